@@ -1,0 +1,29 @@
+"""Pure JAX kernels: from the ranges of echoes to votes, occupied cells and lines. Arrays in, arrays out."""
+
+from .arcs import Arc as Arc
+from .arcs import arc as arc
+from .arcs import arc_point as arc_point
+from .arcs import corrected_range as corrected_range
+from .arcs import tangent_rho as tangent_rho
+from .clusters import Clusters as Clusters
+from .clusters import centres_of_gravity as centres_of_gravity
+from .clusters import extent as extent
+from .extraction import Echoes as Echoes
+from .extraction import cluster_lines as cluster_lines
+from .extraction import occupied_cells as occupied_cells
+from .geometry import edge_range as edge_range
+from .geometry import fold_line as fold_line
+from .geometry import normal as normal
+from .geometry import plane_range as plane_range
+from .geometry import point_range as point_range
+from .geometry import tangent as tangent
+from .geometry import wrap_angle as wrap_angle
+from .hough import HoughSettings as HoughSettings
+from .hough import accumulate as accumulate
+from .hough import cell_of as cell_of
+from .hough import full_wall_votes as full_wall_votes
+from .hough import lowpass as lowpass
+from .hough import soft_accumulate as soft_accumulate
+from .paths import EchoPaths as EchoPaths
+from .paths import Sensors as Sensors
+from .paths import echo_paths as echo_paths

@@ -1,0 +1,65 @@
+"""Lines, points and path lengths in the plane, for ONE line, ONE point, ONE pair of sensors.
+
+A line is (rho, theta): the points p with normal(theta) . p = rho, with rho >= 0 and theta in [-pi, pi). A range is half
+the length of the path transmitter -> reflector -> receiver.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def wrap_angle(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """The same direction in [-pi, pi), radians."""
+    wrapped = jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
+    return jnp.where(wrapped >= jnp.pi, -jnp.pi, wrapped)  # rounding may land on the open end
+
+
+def normal(theta: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
+    """Unit normal (cos theta, sin theta) of a line."""
+    return jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=-1)
+
+
+def tangent(theta: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
+    """Unit tangent of a line: its normal turned a quarter counter-clockwise."""
+    return jnp.stack([-jnp.sin(theta), jnp.cos(theta)], axis=-1)
+
+
+def fold_line(
+    rho: Float[Array, "*batch"], theta: Float[Array, "*batch"]
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """The same line with rho >= 0 and theta in [-pi, pi): (rho, theta) and (-rho, theta + pi) are one line."""
+    behind = rho < 0
+    return jnp.where(behind, -rho, rho), wrap_angle(jnp.where(behind, theta + jnp.pi, theta))
+
+
+def safe_sqrt(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Square root, and 0 with gradient 0 where x is not positive."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+
+
+def plane_range(
+    rho: Float[Array, ""], theta: Float[Array, ""], tx: Float[Array, "2"], rx: Float[Array, "2"]
+) -> Float[Array, ""]:
+    """Range in metres of the echo of a wall, by the image source: exact for direct and cross echoes.
+
+    Args:
+        rho: distance of the wall's line from the origin, metres.
+        theta: direction of its normal, radians.
+        tx: position of the transmitter, metres.
+        rx: position of the receiver, metres, on the same side of the wall.
+    """
+    midpoint, half_baseline = (tx + rx) / 2, (rx - tx) / 2
+    return jnp.hypot(rho - midpoint @ normal(theta), half_baseline @ tangent(theta))
+
+
+def point_range(corner: Float[Array, "2"], tx: Float[Array, "2"], rx: Float[Array, "2"]) -> Float[Array, ""]:
+    """Range in metres of the double reflection in a right-angled corner: its distance from the virtual sensor."""
+    offset = corner - (tx + rx) / 2
+    return safe_sqrt(offset @ offset)
+
+
+def edge_range(edge: Float[Array, "2"], tx: Float[Array, "2"], rx: Float[Array, "2"]) -> Float[Array, ""]:
+    """Range in metres of the diffraction at an edge or a thin pole: half the way to it and on to the receiver."""
+    out, back = edge - tx, edge - rx
+    return (safe_sqrt(out @ out) + safe_sqrt(back @ back)) / 2

@@ -1,0 +1,150 @@
+"""The accumulator: votes of tangent lines, low pass, threshold (paper, section 4).
+
+Rows are theta, columns are rho. The plane of lines has two seams, and both are kept: theta wraps around, and the column
+before rho = 0 is the first column half a turn further, because (-rho, theta) is the line (rho, theta + pi).
+"""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Num
+
+from .geometry import fold_line
+from .paths import EchoPaths
+
+
+_DIRECTIONS = 719  # samples of the full turn, in step with neither cones nor cells
+
+
+@dataclass(frozen=True)
+class HoughSettings:
+    """What the paper leaves to choose, with its values, or ours where it gives none (paper, section 4)."""
+
+    theta_cells: int = 100
+    """Cells around the full turn, an even number; 100 make the paper's 0.0628 rad."""
+    rho_cells: int = 100
+    """Cells from rho = 0 outward."""
+    rho_cell: float = 0.04
+    """Size of a cell in rho, metres."""
+    point_pitch: float = float(np.radians(1.0))
+    """Distance between the points of an arc, radians."""
+    smoothing: tuple[float | int, ...] = (1.0, 2.0, 1.0)
+    """Taps of the low pass, applied along theta and along rho, an odd number of them; normalised to sum 1."""
+    threshold: float = 0.2
+    """Occupancy a cell must exceed, as a fraction of the points that a fully seen wall puts into its cell."""
+    min_echoes: int = 3
+    """Echoes that a line must have: two determine it, a third confirms it."""
+
+    def __post_init__(self):
+        allowed = {
+            "theta_cells": (self.theta_cells >= 4 and self.theta_cells % 2 == 0, "an even number, at least 4"),
+            "rho_cells": (self.rho_cells >= 2, "2 or more"),
+            "rho_cell": (0 < self.rho_cell < np.inf, "more than 0 m"),
+            "point_pitch": (0 < self.point_pitch <= np.pi, "more than 0 and at most pi rad"),
+            "smoothing": (
+                len(self.smoothing) % 2 == 1
+                and len(self.smoothing) <= min(self.theta_cells, self.rho_cells)
+                and all(0 <= tap < np.inf for tap in self.smoothing)
+                and sum(self.smoothing) > 0,
+                "an odd number of taps, none negative, not all 0",
+            ),
+            "threshold": (0 <= self.threshold < np.inf, "0 or more"),
+            "min_echoes": (self.min_echoes >= 1, "1 or more"),
+        }
+        for key, (good, what) in allowed.items():
+            if not good:
+                raise ValueError(f"{key} = {getattr(self, key)!r}; allowed is {what}")
+
+    @property
+    def theta_cell(self) -> float:
+        """Size of a cell in theta, radians."""
+        return 2 * float(np.pi) / self.theta_cells
+
+    @property
+    def max_rho(self) -> float:
+        """Largest distance that the accumulator holds, metres."""
+        return self.rho_cells * self.rho_cell
+
+
+def cell_of(
+    rho: Float[Array, "*lines"],
+    theta: Float[Array, "*lines"],
+    counts: Bool[Array, "*lines"],
+    settings: HoughSettings,
+) -> Int[Array, "*lines"]:
+    """Flat index theta_row * rho_cells + rho_column of each line's cell.
+
+    Lines that do not count and lines beyond the accumulator get the index one past the last cell.
+    """
+    rho, theta = fold_line(rho, theta)
+    row = jnp.floor((theta + jnp.pi) / settings.theta_cell).astype(jnp.int32) % settings.theta_cells
+    column = jnp.floor(rho / settings.rho_cell)
+    inside = counts & (column < settings.rho_cells)
+    column = jnp.where(inside, column, 0).astype(jnp.int32)
+    return jnp.where(inside, row * settings.rho_cells + column, settings.theta_cells * settings.rho_cells)
+
+
+def accumulate(cells: Int[Array, "*lines"], settings: HoughSettings) -> Int[Array, "theta rho"]:
+    """Number of points in each cell. Whole numbers, so the order of votes, and the device, cannot matter."""
+    size = settings.theta_cells * settings.rho_cells
+    votes = jnp.zeros(size + 1, jnp.int32).at[cells.ravel()].add(1, mode="promise_in_bounds")
+    return votes[:size].reshape(settings.theta_cells, settings.rho_cells)
+
+
+def soft_accumulate(
+    rho: Float[Array, "*lines"],
+    theta: Float[Array, "*lines"],
+    weight: Float[Array, "*lines"],
+    settings: HoughSettings,
+) -> Float[Array, "theta rho"]:
+    """Weighted votes, each shared by the four cells around it: differentiable in rho, theta and weight.
+
+    The votes of a line sum to its weight. A cell's centre gets all of it, so that ``accumulate`` is the limit of lines
+    that lie on cell centres.
+    """
+    rows, columns = settings.theta_cells, settings.rho_cells
+    rho, theta = fold_line(rho, theta)
+    row = (theta.ravel() + jnp.pi) / settings.theta_cell - 0.5
+    column = rho.ravel() / settings.rho_cell - 0.5
+    weight = weight.ravel()
+    first_row, first_column = jnp.floor(row), jnp.floor(column)
+    votes = jnp.zeros(rows * columns + 1, weight.dtype)
+    for down in (0, 1):
+        for right in (0, 1):
+            r = (first_row + down).astype(jnp.int32)
+            c = (first_column + right).astype(jnp.int32)
+            share = weight * (1 - jnp.abs(row - first_row - down)) * (1 - jnp.abs(column - first_column - right))
+            r = jnp.where(c < 0, r + rows // 2, r) % rows  # before rho = 0 the same line lies half a turn further
+            c = jnp.where(c < 0, -1 - c, c)
+            index = jnp.where(c < columns, r * columns + c, rows * columns)
+            votes = votes.at[index].add(share, mode="promise_in_bounds")
+    return votes[:-1].reshape(rows, columns)
+
+
+def lowpass(votes: Num[Array, "theta rho"], settings: HoughSettings) -> Float[Array, "theta rho"]:
+    """Two-dimensional low pass, to balance between neighbor cells; beyond the last column there are no votes."""
+    taps = np.asarray(settings.smoothing) / np.sum(settings.smoothing)
+    half = len(taps) // 2
+    smooth = jnp.asarray(votes, jnp.float32)
+    smooth = sum((float(tap) * jnp.roll(smooth, k - half, axis=0) for k, tap in enumerate(taps)), start=jnp.zeros(()))
+    if half == 0:
+        return smooth * float(taps[0])
+    before = jnp.roll(smooth[:, :half][:, ::-1], settings.theta_cells // 2, axis=0)
+    beyond = jnp.zeros((settings.theta_cells, half), smooth.dtype)
+    wide = jnp.concatenate([before, smooth, beyond], axis=1)
+    columns = settings.rho_cells
+    return sum((float(tap) * wide[:, k : k + columns] for k, tap in enumerate(taps)), start=jnp.zeros(()))
+
+
+def full_wall_votes(paths: EchoPaths, settings: HoughSettings) -> Float[Array, ""]:
+    """Points that a fully seen wall puts into its cell: the unit of the threshold.
+
+    The number of paths that hear a plane in a given direction, averaged over the directions that any path hears, times
+    the points that an arc has in one cell. So the threshold depends neither on the point pitch nor on the ring.
+    """
+    directions = (jnp.arange(_DIRECTIONS, dtype=paths.width.dtype) + 0.5) * (2 * jnp.pi / _DIRECTIONS)
+    heard = jnp.mod(directions[:, None] - paths.start[None, :], 2 * jnp.pi) < paths.width[None, :]
+    covered = jnp.maximum(heard.any(axis=1).mean(), 1 / _DIRECTIONS) * 2 * jnp.pi
+    points_per_cell = settings.theta_cell / settings.point_pitch
+    return paths.width.sum() / covered * points_per_cell

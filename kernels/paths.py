@@ -1,0 +1,64 @@
+"""From sensors to echo paths: virtual sensors, baselines and detection ranges (paper, section 3)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .geometry import wrap_angle
+
+
+class Sensors(eqx.Module):
+    """What the kernels know of a ring. Every field is a leaf: change a pose and nothing is compiled anew."""
+
+    position: Float[Array, "sensors 2"]
+    """Mounting positions, robot frame, metres."""
+    heading: Float[Array, " sensors"]
+    """Directions the sensors look to, radians counter-clockwise from x."""
+    beam: Float[Array, " sensors"]
+    """Full detection cones, radians."""
+    range_offset: Float[Array, " sensors"]
+    """What each sensor reports too much, metres."""
+    range_scale: Float[Array, ""]
+    """Speed of sound over the speed that the reported ranges assume."""
+    max_range: Float[Array, ""]
+    """Half path length up to which an echo counts, metres."""
+    tx: Int[Array, " paths"]
+    """Transmitter of each echo path."""
+    rx: Int[Array, " paths"]
+    """Receiver of each echo path."""
+
+
+class EchoPaths(eqx.Module):
+    """Geometry of one echo path, or of all of them with a leading axis."""
+
+    midpoint: Float[Array, "*paths 2"]
+    """The virtual sensor: midpoint of tx and rx, robot frame, metres."""
+    half_baseline: Float[Array, "*paths 2"]
+    """Half the way from tx to rx, metres; zero for a direct path."""
+    start: Float[Array, "*paths"]
+    """First direction from which a plane is heard, radians."""
+    width: Float[Array, "*paths"]
+    """Width of the detection range, radians, counter-clockwise from start; 0 where the cones do not overlap."""
+    range_offset: Float[Array, "*paths"]
+    """Metres that the path reports too much: the mean of its two sensors."""
+
+
+def echo_paths(sensors: Sensors) -> EchoPaths:
+    """Geometry of every echo path of a ring, in the order of ``sensors.tx``."""
+
+    def one_path(tx: Int[Array, ""], rx: Int[Array, ""]) -> EchoPaths:
+        # A plane echo reaches rx only from a direction in both cones: intersect them around the heading of tx.
+        turn = wrap_angle(sensors.heading[rx] - sensors.heading[tx])
+        half_tx, half_rx = sensors.beam[tx] / 2, sensors.beam[rx] / 2
+        first = jnp.maximum(-half_tx, turn - half_rx)
+        last = jnp.minimum(half_tx, turn + half_rx)
+        return EchoPaths(
+            midpoint=(sensors.position[tx] + sensors.position[rx]) / 2,
+            half_baseline=(sensors.position[rx] - sensors.position[tx]) / 2,
+            start=sensors.heading[tx] + first,
+            width=jnp.maximum(last - first, 0),
+            range_offset=(sensors.range_offset[tx] + sensors.range_offset[rx]) / 2,
+        )
+
+    return jax.vmap(one_path)(sensors.tx, sensors.rx)
