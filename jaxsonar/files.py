@@ -1,0 +1,106 @@
+"""Reading and writing files whole: a failure is one line, and a failed write leaves what was there."""
+
+import errno
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from jaxsonar.hardware.errors import SonarError
+
+
+def shown(text: str | os.PathLike[str], limit: int = 200) -> str:
+    """A path or a value as it goes into a message: one line, nothing unprintable, not longer than ``limit``."""
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
+    return line if len(line) <= limit else f"{line[:limit]}..."
+
+
+def reason(failure: Exception) -> str:
+    """What went wrong in the words of the operating system or of a library, on one line."""
+    text = getattr(failure, "strerror", None) or str(failure) or type(failure).__name__
+    return shown(text.splitlines()[0])
+
+
+def read_bytes(path: str | os.PathLike[str], *, what: str) -> bytes:
+    """The whole file.
+
+    Args:
+        path: the file.
+        what: what it should hold, for the message ("a scan log").
+
+    Raises:
+        SonarError: the file is missing, is a directory or cannot be read.
+    """
+    try:
+        return Path(path).read_bytes()
+    except (OSError, ValueError) as failure:  # ValueError: a NUL in the path
+        raise SonarError(f"{shown(path)}: {reason(failure)}; needed is a readable file with {what}") from None
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str], *, binary: bool = False) -> Iterator[IO[Any]]:
+    """A handle for a new file that takes the place of ``path`` only once everything is written.
+
+    The bytes go to a temporary file in the same folder, so that the final rename stays on one file system; if anything
+    fails, the temporary file is removed and whatever was at ``path`` is left alone. A new file gets the permissions
+    that the umask grants, a replaced one keeps its own, a link keeps pointing at the file it names. A device or a pipe
+    (``/dev/stdout``) is written directly.
+
+    Args:
+        path: where the file is to be.
+        binary: bytes instead of UTF-8 text.
+
+    Yields:
+        The open handle; it is closed on leaving the block.
+
+    Raises:
+        SonarError: the folder is missing, the place is a directory, is not writable or full.
+    """
+    mode, encoding, newline = ("wb", None, None) if binary else ("w", "utf-8", "\n")
+    temporary = None
+    try:
+        if "\0" in os.fspath(path):
+            raise OSError(errno.EINVAL, "a NUL character in the path")
+        if os.path.exists(path) and not os.path.isfile(path):
+            # Opening a directory raises the right error; a device must not be replaced by a file.
+            with open(path, mode, encoding=encoding, newline=newline) as handle:
+                yield handle
+            return
+        target = Path(os.path.realpath(path))
+        temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
+        with open(_create(temporary, target), mode, encoding=encoding, newline=newline) as handle:
+            yield handle
+        os.replace(temporary, target)
+        temporary = None
+    except OSError as failure:
+        allowed = "a path in an existing folder that you may write to"
+        raise SonarError(f"{shown(path)}: cannot write: {reason(failure)}; allowed is {allowed}") from None
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def _create(temporary: Path, target: Path) -> int:
+    """Open the temporary file with the permissions its target has, or will have under the umask."""
+    if target.exists() and not os.access(target, os.W_OK):
+        # The rename would succeed, but whoever took the write permission away did not want that.
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    if target.exists():
+        os.fchmod(descriptor, stat.S_IMODE(target.stat().st_mode))
+    return descriptor
+
+
+def make_folder(path: str | os.PathLike[str]) -> None:
+    """Make a folder for results, with those above it; one that is there already is fine.
+
+    Raises:
+        SonarError: it cannot be made.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as failure:
+        raise SonarError(f"{shown(path)}: {reason(failure)}; allowed is a folder that can be written to") from None
