@@ -1,0 +1,101 @@
+"""Packing: from dense arrays or a log to the rectangles of real echoes that the compiled kernels take."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsonar import kernels
+from jaxsonar.hardware.errors import SonarError
+
+from .logs import Log
+from .ring import Ring
+
+SCANS_PER_STEP = 256
+"""Scans that one compiled step takes; a shorter batch is padded with scans that heard nothing."""
+
+
+def room_for(count: int, *, least: int) -> int:
+    """Smallest power of two that holds count things and at least ``least``: few shapes, so few compilations."""
+    return max(least, 1 << max(count - 1, 0).bit_length())
+
+
+class FlatEchoes:
+    """Echoes of scans as flat columns, ready to be packed step by step."""
+
+    def __init__(
+        self,
+        scans: int,
+        scan: Int[np.ndarray, " echoes"],
+        path: Int[np.ndarray, " echoes"],
+        reported: Float[np.ndarray, " echoes"],
+    ):
+        """Take columns sorted by scan.
+
+        Args:
+            scans: number of scans, those without echoes included.
+            scan: index of each echo's scan, ascending.
+            path: row of the ring's ``paths``.
+            reported: ranges as a log has them, metres.
+        """
+        self.scans, self.path, self.reported = scans, path, reported
+        self.start = np.searchsorted(scan, np.arange(scans + 1))
+        self.scan = scan
+
+    @classmethod
+    def from_dense(cls, ring: Ring, ranges: Float[np.ndarray, "scans paths echoes"]) -> "FlatEchoes":
+        """Echoes of a dense array, NaN = no echo.
+
+        Raises:
+            SonarError: another shape than the ring's paths ask for, or a range that is not positive.
+        """
+        ranges = np.asarray(ranges)
+        paths = len(ring.paths)
+        if ranges.ndim != 3 or ranges.shape[1] != paths:
+            raise SonarError(
+                f"ranges: shape {ranges.shape} came; allowed is (scans, {paths}, echoes) for the {paths} echo paths of "
+                f"{ring.name!r}"
+            )
+        if ranges.dtype.kind != "f":
+            raise SonarError(f"ranges: dtype {ranges.dtype} came; allowed are floating-point numbers, NaN for no echo")
+        scan, path, echo = np.nonzero(~np.isnan(ranges))
+        reported = ranges[scan, path, echo]
+        if (reported <= 0).any():
+            k = int(np.argmax(reported <= 0))
+            raise SonarError(
+                f"ranges[{scan[k]}, {path[k]}, {echo[k]}] = {reported[k]:g}; allowed are metres above 0, NaN for no echo"
+            )
+        return cls(len(ranges), scan, path, reported)
+
+    @classmethod
+    def from_log(cls, ring: Ring, log: Log) -> tuple["FlatEchoes", int]:
+        """Echoes of a log, and how many of them are of pairs that this ring does not listen to, and left out.
+
+        Raises:
+            SonarError: a sensor number that the ring does not have.
+        """
+        sensor = np.maximum(log.tx, log.rx)
+        if (sensor >= ring.count).any():
+            k = int(np.argmax(sensor >= ring.count))
+            raise SonarError(
+                f"scan {log.scan[log.echo_scan[k]]}: echo of sensors tx {log.tx[k]}, rx {log.rx[k]}; allowed are 0 to "
+                f"{ring.count - 1}, the sensors of {ring.name!r}"
+            )
+        path = ring.path_index[log.tx, log.rx]
+        heard = path >= 0
+        return cls(len(log), log.echo_scan[heard], path[heard], log.range[heard]), int((~heard).sum())
+
+    def steps(self) -> Iterator[tuple[slice, kernels.Echoes]]:
+        """The scans in rectangles of few different shapes: which scans, and their echoes, padded."""
+        step = SCANS_PER_STEP if self.scans > 1 else 1
+        for first in range(0, self.scans, step):
+            last = min(first + step, self.scans)
+            begin, end = self.start[first], self.start[last]
+            row = self.scan[begin:end] - first
+            column = np.arange(begin, end) - self.start[first + row]
+            columns = room_for(int(column.max(initial=-1)) + 1, least=64)
+            path = np.zeros((step, columns), np.int32)
+            reported = np.full((step, columns), np.nan, np.float32)
+            path[row, column] = self.path[begin:end]
+            reported[row, column] = self.reported[begin:end]
+            yield slice(first, last), kernels.Echoes(path, reported)

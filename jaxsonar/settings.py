@@ -1,0 +1,41 @@
+"""Settings of the extraction in TOML: written beside every result, and taken back with ``--settings``."""
+
+import tomllib
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import msgspec
+import tomli_w
+
+from jaxsonar import kernels
+from jaxsonar.hardware.errors import SonarError
+
+from .files import atomic_write
+
+_File = msgspec.defstruct(
+    "_File",
+    [(field.name, field.type, field.default) for field in fields(kernels.HoughSettings)],
+    forbid_unknown_fields=True,
+)
+
+
+def load_settings(path: Path | str) -> kernels.HoughSettings:
+    """Settings from TOML; keys that are left out keep their defaults.
+
+    Raises:
+        SonarError: no such file, no TOML, an unknown key, a value of another type or out of range.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        return kernels.HoughSettings(**msgspec.structs.asdict(msgspec.convert(tomllib.loads(text), _File)))
+    except OSError as error:
+        raise SonarError(f"{path}: {error.strerror}; allowed is a readable TOML file") from None
+    except (ValueError, msgspec.ValidationError) as error:  # ValueError: no text, no TOML, or out of range
+        keys = ", ".join(field.name for field in fields(kernels.HoughSettings))
+        raise SonarError(f"{path}: {' '.join(str(error).split())}; the keys are {keys}") from None
+
+
+def save_settings(settings: kernels.HoughSettings, path: Path | str) -> None:
+    """Write settings so that ``load_settings`` gives the same ones."""
+    with atomic_write(path, binary=True) as file:
+        tomli_w.dump(asdict(settings), file)
