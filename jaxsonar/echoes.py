@@ -11,8 +11,8 @@ from jaxsonar.hardware.errors import SonarError
 from .logs import Log
 from .ring import Ring
 
-SCANS_PER_STEP = 256
-"""Scans that one compiled step takes; a shorter batch is padded with scans that heard nothing."""
+SCANS_PER_STEP = (1, 16, 256)
+"""Numbers of scans that a compiled step takes: the smallest that holds the batch, padded with scans without echoes."""
 
 
 def room_for(count: int, *, least: int) -> int:
@@ -87,7 +87,7 @@ class FlatEchoes:
 
     def steps(self) -> Iterator[tuple[slice, kernels.Echoes]]:
         """The scans in rectangles of few different shapes: which scans, and their echoes, padded."""
-        step = SCANS_PER_STEP if self.scans > 1 else 1
+        step = next((size for size in SCANS_PER_STEP if size >= self.scans), SCANS_PER_STEP[-1])
         for first in range(0, self.scans, step):
             last = min(first + step, self.scans)
             begin, end = self.start[first], self.start[last]

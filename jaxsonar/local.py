@@ -212,7 +212,8 @@ def _extract(
             sensors, packed, labels, settings=settings, points=points, size=size
         )
         real = slice(0, scans.stop - scans.start)  # the rest is padding
-        lines, involved = _sift(jax.tree.map(lambda a: np.asarray(a)[real], (clusters, segments)), settings.min_echoes)
+        found = jax.tree.map(lambda a, real=real: np.asarray(a)[real], (clusters, segments))
+        lines, involved = _sift(found, settings.min_echoes)
         heard = (packed.range[real] < ring.max_range).sum(axis=1)
         yield scans, _Extracted(lines, involved, packed.path[real], heard, counts[real])
 

@@ -5,7 +5,9 @@ before rho = 0 is the first column half a turn further, because (-rho, theta) is
 """
 
 from dataclasses import dataclass
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
@@ -137,6 +139,7 @@ def lowpass(votes: Num[Array, "theta rho"], settings: HoughSettings) -> Float[Ar
     return sum((float(tap) * wide[:, k : k + columns] for k, tap in enumerate(taps)), start=jnp.zeros(()))
 
 
+@partial(jax.jit, static_argnames="settings")
 def full_wall_votes(paths: EchoPaths, settings: HoughSettings) -> Float[Array, ""]:
     """Points that a fully seen wall puts into its cell: the unit of the threshold.
 

@@ -44,6 +44,7 @@ class EchoPaths(eqx.Module):
     """Metres that the path reports too much: the mean of its two sensors."""
 
 
+@jax.jit
 def echo_paths(sensors: Sensors) -> EchoPaths:
     """Geometry of every echo path of a ring, in the order of ``sensors.tx``."""
 

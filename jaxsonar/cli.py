@@ -1,0 +1,101 @@
+"""The command line: what can be said, and how mistakes are answered. What is done stands in ``commands``.
+
+Nothing heavy is imported here, so that help comes at once.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib import import_module, metadata
+from typing import NoReturn
+
+from jaxsonar.hardware.errors import SonarError
+
+RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
+
+
+class _Parser(argparse.ArgumentParser):
+    """Answers a wrong call with one line and exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def _number(kind: type, least: float, most: float):
+    """A number from ``least`` to ``most``, or a message that says so."""
+
+    def parse(text: str):
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not least <= value <= most:
+            name = "a whole number" if kind is int else "a number"
+            upper = "" if most == float("inf") else f" to {most:g}"
+            raise argparse.ArgumentTypeError(f"{text!r} came; allowed is {name} from {least:g}{upper or ' on'}")
+        return value
+
+    return parse
+
+
+def _finite(least: float, most: float = 1e9):
+    return _number(float, least, most)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    top = _Parser(prog="jaxsonar", description="Maps from the echoes of an ultrasonic ring.", allow_abbrev=False)
+    top.add_argument("--version", action="version", version=f"jaxsonar {metadata.version('jaxsonar')}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, summary: str) -> argparse.ArgumentParser:
+        return commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+
+    demo = command("demo", "The embedded office, 17 scans: figures and a table of deviations.")
+    demo.add_argument("-o", "--output", metavar="DIR", default="demo", help="where to write (default: demo)")
+    demo.add_argument("--seed", type=_number(int, 0, 2**32 - 1), default=1, help="of the simulated noise (default: 1)")
+
+    lines = command("lines", "Straight lines around the robot, from every scan of a log.")
+    lines.add_argument("log", metavar="LOG", help="scan log, .csv or .parquet")
+    lines.add_argument("--ring", required=True, help=RING_HELP)
+    lines.add_argument("--method", choices=("hough",), default="hough", help="default: hough, the paper's")
+    lines.add_argument("--settings", metavar="TOML", help="accumulator, low pass and threshold, instead of the paper's")
+    lines.add_argument("-o", "--output", metavar="LINES", required=True, help="JSON Lines, one object a scan; - = stdout")
+    lines.add_argument("--figure", metavar="FIG", help="draw arcs and lines of one scan, .svg, .png or .pdf")
+    lines.add_argument("--scan", type=_number(int, -(2**62), 2**62), metavar="N", help="the scan to draw (default: first)")
+
+    simulate = command("simulate", "The echoes that a ring hears along a path through a room.")
+    simulate.add_argument("room", metavar="ROOM", help="room GeoJSON: walls, polygons, points of kind pole; metres")
+    simulate.add_argument("--ring", required=True, help=RING_HELP)
+    simulate.add_argument("--path", required=True, metavar="CSV", help="poses: columns x, y (m), theta (rad), opt. stamp")
+    simulate.add_argument("-o", "--output", metavar="LOG", required=True, help=".csv or .parquet; - = CSV on stdout")
+    simulate.add_argument("--sigma", type=_finite(0), default=0.0, metavar="M", help="range noise, metres (default: 0)")
+    simulate.add_argument("--drift", type=_finite(0), default=0.0, metavar="M", help="slow drift, metres (default: 0)")
+    simulate.add_argument("--dropout", type=_finite(0, 1), default=0.0, metavar="P", help="echoes lost (default: 0)")
+    simulate.add_argument("--clutter", type=_finite(0), default=0.0, metavar="P", help="false echoes per real one")
+    simulate.add_argument("--seed", type=_number(int, 0, 2**32 - 1), default=0, help="of the noise (default: 0)")
+    simulate.add_argument("--max-echoes", type=_number(int, 1, 64), default=3, metavar="N", help="per path (default: 3)")
+
+    convert = command("convert", "Scan logs between CSV and Parquet, and recordings of devices into scan logs.")
+    convert.add_argument("source", metavar="IN", help="log or recording")
+    convert.add_argument("destination", metavar="OUT", help="scan log, .csv or .parquet")
+    formats = ("corridor8", "scitos24", "sew-amr", "csv", "parquet")
+    convert.add_argument("--from", dest="from_", choices=formats, help="format of IN (default: by its suffix)")
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code: 0 done, 2 the input or the call was wrong, 1 anything else."""
+    options = parser().parse_args(arguments)
+    try:
+        getattr(import_module("jaxsonar.commands"), options.command)(options)
+    except SonarError as error:
+        print(f"jaxsonar {options.command}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"jaxsonar {options.command}: interrupted", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output has gone; there is no one to tell
+        return 1
+    return 0

@@ -1,0 +1,138 @@
+"""What the commands do: read, call the library, write, and say in one line what came of it."""
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+Item = TypeVar("Item")
+
+
+def demo(options: argparse.Namespace) -> None:
+    """``jaxsonar demo``."""
+    from .demo import PAPER, run_demo, summary
+    from .tables import deviation_table
+
+    rows = run_demo(Path(options.output), seed=options.seed, on_step=_say)
+    Console(width=None if sys.stdout.isatty() else 140).print(
+        deviation_table([(name, summary(row)) for name, row in rows], paper=PAPER)
+    )
+    _say(f"map of segments: {options.output}/6-segments.svg; lines: {options.output}/lines.jsonl")
+
+
+def lines(options: argparse.Namespace) -> None:
+    """``jaxsonar lines``."""
+    from .hardware.errors import SonarError
+    from .local import local_models, settings_for
+    from .logs import load_log
+    from .modelfile import save_models
+    from .ringfile import load_ring
+    from .settings import load_settings, save_settings
+
+    ring, log = load_ring(options.ring), load_log(options.log)
+    settings = settings_for(ring, load_settings(options.settings) if options.settings else None)
+    drawn = None
+    if options.scan is not None and options.scan not in log.scan:
+        raise SonarError(f"--scan {options.scan}: no such scan in {options.log}; it holds {len(log)}")
+    found: Counter[str] = Counter()
+
+    def counted(models: Iterable) -> Iterator:
+        nonlocal drawn
+        for model in models:
+            found["scans" if model.lines else model.empty] += 1
+            found["lines"] += len(model.lines)
+            if drawn is None and options.scan in (None, model.scan):
+                drawn = model
+            yield model
+
+    def left_out(count: int) -> None:
+        _say(f"left out {count} echoes of pairs of sensors that {ring.name!r} does not listen to")
+
+    models = local_models(ring, log, method=options.method, settings=settings, on_left_out=left_out)
+    save_models(counted(_progress(models, len(log), "scans")), options.output)
+    if options.output != "-":
+        save_settings(settings, Path(options.output).with_suffix(".settings.toml"))
+    if options.figure and drawn is not None:
+        from . import figures
+
+        scan = log[int((log.scan == drawn.scan).argmax())]
+        figures.save(figures.lines_figure(ring, scan, drawn), options.figure)
+    total, lines_found, with_lines = len(log), found.pop("lines"), found.pop("scans", 0)
+    share = f" ({100 * with_lines / total:.1f} %)" if total else ""
+    reasons = "".join(f"; {count} without: {why}" for why, count in found.most_common())
+    _say(f"{total} scans, {lines_found} lines, {with_lines} scans with lines{share}{reasons}")
+
+
+def simulate(options: argparse.Namespace) -> None:
+    """``jaxsonar simulate``."""
+    from .logs import save_log
+    from .ringfile import load_ring
+    from .roompaths import load_path
+    from .rooms import load_room
+    from .simulate import simulate as simulate_scans
+
+    ring, room = load_ring(options.ring), load_room(options.room)
+    poses, stamps = load_path(options.path)
+    with _bar("scans", len(poses)) as advance:
+        simulation = simulate_scans(
+            ring,
+            room,
+            poses,
+            sigma=options.sigma,
+            drift=options.drift,
+            dropout=options.dropout,
+            clutter=options.clutter,
+            seed=options.seed,
+            max_echoes=options.max_echoes,
+            stamps=stamps,
+            progress=advance,
+        )
+    log = simulation.as_log(ring, poses)
+    save_log(log, options.output)
+    _say(f"{len(log)} scans, {len(log.range)} echoes")
+
+
+def convert(options: argparse.Namespace) -> None:
+    """``jaxsonar convert``."""
+    from .convert import convert as convert_log
+
+    log = convert_log(options.source, options.destination, from_=options.from_)
+    _say(f"{len(log)} scans, {len(log.range)} echoes")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+@contextmanager
+def _bar(unit: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A progress bar on standard error, with rate and time left; the function given advances it."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(unit, total=total, rate="")
+
+        def advance(count: int) -> None:
+            speed = progress.tasks[task].speed
+            progress.update(task, advance=count, rate=f"{speed:,.0f} {unit}/s" if speed else "")
+
+        yield advance
+
+
+def _progress(items: Iterable[Item], total: int, unit: str) -> Iterator[Item]:
+    with _bar(unit, total) as advance:
+        for item in items:
+            yield item
+            advance(1)
