@@ -2,12 +2,13 @@
 
 import os
 
-from jaxsonar.files import shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.recordings import read_corridor8, read_scitos24, read_sew_amr
-from jaxsonar.logs import Log, log_format, save_log
-from jaxsonar.logs_csv import read_csv
-from jaxsonar.logs_parquet import read_parquet
+
+from .files import shown
+from .logs import Log, log_format, save_log
+from .logs_csv import read_csv
+from .logs_parquet import read_parquet
 
 RECORDINGS = {"corridor8": read_corridor8, "scitos24": read_scitos24, "sew-amr": read_sew_amr}
 LOGS = {"csv": read_csv, "parquet": read_parquet}

@@ -73,9 +73,10 @@ def ring_figure(ring: Ring, *, transmitter: int = 0, reach: float | None = None)
     """
     reach = ring.max_range / 2 if reach is None else reach
     figure, axes = _plan(f"{ring.name}: {ring.count} sensors, {len(ring.paths)} echo paths")
-    for (x, y), heading, beam in zip(ring.position, ring.heading, ring.beam, strict=True):
+    for sensor, ((x, y), heading, beam) in enumerate(zip(ring.position, ring.heading, ring.beam, strict=True)):
         from_, to = np.degrees([heading - beam / 2, heading + beam / 2])
-        axes.add_patch(Wedge((x, y), 0.45 * reach, from_, to, color=FAINT, alpha=0.25, lw=0))
+        length = reach if sensor == transmitter else 0.4 * reach
+        axes.add_patch(Wedge((x, y), length, from_, to, color=FAINT, alpha=0.3, lw=0))
     mine = np.flatnonzero(ring.paths[:, 0] == transmitter)
     audible = mine[np.asarray(ring.echo_paths.width)[mine] > 0]
     offsets = (ring.paths[audible, 1] - transmitter + ring.count // 2) % ring.count - ring.count // 2

@@ -10,8 +10,9 @@ from typing import Any, SupportsIndex, overload
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsonar.files import shown
 from jaxsonar.hardware.errors import SonarError
+
+from .files import shown
 
 LARGEST_SENSOR = 2**31 - 1
 """Sensor indices are 32-bit in Parquet, so a log in memory holds no larger ones."""

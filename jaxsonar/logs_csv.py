@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 from numpy.lib.stride_tricks import sliding_window_view
 
-from jaxsonar.files import atomic_write, read_bytes, shown
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.logs import ALLOWED, LARGEST_SENSOR, Log, LogFault
+
+from .files import atomic_write, read_bytes, shown
+from .logs import ALLOWED, LARGEST_SENSOR, Log, LogFault
 
 COLUMNS = ("scan", "stamp", "x", "y", "theta", "tx", "rx", "range")
 OPTIONAL = "amplitude"

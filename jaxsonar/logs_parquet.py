@@ -8,9 +8,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from jaxsonar.files import atomic_write, read_bytes, reason, shown
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.logs import ALLOWED, Log, LogFault
+
+from .files import atomic_write, read_bytes, reason, shown
+from .logs import ALLOWED, Log, LogFault
 
 SCANS_AT_ONCE = 8192  # a row group; keeps 32-bit list offsets and memory far from their limits
 

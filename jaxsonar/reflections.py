@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.rooms import Junctions, Room, crossings, point_to_walls
+from .rooms import Junctions, Room, crossings, point_to_walls
 
 _TOL = 1e-9  # m; what may be missed by rounding when a point lies on a wall or at its end
 

@@ -12,9 +12,10 @@ import numpy as np
 import tomli_w
 from msgspec import Meta
 
-from jaxsonar.files import atomic_write, read_bytes, reason, shown
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.ring import REFERENCE_SPEED_OF_SOUND, Ring
+
+from .files import atomic_write, read_bytes, reason, shown
+from .ring import REFERENCE_SPEED_OF_SOUND, Ring
 
 DATA = Path(__file__).with_name("data")
 

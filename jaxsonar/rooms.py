@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.files import atomic_write, read_bytes, reason, shown
 from jaxsonar.hardware.errors import SonarError
+
+from .files import atomic_write, read_bytes, reason, shown
 
 TOUCH = 1e-3
 """Metres; ends of walls nearer than this are one vertex, and an end this near to another wall touches it."""

@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.logs import Log
-from jaxsonar.reflections import Kind as Kind
-from jaxsonar.reflections import Reflections, trace
-from jaxsonar.ring import REFERENCE_SPEED_OF_SOUND, Ring
-from jaxsonar.rooms import Room
+
+from .logs import Log
+from .reflections import Kind as Kind
+from .reflections import Reflections, trace
+from .ring import REFERENCE_SPEED_OF_SOUND, Ring
+from .rooms import Room
 
 SECONDS_PER_SCAN = 0.1
 """Between scans that come without stamps: about the rate of the paper's ring (8 firing groups of 11.7 ms)."""
@@ -33,11 +34,13 @@ class Acoustics:
 
     reflectivity: float = 1.0
     """Share of the amplitude that a wall sends back, once per reflection, (0, 1]; smooth hard walls: about 1."""
-    edge_strength: float = 0.1
-    """Amplitude of an edge 1 m from both sensors, >= 0; falls with the product of the distances. 20 dB below a
-    wall there is our choice."""
+    edge_strength: float = 0.02
+    """Amplitude of an edge 1 m from both sensors, >= 0; falls with sqrt(d1 d2 (d1 + d2)) of the two distances, a
+    cylindrical wave from a point source. 0.02 is a half plane at 40 kHz away from its specular direction (Keller's
+    diffraction coefficient 1 / sqrt(8 pi k) and its obliquity factor of 1 to 2)."""
     pole_strength: float = 0.1
-    """Amplitude of a thin pole 1 m from both sensors, >= 0; falls with the product of the distances (our choice)."""
+    """Amplitude of a thin pole 1 m from both sensors, >= 0; falls likewise. 0.1 is a smooth pole of 1 cm radius, a table
+    leg: sqrt(radius / distance) of a wall there."""
     beam_edge_db: float = 6.0
     """Loss at the border of a sensor's cone, one way, dB, >= 0; Gaussian in the off-axis angle between. 6 dB is how
     data sheets define the beam angle of such transducers."""
@@ -245,7 +248,7 @@ def _amplitude(
     out, departing = _leg(sensors[found.group, tx], axis[found.group, tx], found.first)
     back, arriving = _leg(sensors[found.group, rx], axis[found.group, rx], found.last)
     with np.errstate(divide="ignore"):
-        scattered = 1.0 / (out * back)
+        scattered = np.sqrt(2.0 / (out * back * (out + back)))
     reflections = np.where(found.kind == Kind.PLANE, 1, 2)
     strength = np.select(
         [found.kind == Kind.EDGE, found.kind == Kind.POLE],

@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float, Int, Num
 from .geometry import fold_line
 from .paths import EchoPaths
 
-
 _DIRECTIONS = 719  # samples of the full turn, in step with neither cones nor cells
 
 

@@ -9,6 +9,7 @@ import oracles
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+
 from jaxsonar import HoughSettings, Ring, kernels
 
 angles = st.floats(-3.125, 3.125, width=32)

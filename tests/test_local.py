@@ -9,6 +9,7 @@ import oracles
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from jaxsonar import HoughSettings, Log, Ring, SonarError, extract_lines, kernels, local_model, local_models
 
 THREE_WALLS = [(1.2, 0.3), (1.7, -1.9), (1.5, 3.1)]

@@ -1,8 +1,8 @@
 """Section 3 of the paper: counts, order, detection ranges, virtual sensors, firing groups, for any arrangement."""
 
-import oracles
 import jax
 import numpy as np
+import oracles
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
