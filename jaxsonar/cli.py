@@ -60,21 +60,23 @@ def parser() -> argparse.ArgumentParser:
     lines.add_argument("--ring", required=True, help=RING_HELP)
     lines.add_argument("--method", choices=("hough",), default="hough", help="default: hough, the paper's")
     lines.add_argument("--settings", metavar="TOML", help="accumulator, low pass and threshold, instead of the paper's")
-    lines.add_argument("-o", "--output", metavar="LINES", required=True, help="JSON Lines, one object a scan; - = stdout")
+    lines.add_argument(
+        "-o", "--output", metavar="LINES", required=True, help="JSON Lines, an object a scan; - = stdout"
+    )
     lines.add_argument("--figure", metavar="FIG", help="draw arcs and lines of one scan, .svg, .png or .pdf")
-    lines.add_argument("--scan", type=_number(int, -(2**62), 2**62), metavar="N", help="the scan to draw (default: first)")
+    lines.add_argument("--scan", type=_number(int, -(2**62), 2**62), metavar="N", help="scan to draw (default: first)")
 
     simulate = command("simulate", "The echoes that a ring hears along a path through a room.")
     simulate.add_argument("room", metavar="ROOM", help="room GeoJSON: walls, polygons, points of kind pole; metres")
     simulate.add_argument("--ring", required=True, help=RING_HELP)
-    simulate.add_argument("--path", required=True, metavar="CSV", help="poses: columns x, y (m), theta (rad), opt. stamp")
+    simulate.add_argument("--path", required=True, metavar="CSV", help="poses: columns x, y (m), theta (rad), [stamp]")
     simulate.add_argument("-o", "--output", metavar="LOG", required=True, help=".csv or .parquet; - = CSV on stdout")
     simulate.add_argument("--sigma", type=_finite(0), default=0.0, metavar="M", help="range noise, metres (default: 0)")
     simulate.add_argument("--drift", type=_finite(0), default=0.0, metavar="M", help="slow drift, metres (default: 0)")
     simulate.add_argument("--dropout", type=_finite(0, 1), default=0.0, metavar="P", help="echoes lost (default: 0)")
     simulate.add_argument("--clutter", type=_finite(0), default=0.0, metavar="P", help="false echoes per real one")
     simulate.add_argument("--seed", type=_number(int, 0, 2**32 - 1), default=0, help="of the noise (default: 0)")
-    simulate.add_argument("--max-echoes", type=_number(int, 1, 64), default=3, metavar="N", help="per path (default: 3)")
+    simulate.add_argument("--max-echoes", type=_number(int, 1, 64), default=3, metavar="N", help="a path (default: 3)")
 
     convert = command("convert", "Scan logs between CSV and Parquet, and recordings of devices into scan logs.")
     convert.add_argument("source", metavar="IN", help="log or recording")

@@ -79,7 +79,7 @@ def simulate(options: argparse.Namespace) -> None:
 
     ring, room = load_ring(options.ring), load_room(options.room)
     poses, stamps = load_path(options.path)
-    with _bar("scans", len(poses)) as advance:
+    with _bar("scans", len(poses)) as show:
         simulation = simulate_scans(
             ring,
             room,
@@ -91,10 +91,10 @@ def simulate(options: argparse.Namespace) -> None:
             seed=options.seed,
             max_echoes=options.max_echoes,
             stamps=stamps,
-            progress=advance,
+            progress=lambda done, _: show(done),
         )
     log = simulation.as_log(ring, poses)
-    save_log(log, options.output)
+    save_log(log, "/dev/stdout" if options.output == "-" else options.output)
     _say(f"{len(log)} scans, {len(log.range)} echoes")
 
 
@@ -112,7 +112,7 @@ def _say(text: str) -> None:
 
 @contextmanager
 def _bar(unit: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar on standard error, with rate and time left; the function given advances it."""
+    """A progress bar on standard error, with rate and time left; the function given is told how many are done."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -124,15 +124,15 @@ def _bar(unit: str, total: int) -> Iterator[Callable[[int], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(unit, total=total, rate="")
 
-        def advance(count: int) -> None:
+        def show(done: int) -> None:
             speed = progress.tasks[task].speed
-            progress.update(task, advance=count, rate=f"{speed:,.0f} {unit}/s" if speed else "")
+            progress.update(task, completed=done, rate=f"{speed:,.0f} {unit}/s" if speed else "")
 
-        yield advance
+        yield show
 
 
 def _progress(items: Iterable[Item], total: int, unit: str) -> Iterator[Item]:
-    with _bar(unit, total) as advance:
-        for item in items:
+    with _bar(unit, total) as show:
+        for done, item in enumerate(items, start=1):
             yield item
-            advance(1)
+            show(done)

@@ -1,4 +1,4 @@
-"""How far extracted lines are from true walls: matches, false lines, deviations, and the bound they are held against."""
+"""How far extracted lines are from true walls: matches, false lines, deviations, and the bound to hold them against."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

@@ -63,7 +63,7 @@ class FlatEchoes:
         if (reported <= 0).any():
             k = int(np.argmax(reported <= 0))
             raise SonarError(
-                f"ranges[{scan[k]}, {path[k]}, {echo[k]}] = {reported[k]:g}; allowed are metres above 0, NaN for no echo"
+                f"ranges[{scan[k]}, {path[k]}, {echo[k]}] = {reported[k]:g}; allowed are metres above 0, NaN = no echo"
             )
         return cls(len(ranges), scan, path, reported)
 

@@ -195,9 +195,7 @@ def _check_method(method: str) -> None:
         raise SonarError(f"method {method!r}; allowed is {' or '.join(METHODS)}")
 
 
-def _extract(
-    ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings
-) -> Iterator[tuple[slice, _Extracted]]:
+def _extract(ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings) -> Iterator[tuple[slice, _Extracted]]:
     """The paper's section 4 from echoes to lines, step by step over a batch of scans."""
     sensors = ring.sensors
     points = points_of_widest_arc(float(ring.echo_paths.width.max()), settings)
@@ -208,9 +206,7 @@ def _extract(
         labels, counts = label_components(np.asarray(occupied))
         # Centres of gravity of the points in each cluster, and from the sensors involved the extent of each line.
         size = room_for(int(counts.max(initial=0)), least=16)
-        clusters, segments = kernels.cluster_lines(
-            sensors, packed, labels, settings=settings, points=points, size=size
-        )
+        clusters, segments = kernels.cluster_lines(sensors, packed, labels, settings=settings, points=points, size=size)
         real = slice(0, scans.stop - scans.start)  # the rest is padding
         found = jax.tree.map(lambda a, real=real: np.asarray(a)[real], (clusters, segments))
         lines, involved = _sift(found, settings.min_echoes)

@@ -39,8 +39,8 @@ class Acoustics:
     cylindrical wave from a point source. 0.02 is a half plane at 40 kHz away from its specular direction (Keller's
     diffraction coefficient 1 / sqrt(8 pi k) and its obliquity factor of 1 to 2)."""
     pole_strength: float = 0.1
-    """Amplitude of a thin pole 1 m from both sensors, >= 0; falls likewise. 0.1 is a smooth pole of 1 cm radius, a table
-    leg: sqrt(radius / distance) of a wall there."""
+    """Amplitude of a thin pole 1 m from both sensors, >= 0; falls likewise. 0.1 is a smooth pole of 1 cm radius, a
+    table leg: sqrt(radius / distance) of a wall there."""
     beam_edge_db: float = 6.0
     """Loss at the border of a sensor's cone, one way, dB, >= 0; Gaussian in the off-axis angle between. 6 dB is how
     data sheets define the beam angle of such transducers."""

@@ -1,4 +1,4 @@
-"""From labelled cells back to the points in them: centres of gravity, involved echoes, extent (paper, sections 4, 5)."""
+"""From labelled cells back to the points in them: centre of gravity, involved echoes, extent (paper, sections 4, 5)."""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -110,7 +110,7 @@ def full_wall_votes(ring, settings):
 
 def components(mask):
     """Sets of cells, 8-connected, joined where theta wraps and across rho = 0, by flood fill."""
-    rows, columns = mask.shape
+    rows = mask.shape[0]
     unseen = {tuple(where) for where in np.argwhere(mask)}
     found = []
     while unseen:

@@ -156,7 +156,11 @@ def test_votes_fall_into_the_cells_of_their_lines(rng, run):
     counts = rng.random(400) < 0.8
     voting = lambda rho, theta, counts: kernels.accumulate(kernels.cell_of(rho, theta, counts, SMALL), SMALL)  # noqa: E731
     came = run(voting, rho, theta, counts)
-    lines = zip(*(np.asarray(a, np.float64) for a in kernels.fold_line(jnp.asarray(rho), jnp.asarray(theta))), counts, strict=True)
+    lines = zip(
+        *(np.asarray(a, np.float64) for a in kernels.fold_line(jnp.asarray(rho), jnp.asarray(theta))),
+        counts,
+        strict=True,
+    )
     cells = [oracles.cell(r, t, SMALL) for r, t, voting in lines if voting]
     np.testing.assert_array_equal(came, oracles.accumulate(cells, SMALL))
 
@@ -236,7 +240,9 @@ def test_centres_of_gravity(rng, run):
     np.testing.assert_array_equal(came.involved[:, :], np.eye(5, 3, dtype=bool)[[0, 1, 4, 2, 4]])
     for k, row in [(0, 0), (1, 1), (3, 2)]:
         points = [(float(r), float(t)) for r, t, m in zip(rho[row], theta[row], label[row], strict=True) if m]
-        wanted = oracles.centre_of_gravity(sorted(points, key=lambda line: abs(oracles.wrap(line[1] - centres[row][1]))))
+        wanted = oracles.centre_of_gravity(
+            sorted(points, key=lambda line: abs(oracles.wrap(line[1] - centres[row][1])))
+        )
         assert float(came.rho[k]) == pytest.approx(wanted[0], abs=1e-5)
         assert abs(oracles.wrap(float(came.theta[k]) - wanted[1])) < 1e-5
 

@@ -53,7 +53,8 @@ def as_log(ring, scans):
 
 def found(lines, scan=0):
     count = int((lines.echoes[scan] > 0).sum())
-    return [(lines.rho[scan, k], lines.theta[scan, k], lines.votes[scan, k], lines.echoes[scan, k]) for k in range(count)]
+    columns = (lines.rho, lines.theta, lines.votes, lines.echoes)
+    return [tuple(column[scan, k] for column in columns) for k in range(count)]
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -237,9 +238,7 @@ def test_offsets_and_speed_of_sound_are_taken_out():
         speed_of_sound=350.0,
     )
     echoes = oracles.wall_echoes(plain, 1.1, 0.7)
-    reported = [
-        (k, r * 343.2 / 350.0 + ring.range_offset[list(ring.paths[k])].mean()) for k, r in echoes
-    ]
+    reported = [(k, r * 343.2 / 350.0 + ring.range_offset[list(ring.paths[k])].mean()) for k, r in echoes]
     lines = extract_lines(ring, dense(ring, reported))
     wanted = extract_lines(plain, dense(plain, echoes))
     np.testing.assert_allclose(lines.rho[0, 0], wanted.rho[0, 0], atol=1e-4)
@@ -281,9 +280,9 @@ def test_unusable_ranges_are_refused(faw_ring, ranges, message):
 
 def test_unusable_calls_are_refused(faw_ring):
     ranges = dense(faw_ring, [])
-    with pytest.raises(SonarError, match="method 'best'; allowed is hough"):
+    with pytest.raises(SonarError, match=r"method 'best'; allowed is hough$"):
         extract_lines(faw_ring, ranges, method="best")
-    with pytest.raises(SonarError, match="rho_cells 20 x rho_cell 0.04"):
+    with pytest.raises(SonarError, match=r"rho_cells 20 x rho_cell 0\.04"):
         extract_lines(faw_ring, ranges, settings=HoughSettings(rho_cells=20))
     stranger = Log.from_echoes(
         np.array([0]), np.array([3]), np.array([24]), np.array([1.0]), stamp=np.zeros(1), pose=np.zeros((1, 3))

@@ -54,7 +54,13 @@ def test_detection_ranges_of_section_3(beam, neighbors, widths):
     [
         Ring(**BUMPER, beam=np.radians([40.0, 120.0, 60.0, 90.0]), neighbors=3, max_range=3.0),
         Ring.circular(count=10, beam=np.radians(150), neighbors=4),
-        Ring(np.zeros((3, 2)), np.radians([170.0, -170.0, 20.0]), beam=np.radians([50, 180, 30.0]), neighbors=1, max_range=1.0),
+        Ring(
+            np.zeros((3, 2)),
+            np.radians([170.0, -170.0, 20.0]),
+            beam=np.radians([50, 180, 30.0]),
+            neighbors=1,
+            max_range=1.0,
+        ),
     ],
 )
 def test_a_path_hears_a_direction_that_lies_in_both_cones_and_no_other(ring):
