@@ -4,24 +4,27 @@ Nothing heavy is imported here, so that help comes at once.
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module, metadata
+from pathlib import Path
 from typing import NoReturn
 
 from jaxsonar.hardware.errors import SonarError
 
 RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
+FIGURES = (".svg", ".png", ".pdf")
 
 
 class _Parser(argparse.ArgumentParser):
     """Answers a wrong call with one line and exit code 2."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+        self.exit(2, f"{self.prog}: {' '.join(message.split())}; see {self.prog} --help\n")
 
 
-def _number(kind: type, least: float, most: float):
+def _number(kind: type, least: float | int, most: float | int):
     """A number from ``least`` to ``most``, or a message that says so."""
 
     def parse(text: str):
@@ -38,8 +41,15 @@ def _number(kind: type, least: float, most: float):
     return parse
 
 
-def _finite(least: float, most: float = 1e9):
+def _finite(least: float | int, most: float | int = 1e9):
     return _number(float, least, most)
+
+
+def _figure(text: str) -> str:
+    """A name that a figure can be written to: a wrong one is refused before the work, not after it."""
+    if Path(text).suffix.lower() not in FIGURES:
+        raise argparse.ArgumentTypeError(f"{text!r} came; allowed is a file name ending in {', '.join(FIGURES)}")
+    return text
 
 
 def parser() -> argparse.ArgumentParser:
@@ -63,7 +73,9 @@ def parser() -> argparse.ArgumentParser:
     lines.add_argument(
         "-o", "--output", metavar="LINES", required=True, help="JSON Lines, an object a scan; - = stdout"
     )
-    lines.add_argument("--figure", metavar="FIG", help="draw arcs and lines of one scan, .svg, .png or .pdf")
+    lines.add_argument(
+        "--figure", type=_figure, metavar="FIG", help="draw arcs and lines of one scan, .svg, .png or .pdf"
+    )
     lines.add_argument("--scan", type=_number(int, -(2**62), 2**62), metavar="N", help="scan to draw (default: first)")
 
     simulate = command("simulate", "The echoes that a ring hears along a path through a room.")
@@ -91,6 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     try:
         getattr(import_module("jaxsonar.commands"), options.command)(options)
+        sys.stdout.flush()
     except SonarError as error:
         print(f"jaxsonar {options.command}: {error}", file=sys.stderr)
         return 2
@@ -98,6 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jaxsonar {options.command}: interrupted", file=sys.stderr)
         return 1
     except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output has gone; there is no one to tell
+        # The reader of our output has gone: what is left goes nowhere, or Python complains about it at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return 0

@@ -1,11 +1,13 @@
 """What the commands do: read, call the library, write, and say in one line what came of it."""
 
 import argparse
+import shutil
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 from rich.console import Console
@@ -28,6 +30,7 @@ def demo(options: argparse.Namespace) -> None:
 
 def lines(options: argparse.Namespace) -> None:
     """``jaxsonar lines``."""
+    from .files import shown
     from .hardware.errors import SonarError
     from .local import local_models, settings_for
     from .logs import load_log
@@ -35,11 +38,14 @@ def lines(options: argparse.Namespace) -> None:
     from .ringfile import load_ring
     from .settings import load_settings, save_settings
 
+    if options.scan is not None and not options.figure:
+        raise SonarError(f"--scan {options.scan} came alone; allowed is --scan with --figure, to which it belongs")
     ring, log = load_ring(options.ring), load_log(options.log)
     settings = settings_for(ring, load_settings(options.settings) if options.settings else None)
     drawn = None
     if options.scan is not None and options.scan not in log.scan:
-        raise SonarError(f"--scan {options.scan}: no such scan in {options.log}; it holds {len(log)}")
+        held = f"numbers from {log.scan.min()} to {log.scan.max()}" if len(log) else "none"
+        raise SonarError(f"--scan {options.scan}: no such scan in {shown(options.log)}; it holds {len(log)}, {held}")
     found: Counter[str] = Counter()
 
     def counted(models: Iterable) -> Iterator:
@@ -63,7 +69,7 @@ def lines(options: argparse.Namespace) -> None:
 
         scan = log[int((log.scan == drawn.scan).argmax())]
         figures.save(figures.lines_figure(ring, scan, drawn), options.figure)
-    total, lines_found, with_lines = len(log), found.pop("lines"), found.pop("scans", 0)
+    total, lines_found, with_lines = len(log), found.pop("lines", 0), found.pop("scans", 0)
     share = f" ({100 * with_lines / total:.1f} %)" if total else ""
     reasons = "".join(f"; {count} without: {why}" for why, count in found.most_common())
     _say(f"{total} scans, {lines_found} lines, {with_lines} scans with lines{share}{reasons}")
@@ -71,12 +77,14 @@ def lines(options: argparse.Namespace) -> None:
 
 def simulate(options: argparse.Namespace) -> None:
     """``jaxsonar simulate``."""
-    from .logs import save_log
+    from .logs import log_format, save_log
     from .ringfile import load_ring
     from .roompaths import load_path
     from .rooms import load_room
     from .simulate import simulate as simulate_scans
 
+    if options.output != "-":
+        log_format(options.output)  # complain before the work, not after it
     ring, room = load_ring(options.ring), load_room(options.room)
     poses, stamps = load_path(options.path)
     with _bar("scans", len(poses)) as show:
@@ -94,7 +102,13 @@ def simulate(options: argparse.Namespace) -> None:
             progress=lambda done, _: show(done),
         )
     log = simulation.as_log(ring, poses)
-    save_log(log, "/dev/stdout" if options.output == "-" else options.output)
+    if options.output == "-":
+        with TemporaryDirectory() as folder:
+            save_log(log, file := Path(folder) / "log.csv")
+            with open(file, encoding="utf-8") as text:
+                shutil.copyfileobj(text, sys.stdout)
+    else:
+        save_log(log, options.output)
     _say(f"{len(log)} scans, {len(log.range)} echoes")
 
 
@@ -121,7 +135,8 @@ def _bar(unit: str, total: int) -> Iterator[Callable[[int], None]]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(unit, total=total, rate="")
 
         def show(done: int) -> None:

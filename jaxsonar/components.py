@@ -35,8 +35,10 @@ def label_components(
     theta_seam = _touching(flat[:, 0], flat[:, -1], wrap=False)
     rho_seam = _touching(flat[:, :, 0], np.roll(flat[:, :, 0], rows // 2, axis=1), wrap=True)
     pairs = np.concatenate([theta_seam, rho_seam])
-    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(total, total))
-    merged = graph_components(graph, directed=False)[1]
+    merged = np.arange(total)
+    if len(pairs):
+        graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(total, total))
+        merged = graph_components(graph, directed=False)[1]
 
     cell = np.flatnonzero(flat)
     component = merged[flat.ravel()[cell]]
@@ -61,6 +63,8 @@ def _touching(
     one: Int[np.ndarray, "scans cells"], other: Int[np.ndarray, "scans cells"], *, wrap: bool
 ) -> Int[np.ndarray, "pairs 2"]:
     """Pairs of different labels, cell k of one side touching cells k-1, k and k+1 of the other."""
+    if not one.any() or not other.any():
+        return np.zeros((0, 2), np.int32)
     found = []
     for shift in (-1, 0, 1):
         shifted = np.roll(other, shift, axis=1)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -114,14 +115,11 @@ def compare(
 
 def pooled(parts: Sequence[Deviations]) -> Deviations:
     """Several comparisons as one."""
-    return Deviations(
-        **{
-            field.name: np.concatenate([getattr(part, field.name) for part in parts])
-            if field.name in ("rho", "theta", "bound_rho", "bound_theta")
-            else sum(getattr(part, field.name) for part in parts)
-            for field in fields(Deviations)
-        }
-    )
+    table: dict[str, Any] = {}
+    for field in fields(Deviations):
+        values = [getattr(part, field.name) for part in parts]
+        table[field.name] = np.concatenate(values) if isinstance(values[0], np.ndarray) else sum(values)
+    return Deviations(**table)
 
 
 def match(

@@ -1,7 +1,9 @@
 """Packing: from dense arrays or a log to the rectangles of real echoes that the compiled kernels take."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -18,6 +20,22 @@ SCANS_PER_STEP = (1, 16, 256)
 def room_for(count: int, *, least: int) -> int:
     """Smallest power of two that holds count things and at least ``least``: few shapes, so few compilations."""
     return max(least, 1 << max(count - 1, 0).bit_length())
+
+
+class Step(NamedTuple):
+    """Scans that one compiled step takes, and their echoes: real ones first, then padding, likewise for the scans."""
+
+    scans: slice
+    """Which scans of the batch these are."""
+    path: Int[np.ndarray, "rows columns"]
+    """Row of the ring's ``paths``; 0 where there is no echo."""
+    reported: Float[np.ndarray, "rows columns"]
+    """Half path length as reported, metres; NaN where there is no echo."""
+
+    @property
+    def packed(self) -> kernels.Echoes:
+        """The echoes as the kernels take them."""
+        return kernels.Echoes(jnp.asarray(self.path), jnp.asarray(self.reported))
 
 
 class FlatEchoes:
@@ -85,8 +103,8 @@ class FlatEchoes:
         heard = path >= 0
         return cls(len(log), log.echo_scan[heard], path[heard], log.range[heard]), int((~heard).sum())
 
-    def steps(self) -> Iterator[tuple[slice, kernels.Echoes]]:
-        """The scans in rectangles of few different shapes: which scans, and their echoes, padded."""
+    def steps(self) -> Iterator["Step"]:
+        """The scans in rectangles of few different shapes."""
         step = next((size for size in SCANS_PER_STEP if size >= self.scans), SCANS_PER_STEP[-1])
         for first in range(0, self.scans, step):
             last = min(first + step, self.scans)
@@ -98,4 +116,4 @@ class FlatEchoes:
             reported = np.full((step, columns), np.nan, np.float32)
             path[row, column] = self.path[begin:end]
             reported[row, column] = self.reported[begin:end]
-            yield slice(first, last), kernels.Echoes(path, reported)
+            yield Step(slice(first, last), path, reported)

@@ -6,6 +6,7 @@ Each function draws one figure and returns it; ``save`` writes it. Colours stay 
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +23,11 @@ from matplotlib.ticker import MultipleLocator
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.kernels.extraction import accumulators, points_of_widest_arc
 
 from .components import label_components
 from .echoes import FlatEchoes
 from .files import atomic_write
-from .local import LocalModel, settings_for
+from .local import LocalModel, arcs_of, settings_for
 from .logs import Scan
 from .poses import to_world
 from .ring import Ring
@@ -35,7 +35,7 @@ from .rooms import Room
 
 DIRECT, CROSS, LINE, WALL, FAINT, ROBOT = "#0072B2", "#E69F00", "#B5123E", "#8C8C8C", "#DDDDDD", "#222222"
 FORMATS = (".svg", ".png", ".pdf")
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "axes.spines.top": False,
@@ -88,7 +88,7 @@ def ring_figure(ring: Ring, *, transmitter: int = 0, reach: float | None = None)
     axes.plot(*np.asarray(ring.position[transmitter]), "o", color=LINE, ms=7)
     for k, ((x, y), heading) in enumerate(zip(ring.position, ring.heading, strict=True)):
         inward = np.array([x, y]) - 0.055 * np.array([np.cos(heading), np.sin(heading)])
-        axes.text(*inward, str(k), ha="center", va="center", fontsize=6, color=ROBOT)
+        axes.text(inward[0], inward[1], str(k), ha="center", va="center", fontsize=6, color=ROBOT)
     handles = [Line2D([], [], color=LINE, marker="o", ls="", label=f"sensor {transmitter} fires")]
     for distance in sorted({abs(int(o)) for o in offsets}):
         width = np.degrees(np.asarray(ring.echo_paths.width)[audible[np.abs(offsets) == distance][0]])
@@ -160,7 +160,7 @@ def lines_figure(
         axes.plot(*infinite.T, color=LINE, lw=0.8, ls=(0, (4, 3)), zorder=4, scalex=False, scaley=False)
         axes.plot(*to_world(pose, line.segment).T, color=LINE, lw=3.2, solid_capstyle="butt", zorder=5)
         place = to_world(pose, (foot * (1 + 0.12 / max(line.rho, 0.12)))[None])[0]
-        axes.text(*place, f"{number}", color=LINE, fontweight="bold", ha="center", va="center", zorder=6)
+        axes.text(place[0], place[1], str(number), color=LINE, fontweight="bold", ha="center", va="center", zorder=6)
     handles.append(Line2D([], [], color=LINE, lw=0.8, ls=(0, (4, 3)), label="the same line, continued"))
     _draw_robot(axes, ring, pose)
     handles += _arc_handles(ring)
@@ -172,11 +172,10 @@ def accumulator_figure(
 ) -> Figure:
     """The accumulator before and after the low pass, and the components above the threshold (paper, section 4)."""
     settings = settings_for(ring, settings)
-    packed = next(FlatEchoes.from_log(ring, scan.as_log())[0].steps())[1]
-    paths = ring.echo_paths
-    points = points_of_widest_arc(float(paths.width.max()), settings)
-    votes, smooth = (np.asarray(a)[0] for a in accumulators(ring.sensors, packed, settings=settings, points=points))
-    level = settings.threshold * float(kernels.full_wall_votes(paths, settings))
+    packed = next(FlatEchoes.from_log(ring, scan.as_log())[0].steps()).packed
+    arcs = arcs_of(ring, settings)
+    votes, smooth = (np.asarray(image)[0] for image in kernels.accumulators(arcs, packed, settings=settings))
+    level = float(arcs.level)
     labels = np.abs(label_components((smooth > level)[None])[0][0])
 
     with rc_context(STYLE):

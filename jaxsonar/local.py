@@ -4,13 +4,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.kernels.extraction import points_of_widest_arc
 
 from .components import label_components
 from .echoes import FlatEchoes, room_for
@@ -177,7 +176,7 @@ def settings_for(ring: Ring, settings: kernels.HoughSettings | None) -> kernels.
     Raises:
         SonarError: the given accumulator is too small for lines that this ring can report.
     """
-    reach = float(np.hypot(*np.asarray(ring.position).T).max() + ring.max_range)
+    reach = float(np.linalg.norm(ring.position, axis=1).max() + ring.max_range)
     if settings is None:
         settings = kernels.HoughSettings()
         needed = int(np.ceil(reach / settings.rho_cell))
@@ -190,6 +189,17 @@ def settings_for(ring: Ring, settings: kernels.HoughSettings | None) -> kernels.
     return settings
 
 
+_latest: list[tuple[Ring, kernels.HoughSettings, kernels.RingArcs]] = []
+
+
+def arcs_of(ring: Ring, settings: kernels.HoughSettings) -> kernels.RingArcs:
+    """Arcs of all paths of a ring; the latest ones are kept, so that a stream of single scans makes them once."""
+    if not (_latest and _latest[0][0] is ring and _latest[0][1] == settings):
+        points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
+        _latest[:] = [(ring, settings, kernels.ring_arcs(ring.sensors, settings=settings, points=points))]
+    return _latest[0][2]
+
+
 def _check_method(method: str) -> None:
     if method not in METHODS:
         raise SonarError(f"method {method!r}; allowed is {' or '.join(METHODS)}")
@@ -197,31 +207,36 @@ def _check_method(method: str) -> None:
 
 def _extract(ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings) -> Iterator[tuple[slice, _Extracted]]:
     """The paper's section 4 from echoes to lines, step by step over a batch of scans."""
-    sensors = ring.sensors
-    points = points_of_widest_arc(float(ring.echo_paths.width.max()), settings)
-    for scans, packed in echoes.steps():
+    arcs = arcs_of(ring, settings)
+    for step in echoes.steps():
+        packed = step.packed
         # Echo arcs -> equidistant points -> tangent lines -> votes -> low pass -> threshold, in one compiled step.
-        occupied = kernels.occupied_cells(sensors, packed, settings=settings, points=points)
+        occupied = kernels.occupied_cells(arcs, packed, settings=settings)
         # Clusters are regions of cohesive highly occupied cells.
         labels, counts = label_components(np.asarray(occupied))
         # Centres of gravity of the points in each cluster, and from the sensors involved the extent of each line.
         size = room_for(int(counts.max(initial=0)), least=16)
-        clusters, segments = kernels.cluster_lines(sensors, packed, labels, settings=settings, points=points, size=size)
-        real = slice(0, scans.stop - scans.start)  # the rest is padding
-        found = jax.tree.map(lambda a, real=real: np.asarray(a)[real], (clusters, segments))
-        lines, involved = _sift(found, settings.min_echoes)
-        heard = (packed.range[real] < ring.max_range).sum(axis=1)
-        yield scans, _Extracted(lines, involved, packed.path[real], heard, counts[real])
+        clusters, segments = kernels.cluster_lines(arcs, packed, jnp.asarray(labels), settings=settings, size=size)
+        real = slice(0, step.scans.stop - step.scans.start)  # the rest is padding
+        columns = (clusters.rho, clusters.theta, clusters.votes, segments, clusters.involved)
+        lines, involved = _sift(*(np.asarray(column)[real] for column in columns), min_echoes=settings.min_echoes)
+        heard = (step.reported[real] < ring.max_range).sum(axis=1)
+        yield step.scans, _Extracted(lines, involved, step.path[real], heard, counts[real])
 
 
 def _sift(
-    found: tuple[kernels.Clusters, Float[np.ndarray, "scans clusters 2 2"]], min_echoes: int
+    rho: Float[np.ndarray, "scans clusters"],
+    theta: Float[np.ndarray, "scans clusters"],
+    votes: Int[np.ndarray, "scans clusters"],
+    segments: Float[np.ndarray, "scans clusters 2 2"],
+    involved: Bool[np.ndarray, "scans clusters echoes"],
+    *,
+    min_echoes: int,
 ) -> tuple[Lines, Bool[np.ndarray, "scans lines echoes"]]:
     """Lines with enough echoes, strongest first, and which echoes are involved in each."""
-    clusters, segments = found
-    echoes = clusters.involved.sum(axis=-1)
+    echoes = involved.sum(axis=-1)
     kept = echoes >= min_echoes
-    order = np.argsort(np.where(kept, -clusters.votes, 1), axis=1, kind="stable")
+    order = np.argsort(np.where(kept, -votes, 1), axis=1, kind="stable")
     order = order[:, : int(kept.sum(axis=1).max(initial=0))]
 
     def sifted(values: np.ndarray) -> np.ndarray:
@@ -229,13 +244,13 @@ def _sift(
 
     kept = sifted(kept)
     lines = Lines(
-        rho=np.where(kept, sifted(clusters.rho), np.nan),
-        theta=np.where(kept, sifted(clusters.theta), np.nan),
-        votes=np.where(kept, sifted(clusters.votes), np.nan),
+        rho=np.where(kept, sifted(rho), np.nan),
+        theta=np.where(kept, sifted(theta), np.nan),
+        votes=np.where(kept, sifted(votes), np.nan),
         echoes=np.where(kept, sifted(echoes), 0),
         segments=np.where(kept[..., None, None], sifted(segments), np.nan),
     )
-    return lines, sifted(clusters.involved)
+    return lines, sifted(involved)
 
 
 def _why_empty(heard: int, components: int, min_echoes: int) -> str:

@@ -79,6 +79,8 @@ class Ring(eqx.Module):
         self.max_range = float(max_range)
         self.name = name
         self._check()
+        for array in (self.position, self.heading, self.beam, self.range_offset, self.speed_of_sound):
+            array.setflags(write=False)
 
     def _check(self) -> None:
         count = len(self.position)

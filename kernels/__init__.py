@@ -9,8 +9,13 @@ from .clusters import Clusters as Clusters
 from .clusters import centres_of_gravity as centres_of_gravity
 from .clusters import extent as extent
 from .extraction import Echoes as Echoes
+from .extraction import RingArcs as RingArcs
+from .extraction import accumulators as accumulators
 from .extraction import cluster_lines as cluster_lines
+from .extraction import lines_of_scan as lines_of_scan
 from .extraction import occupied_cells as occupied_cells
+from .extraction import points_of_widest_arc as points_of_widest_arc
+from .extraction import ring_arcs as ring_arcs
 from .geometry import edge_range as edge_range
 from .geometry import fold_line as fold_line
 from .geometry import normal as normal

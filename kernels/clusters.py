@@ -1,6 +1,7 @@
 """From labelled cells back to the points in them: centre of gravity, involved echoes, extent (paper, sections 4, 5)."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -37,19 +38,18 @@ def centres_of_gravity(
             side, so that a component around rho = 0 has one centre.
         clusters: how many components the result has room for.
     """
-    mirrored = label < 0
-    rho = jnp.where(mirrored, -rho, rho)
-    flip = jnp.where(mirrored, -1.0, 1.0)
-    member = jnp.abs(label)
-    votes = jnp.zeros(clusters + 1, jnp.int32).at[member].add(1, mode="promise_in_bounds")[1:]
-    moments = jnp.stack([rho, flip * jnp.cos(theta), flip * jnp.sin(theta)], axis=-1)
-    sums = jnp.zeros((clusters + 1, 3), rho.dtype).at[member].add(moments, mode="promise_in_bounds")[1:]
-    empty = votes == 0
+    flip = jnp.sign(label).astype(rho.dtype)  # 0 for the points in no component
+    moments = jnp.stack([jnp.abs(flip), flip * rho, flip * jnp.cos(theta), flip * jnp.sin(theta)], axis=-1)
+    per_echo = jax.vmap(lambda member, values: jnp.zeros((clusters + 1, 4), rho.dtype).at[member].add(values))
+    of_echo = per_echo(jnp.abs(label), moments)[:, 1:]
+    involved = (of_echo[..., 0] > 0).T
+    sums = of_echo.sum(axis=0)
+    votes = sums[:, 0].astype(jnp.int32)  # exact: far below 2**24 points
+    sums, empty = sums[:, 1:], votes == 0
     count = jnp.where(empty, 1, votes).astype(rho.dtype)
     nowhere = (sums[:, 1] == 0) & (sums[:, 2] == 0)
     east = jnp.where(nowhere, 1, sums[:, 1])  # atan2(0, 0) has no gradient
     mean_rho, mean_theta = fold_line(sums[:, 0] / count, jnp.arctan2(sums[:, 2], east))
-    involved = (member[None] == jnp.arange(1, clusters + 1)[:, None, None]).any(axis=-1)
     return Clusters(
         rho=jnp.where(empty, jnp.nan, mean_rho),
         theta=jnp.where(empty, jnp.nan, mean_theta),

@@ -17,35 +17,63 @@ from .paths import EchoPaths, Sensors, echo_paths
 class Echoes(eqx.Module):
     """Echoes of scans, packed: real ones first, then padding."""
 
-    path: Int[Array | np.ndarray, "*scans echoes"]
+    path: Int[Array, "*scans echoes"]
     """Row of the ring's ``paths``; 0 where there is no echo."""
-    range: Float[Array | np.ndarray, "*scans echoes"]
+    range: Float[Array, "*scans echoes"]
     """Half path length as reported, metres; NaN where there is no echo."""
 
 
-class _Ring(eqx.Module):
-    """What one call needs of the ring, the same for all its scans."""
+class RingArcs(eqx.Module):
+    """What all scans of a ring have in common: its paths and their arcs, for one set of settings."""
 
-    sensors: Sensors
     paths: EchoPaths
+    """Geometry of every echo path."""
     arcs: arcs.Arc
+    """Equidistant normals of every path."""
+    level: Float[Array, ""]
+    """Occupancy that a cell must exceed, points."""
+    range_scale: Float[Array, ""]
+    """Speed of sound over the speed that the reported ranges assume."""
+    max_range: Float[Array, ""]
+    """Half path length up to which an echo counts, metres."""
 
 
-def _prepare(sensors: Sensors, settings: HoughSettings, points: int) -> _Ring:
+@partial(jax.jit, static_argnames=("settings", "points"))
+def ring_arcs(sensors: Sensors, *, settings: HoughSettings, points: int) -> RingArcs:
+    """Equidistant points on the arcs of every path of a ring, and the threshold for its scans.
+
+    Args:
+        sensors: the ring.
+        settings: point pitch, cells and threshold.
+        points: room for this many points on an arc (``points_of_widest_arc``).
+    """
     paths = echo_paths(sensors)
-    one_arc = partial(arcs.arc, pitch=settings.point_pitch, points=points)
-    return _Ring(sensors, paths, jax.vmap(one_arc)(paths))
+    return RingArcs(
+        paths=paths,
+        arcs=jax.vmap(partial(arcs.arc, pitch=settings.point_pitch, points=points))(paths),
+        level=settings.threshold * hough.full_wall_votes(paths, settings),
+        range_scale=sensors.range_scale,
+        max_range=sensors.max_range,
+    )
 
 
-def _lines_of_scan(ring: _Ring, echoes: Echoes, settings: HoughSettings):
+def points_of_widest_arc(beam: Float[np.ndarray, " sensors"], settings: HoughSettings) -> int:
+    """Points that the widest arc of a ring needs: that of the direct path of the sensor with the widest cone."""
+    return max(1, int(np.ceil(np.max(beam) / settings.point_pitch - 1e-6)))
+
+
+def lines_of_scan(
+    ring: RingArcs, echoes: Echoes, settings: HoughSettings
+) -> tuple[Float[Array, "echoes points"], Float[Array, "echoes points"], Int[Array, "echoes points"]]:
     """Distance, normal direction and cell of every point of every echo of ONE scan."""
 
     def one_echo(path: Int[Array, ""], reported: Float[Array, ""]):
         arc = jax.tree.map(lambda leaf: leaf[path], ring.arcs)
-        max_range, scale = ring.sensors.max_range, ring.sensors.range_scale
         offset = ring.paths.range_offset[path]
-        reach = arcs.corrected_range(reported, range_offset=offset, range_scale=scale, max_range=max_range)
-        rho, counts = arcs.tangent_rho(arc, reach, max_range=max_range)
+        reach = arcs.corrected_range(
+            reported, range_offset=offset, range_scale=ring.range_scale, max_range=ring.max_range
+        )
+        rho, counts = arcs.tangent_rho(arc, reach, max_range=ring.max_range)
         return rho, arc.theta, counts
 
     rho, theta, counts = jax.vmap(one_echo)(echoes.path, echoes.range)
@@ -61,74 +89,65 @@ def _over_scans(one_scan: Callable, *scans):
     )
 
 
-@partial(jax.jit, static_argnames=("settings", "points"))
-def occupied_cells(
-    sensors: Sensors, echoes: Echoes, *, settings: HoughSettings, points: int
-) -> Bool[Array, "scans theta rho"]:
+@partial(jax.jit, static_argnames="settings")
+def occupied_cells(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -> Bool[Array, "scans theta rho"]:
     """The paper's section 4 up to the threshold, for a batch of scans in one compiled step.
 
     Args:
-        sensors: the ring.
+        ring: arcs of the ring's paths, and the threshold.
         echoes: (scans, echoes) packed echoes.
-        settings: accumulator, low pass and threshold.
-        points: most points that an arc has.
+        settings: accumulator and low pass.
 
     Returns:
         The highly occupied cells of each scan.
     """
-    ring = _prepare(sensors, settings, points)
-    level = settings.threshold * hough.full_wall_votes(ring.paths, settings)
 
     def one_scan(scan: Echoes) -> Bool[Array, "theta rho"]:
-        _, _, cells = _lines_of_scan(ring, scan, settings)  # arcs -> equidistant points -> tangent lines
+        _, _, cells = lines_of_scan(ring, scan, settings)  # arcs -> equidistant points -> tangent lines
         votes = hough.accumulate(cells, settings)  # points per cell
         smooth = hough.lowpass(votes, settings)  # balance between neighbor cells
-        return smooth > level  # highly occupied cells
+        return smooth > ring.level  # highly occupied cells
 
     return _over_scans(one_scan, echoes)
 
 
-@partial(jax.jit, static_argnames=("settings", "points"))
+@partial(jax.jit, static_argnames="settings")
 def accumulators(
-    sensors: Sensors, echoes: Echoes, *, settings: HoughSettings, points: int
+    ring: RingArcs, echoes: Echoes, *, settings: HoughSettings
 ) -> tuple[Int[Array, "scans theta rho"], Float[Array, "scans theta rho"]]:
     """Votes before and after the low pass, to look at; arguments as ``occupied_cells``."""
-    ring = _prepare(sensors, settings, points)
 
     def one_scan(scan: Echoes):
-        votes = hough.accumulate(_lines_of_scan(ring, scan, settings)[2], settings)
+        votes = hough.accumulate(lines_of_scan(ring, scan, settings)[2], settings)
         return votes, hough.lowpass(votes, settings)
 
     return _over_scans(one_scan, echoes)
 
 
-@partial(jax.jit, static_argnames=("settings", "points", "size"))
+@partial(jax.jit, static_argnames=("settings", "size"))
 def cluster_lines(
-    sensors: Sensors,
+    ring: RingArcs,
     echoes: Echoes,
     labels: Int[Array, "scans theta rho"],
     *,
     settings: HoughSettings,
-    points: int,
     size: int,
 ) -> tuple[clusters.Clusters, Float[Array, "scans clusters 2 2"]]:
     """The paper's section 4 from the labelled components on, and section 5's extent, for a batch of scans.
 
     Args:
-        sensors: the ring.
-        echoes: (scans, echoes) packed echoes, as ``occupied_cells`` got them.
+        ring: as ``occupied_cells`` got it.
+        echoes: as ``occupied_cells`` got them.
         labels: component of each cell: 0 none, k or -k (see ``centres_of_gravity``).
         settings: as ``occupied_cells`` got them.
-        points: as ``occupied_cells`` got it.
         size: room for this many components a scan.
 
     Returns:
         Centres of gravity with the echoes involved, and the endpoints of the segments, robot frame, metres.
     """
-    ring = _prepare(sensors, settings, points)
 
     def one_scan(scan: Echoes, label: Int[Array, "theta rho"]):
-        rho, theta, cells = _lines_of_scan(ring, scan, settings)
+        rho, theta, cells = lines_of_scan(ring, scan, settings)
         label_of_cell = jnp.append(label.ravel(), jnp.zeros(1, label.dtype))  # the last one: no cell, no component
         lines = clusters.centres_of_gravity(rho, theta, label_of_cell[cells], clusters=size)
         sensors_of_echoes = ring.paths.midpoint[scan.path]
@@ -138,8 +157,3 @@ def cluster_lines(
         return lines, segments
 
     return _over_scans(one_scan, echoes, labels)
-
-
-def points_of_widest_arc(widest: float, settings: HoughSettings) -> int:
-    """Points that the widest detection range (radians) of a ring needs, at least one."""
-    return max(1, round(float(np.ceil(widest / settings.point_pitch - 1e-6))))

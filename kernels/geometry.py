@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 def wrap_angle(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """The same direction in [-pi, pi), radians."""
-    wrapped = jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
-    return jnp.where(wrapped >= jnp.pi, -jnp.pi, wrapped)  # rounding may land on the open end
+    wrapped = angle - 2 * jnp.pi * jnp.floor((angle + jnp.pi) / (2 * jnp.pi))  # many times faster than a modulo
+    return jnp.where(jnp.abs(wrapped) < jnp.pi, wrapped, -jnp.pi)  # rounding may land on the open end, or beyond
 
 
 def normal(theta: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:

@@ -79,7 +79,8 @@ def cell_of(
     Lines that do not count and lines beyond the accumulator get the index one past the last cell.
     """
     rho, theta = fold_line(rho, theta)
-    row = jnp.floor((theta + jnp.pi) / settings.theta_cell).astype(jnp.int32) % settings.theta_cells
+    row = jnp.floor((theta + jnp.pi) / settings.theta_cell).astype(jnp.int32)
+    row = jnp.minimum(row, settings.theta_cells - 1)  # rounding just below pi
     column = jnp.floor(rho / settings.rho_cell)
     inside = counts & (column < settings.rho_cells)
     column = jnp.where(inside, column, 0).astype(jnp.int32)

@@ -148,8 +148,9 @@ def local_model(ring, echoes, settings, level):
     """The paper's section 4 for one scan: echoes (path, reported) to lines (rho, theta, votes, echoes, ends)."""
     per_echo = []
     for path, reported in echoes:
-        lines = lines_of_echo(ring, *ring.paths[path], reported, settings.point_pitch)
-        per_echo.append([(line, cell(*line, settings)) for line in lines])
+        tx, rx = ring.paths[path]
+        lines = lines_of_echo(ring, tx, rx, reported, settings.point_pitch)
+        per_echo.append([((rho, theta), cell(rho, theta, settings)) for rho, theta in lines])
     votes = accumulate([where for lines in per_echo for _, where in lines], settings)
     mask = lowpass(votes, settings) > level
     found = []

@@ -98,7 +98,8 @@ def test_tangent_lines_of_an_arc(faw_ring, run, path):
     rho, counts = run(tangents, arc, jnp.float32(reach))
     folded = kernels.fold_line(rho, arc.theta)
     came = np.stack(folded, axis=-1)[np.asarray(counts)]
-    wanted = oracles.lines_of_echo(faw_ring, *faw_ring.paths[path], reach, settings.point_pitch)
+    tx, rx = faw_ring.paths[path]
+    wanted = oracles.lines_of_echo(faw_ring, tx, rx, reach, settings.point_pitch)
     np.testing.assert_allclose(came, wanted, atol=2e-6)
 
 
@@ -191,9 +192,9 @@ def test_soft_votes_equal_hard_ones_on_cell_centres(rng):
 
 @given(st.floats(-2, 2, width=32, allow_subnormal=False), angles, st.floats(0.125, 5, width=32))
 def test_soft_votes_add_up_and_do_not_see_the_seams(rho, theta, weight):
-    soft = kernels.soft_accumulate(*map(one, (rho, theta, weight)), SMALL)
+    soft = kernels.soft_accumulate(one(rho), one(theta), one(weight), SMALL)
     assert float(soft.sum()) == pytest.approx(weight, rel=1e-4)
-    folded = kernels.soft_accumulate(*map(one, (-rho, theta + np.pi, weight)), SMALL)
+    folded = kernels.soft_accumulate(one(-rho), one(theta + np.pi), one(weight), SMALL)
     np.testing.assert_allclose(folded, soft, atol=1e-4)
 
 

@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
@@ -11,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxsonar import HoughSettings, Log, Ring, SonarError, extract_lines, kernels, local_model, local_models
+from jaxsonar.local import arcs_of
 
 THREE_WALLS = [(1.2, 0.3), (1.7, -1.9), (1.5, 3.1)]
 TURNED_RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # no point on a cell's border
@@ -246,21 +249,22 @@ def test_offsets_and_speed_of_sound_are_taken_out():
 
 def test_compiles_once_for_a_ring_whatever_the_scans(faw_ring, rng):
     """New scans, other numbers of echoes and a recalibrated ring run what was compiled before."""
-    kernels.occupied_cells.clear_cache()
-    kernels.cluster_lines.clear_cache()
+    compiled: list[Any] = [kernels.occupied_cells, kernels.cluster_lines, kernels.ring_arcs]
+    for kernel in compiled:
+        kernel.clear_cache()
     moved = Ring(faw_ring.position * 1.01, faw_ring.heading, beam=1.05, neighbors=3, max_range=2.1, name="moved")
     for k in range(4):
         ring = moved if k == 3 else faw_ring
         extract_lines(ring, dense(ring, a_scan(ring, rng, false=k * 3)))
-    assert kernels.occupied_cells._cache_size() == 1
-    assert kernels.cluster_lines._cache_size() == 1
+    assert [kernel._cache_size() for kernel in compiled] == [1, 1, 1]
 
 
 def test_one_jitted_step_from_echoes_to_cells(faw_ring):
     """Votes, low pass and threshold are one program: nothing but the cells leaves it."""
-    program = jax.make_jaxpr(
-        lambda sensors, echoes: kernels.occupied_cells(sensors, echoes, settings=HoughSettings(), points=60)
-    )(faw_ring.sensors, kernels.Echoes(np.zeros((2, 64), np.int32), np.full((2, 64), np.nan, np.float32)))
+    program = jax.make_jaxpr(lambda arcs, echoes: kernels.occupied_cells(arcs, echoes, settings=HoughSettings()))(
+        arcs_of(faw_ring, HoughSettings()),
+        kernels.Echoes(jnp.zeros((2, 64), jnp.int32), jnp.full((2, 64), jnp.nan, jnp.float32)),
+    )
     assert [str(out.dtype) for out in program.out_avals] == ["bool"]
     assert [out.shape for out in program.out_avals] == [(2, 100, 100)]
     assert len(program.eqns) == 1

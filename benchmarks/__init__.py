@@ -1,0 +1,1 @@
+"""Benchmarks: one file a workload, run as ``python -m benchmarks.NAME``."""
