@@ -4,6 +4,7 @@ Each function draws one figure and returns it; ``save`` writes it. Colours stay 
 """
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,11 @@ STYLE: dict[Any, Any] = {
 }
 
 
+def styled() -> AbstractContextManager[None]:
+    """The context in which figures of this house are made and written."""
+    return rc_context(STYLE)
+
+
 def save(figure: Figure, path: Path | str) -> None:
     """Write a figure as .svg, .png or .pdf, whole or not at all.
 
@@ -59,7 +65,7 @@ def save(figure: Figure, path: Path | str) -> None:
         raise SonarError(f"{path}: figure format {path.suffix!r}; allowed are {', '.join(FORMATS)}")
     kind = path.suffix.lower()[1:]
     metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    with rc_context(STYLE), atomic_write(path, binary=True) as file:
+    with styled(), atomic_write(path, binary=True) as file:
         figure.savefig(file, format=kind, metadata=metadata)
 
 
@@ -178,7 +184,7 @@ def accumulator_figure(
     level = float(arcs.level)
     labels = np.abs(label_components((smooth > level)[None])[0][0])
 
-    with rc_context(STYLE):
+    with styled():
         figure = Figure(figsize=(10.5, 4.2), layout="constrained")
         panels = figure.subplots(1, 3, sharex=True, sharey=True)
     box = (-180, 180, 0, settings.max_rho)
@@ -258,7 +264,7 @@ def _tangent(theta: float) -> Float[np.ndarray, "2"]:
 
 def _plan(title: str) -> tuple[Figure, Axes]:
     """An empty plan view in metres."""
-    with rc_context(STYLE):
+    with styled():
         figure = Figure(layout="constrained")
         axes = figure.add_subplot()
         axes.set_title(title)

@@ -16,7 +16,7 @@ def deviation_table(rows: Sequence[tuple[str, dict[str, Any]]], *, paper: dict[s
     sigma = rows[0][1]["sigma_mm"]
     table = Table(
         title=f"Extracted lines against true walls, simulated, range noise sigma = {sigma:g} mm",
-        caption="recall: walls with 8 or more echoes in the high-resolution ring that have a line up to 100 mm, 15 deg off\n"
+        caption="recall: walls with 8 or more echoes in the high-resolution ring that have a line (100 mm, 15 deg)\n"
         "false: lines that are no wall; CRB: Cramer-Rao bound from the wall's own echoes",
     )
     for column in ("", "scans", "echoes\n/scan", "walls", "recall", "lines", "false\n/scan", "at\ncorners"):
