@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 from rich.table import Table
 
@@ -101,6 +102,7 @@ def deviation_figure(found: dict[str, Agreement]) -> Figure:
             axes.axvline(0, color=figures.ROBOT, lw=0.8)
             axes.set_title(f"{name}: {len(row.rho)} of {row.square} square walls")
             axes.set_xlabel("line less own minimum (mm)")
+            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
         figure.axes[0].set_ylabel("scans")
     return figure
 
@@ -119,9 +121,10 @@ def main() -> None:
     models = list(local_models(ring, log))
     options.output.mkdir(parents=True, exist_ok=True)
 
+    lines_a_scan = np.mean([len(model.lines) for model in models])
     with_lines = np.mean([bool(model.lines) for model in models])
     table = Table(
-        title=f"{len(log)} scans, {with_lines:.1%} with lines, {np.mean([len(m.lines) for m in models]):.2f} lines a scan",
+        title=f"{len(log)} scans, {with_lines:.1%} with lines, {lines_a_scan:.2f} lines a scan",
         caption="lines less the recording's own minima, where a wall is square to the robot",
     )
     for column in ("", "square walls", "with a line", "median Δρ (mm)", "RMS Δρ (mm)", "RMS Δθ (deg)"):

@@ -86,7 +86,7 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--sigma", type=_finite(0), default=0.0, metavar="M", help="range noise, metres (default: 0)")
     simulate.add_argument("--drift", type=_finite(0), default=0.0, metavar="M", help="slow drift, metres (default: 0)")
     simulate.add_argument("--dropout", type=_finite(0, 1), default=0.0, metavar="P", help="echoes lost (default: 0)")
-    simulate.add_argument("--clutter", type=_finite(0), default=0.0, metavar="P", help="false echoes per real one")
+    simulate.add_argument("--clutter", type=_finite(0, 100), default=0.0, metavar="P", help="false echoes per real one")
     simulate.add_argument("--seed", type=_number(int, 0, 2**32 - 1), default=0, help="of the noise (default: 0)")
     simulate.add_argument("--max-echoes", type=_number(int, 1, 64), default=3, metavar="N", help="a path (default: 3)")
 

@@ -62,7 +62,7 @@ def lines(options: argparse.Namespace) -> None:
 
     models = local_models(ring, log, method=options.method, settings=settings, on_left_out=left_out)
     save_models(counted(_progress(models, len(log), "scans")), options.output)
-    if options.output != "-":
+    if options.output != "-" and Path(options.output).is_file():  # beside a device or a pipe there is no place
         save_settings(settings, Path(options.output).with_suffix(".settings.toml"))
     if options.figure and drawn is not None:
         from . import figures

@@ -18,8 +18,11 @@ SCANS_PER_STEP = (1, 16, 256)
 
 
 def room_for(count: int, *, least: int) -> int:
-    """Smallest power of two that holds count things and at least ``least``: few shapes, so few compilations."""
-    return max(least, 1 << max(count - 1, 0).bit_length())
+    """Room for count things in few different shapes, so few compilations: ``least``, 1.5 or 2 times that, and so on."""
+    room = least
+    while room < count:
+        room = room * 3 // 2 if room & (room - 1) == 0 else room * 4 // 3  # powers of two, and halfway between
+    return room
 
 
 class Step(NamedTuple):

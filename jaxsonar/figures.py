@@ -281,7 +281,7 @@ def _finish(figure: Figure, axes: Axes, handles: list[Line2D], *, width: float =
     axes.autoscale_view()
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     legend_rows = -(-len(handles) // 3)
-    figure.set_size_inches(width, (width - 0.7) * (high - low) / (right - left) + 0.8 + 0.2 * legend_rows)
+    figure.set_size_inches(width, (width - 0.7) * (high - low) / (right - left) + 1.0 + 0.22 * legend_rows)
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
 
@@ -318,7 +318,9 @@ def _draw_robot(axes: Axes, ring: Ring, pose: Float[np.ndarray, "3"]) -> None:
 
 
 def _arc_handles(ring: Ring) -> list[Line2D]:
-    labels = {DIRECT: "direct echo", CROSS: "cross echo", FAINT: f"no echo up to {ring.max_range:g} m"}
+    labels = {DIRECT: "direct echo", FAINT: f"no echo up to {ring.max_range:g} m"}
+    if ring.neighbors:
+        labels[CROSS] = "cross echo"
     return [Line2D([], [], color=colour, lw=1.4, label=label) for colour, label in labels.items()]
 
 

@@ -29,6 +29,7 @@ from .hough import cell_of as cell_of
 from .hough import full_wall_votes as full_wall_votes
 from .hough import lowpass as lowpass
 from .hough import soft_accumulate as soft_accumulate
+from .hough import theta_row as theta_row
 from .paths import EchoPaths as EchoPaths
 from .paths import Sensors as Sensors
 from .paths import echo_paths as echo_paths

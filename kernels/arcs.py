@@ -22,6 +22,10 @@ class Arc(eqx.Module):
 
     theta: Float[Array, "*paths points"]
     """Directions of the normals, radians, not wrapped."""
+    normal_x: Float[Array, "*paths points"]
+    """Cosines of the normals."""
+    normal_y: Float[Array, "*paths points"]
+    """Sines of the normals."""
     along: Float[Array, "*paths points"]
     """The virtual sensor's coordinate along each normal, m . n, metres."""
     across_squared: Float[Array, "*paths points"]
@@ -44,9 +48,12 @@ def arc(path: EchoPaths, *, pitch: float, points: int) -> Arc:
     whole = jnp.clip(jnp.round(path.width / pitch), 1, points)
     index = jnp.arange(points, dtype=path.width.dtype)
     theta = path.start + (index + 0.5) * (path.width / whole)
+    normals = normal(theta)
     return Arc(
         theta=theta,
-        along=normal(theta) @ path.midpoint,
+        normal_x=normals[:, 0],
+        normal_y=normals[:, 1],
+        along=normals @ path.midpoint,
         across_squared=(tangent(theta) @ path.half_baseline) ** 2,
         half_baseline_squared=path.half_baseline @ path.half_baseline,
         counts=(index < whole) & (path.width > 0),

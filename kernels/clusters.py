@@ -23,7 +23,8 @@ class Clusters(eqx.Module):
 
 def centres_of_gravity(
     rho: Float[Array, "echoes points"],
-    theta: Float[Array, "echoes points"],
+    normal_x: Float[Array, "echoes points"],
+    normal_y: Float[Array, "echoes points"],
     label: Int[Array, "echoes points"],
     *,
     clusters: int,
@@ -31,15 +32,17 @@ def centres_of_gravity(
     """Centre of gravity of the POINTS of each component (paper, section 4), the mean of theta taken on the circle.
 
     Args:
-        rho: distances of the voting lines, metres.
-        theta: directions of their normals, radians.
+        rho: distances of the voting lines, metres, any sign: (rho, n) and (-rho, -n) are one line.
+        normal_x: cosines of their normals.
+        normal_y: sines of their normals.
         label: component of the cell that each point fell into: 0 for none, k or -k for component k. Minus marks cells
-            that joined across rho = 0: their points enter as (-rho, theta + pi), the same lines seen from the other
-            side, so that a component around rho = 0 has one centre.
+            that joined across rho = 0: their points enter as the same lines seen from the other side, so that a
+            component around rho = 0 has one centre.
         clusters: how many components the result has room for.
     """
-    flip = jnp.sign(label).astype(rho.dtype)  # 0 for the points in no component
-    moments = jnp.stack([jnp.abs(flip), flip * rho, flip * jnp.cos(theta), flip * jnp.sin(theta)], axis=-1)
+    flip = jnp.where(rho < 0, -1, 1) * jnp.sign(label)  # 0 for the points in no component
+    flip = flip.astype(rho.dtype)
+    moments = jnp.stack([jnp.abs(flip), flip * rho, flip * normal_x, flip * normal_y], axis=-1)
     per_echo = jax.vmap(lambda member, values: jnp.zeros((clusters + 1, 4), rho.dtype).at[member].add(values))
     of_echo = per_echo(jnp.abs(label), moments)[:, 1:]
     involved = (of_echo[..., 0] > 0).T

@@ -30,6 +30,8 @@ class RingArcs(eqx.Module):
     """Geometry of every echo path."""
     arcs: arcs.Arc
     """Equidistant normals of every path."""
+    rows: Int[Array, "paths points"]
+    """Row of the accumulator that each normal belongs to."""
     level: Float[Array, ""]
     """Occupancy that a cell must exceed, points."""
     range_scale: Float[Array, ""]
@@ -48,9 +50,11 @@ def ring_arcs(sensors: Sensors, *, settings: HoughSettings, points: int) -> Ring
         points: room for this many points on an arc (``points_of_widest_arc``).
     """
     paths = echo_paths(sensors)
+    arcs_of_paths = jax.vmap(partial(arcs.arc, pitch=settings.point_pitch, points=points))(paths)
     return RingArcs(
         paths=paths,
-        arcs=jax.vmap(partial(arcs.arc, pitch=settings.point_pitch, points=points))(paths),
+        arcs=arcs_of_paths,
+        rows=hough.theta_row(arcs_of_paths.theta, settings),
         level=settings.threshold * hough.full_wall_votes(paths, settings),
         range_scale=sensors.range_scale,
         max_range=sensors.max_range,
@@ -64,20 +68,19 @@ def points_of_widest_arc(beam: Float[np.ndarray, " sensors"], settings: HoughSet
 
 def lines_of_scan(
     ring: RingArcs, echoes: Echoes, settings: HoughSettings
-) -> tuple[Float[Array, "echoes points"], Float[Array, "echoes points"], Int[Array, "echoes points"]]:
-    """Distance, normal direction and cell of every point of every echo of ONE scan."""
+) -> tuple[Float[Array, "echoes points"], Int[Array, "echoes points"]]:
+    """Distance (metres, any sign) and cell of the tangent line at every point of every echo's arc, for ONE scan."""
 
     def one_echo(path: Int[Array, ""], reported: Float[Array, ""]):
-        arc = jax.tree.map(lambda leaf: leaf[path], ring.arcs)
+        arc, row = jax.tree.map(lambda leaf: leaf[path], (ring.arcs, ring.rows))
         offset = ring.paths.range_offset[path]
         reach = arcs.corrected_range(
             reported, range_offset=offset, range_scale=ring.range_scale, max_range=ring.max_range
         )
         rho, counts = arcs.tangent_rho(arc, reach, max_range=ring.max_range)
-        return rho, arc.theta, counts
+        return rho, hough.cell_of(rho, row, counts, settings)
 
-    rho, theta, counts = jax.vmap(one_echo)(echoes.path, echoes.range)
-    return rho, theta, hough.cell_of(rho, theta, counts, settings)
+    return jax.vmap(one_echo)(echoes.path, echoes.range)
 
 
 def _over_scans(one_scan: Callable, *scans):
@@ -103,7 +106,7 @@ def occupied_cells(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -
     """
 
     def one_scan(scan: Echoes) -> Bool[Array, "theta rho"]:
-        _, _, cells = lines_of_scan(ring, scan, settings)  # arcs -> equidistant points -> tangent lines
+        _, cells = lines_of_scan(ring, scan, settings)  # arcs -> equidistant points -> tangent lines
         votes = hough.accumulate(cells, settings)  # points per cell
         smooth = hough.lowpass(votes, settings)  # balance between neighbor cells
         return smooth > ring.level  # highly occupied cells
@@ -118,7 +121,7 @@ def accumulators(
     """Votes before and after the low pass, to look at; arguments as ``occupied_cells``."""
 
     def one_scan(scan: Echoes):
-        votes = hough.accumulate(lines_of_scan(ring, scan, settings)[2], settings)
+        votes = hough.accumulate(lines_of_scan(ring, scan, settings)[1], settings)
         return votes, hough.lowpass(votes, settings)
 
     return _over_scans(one_scan, echoes)
@@ -147,9 +150,10 @@ def cluster_lines(
     """
 
     def one_scan(scan: Echoes, label: Int[Array, "theta rho"]):
-        rho, theta, cells = lines_of_scan(ring, scan, settings)
+        rho, cells = lines_of_scan(ring, scan, settings)
+        normal_x, normal_y = ring.arcs.normal_x[scan.path], ring.arcs.normal_y[scan.path]
         label_of_cell = jnp.append(label.ravel(), jnp.zeros(1, label.dtype))  # the last one: no cell, no component
-        lines = clusters.centres_of_gravity(rho, theta, label_of_cell[cells], clusters=size)
+        lines = clusters.centres_of_gravity(rho, normal_x, normal_y, label_of_cell[cells], clusters=size)
         sensors_of_echoes = ring.paths.midpoint[scan.path]
         segments = jax.vmap(clusters.extent, in_axes=(0, 0, None, 0))(
             lines.rho, lines.theta, sensors_of_echoes, lines.involved

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from .geometry import fold_line
+from .geometry import fold_line, wrap_angle
 from .paths import EchoPaths
 
 _DIRECTIONS = 719  # samples of the full turn, in step with neither cones nor cells
@@ -68,20 +68,26 @@ class HoughSettings:
         return self.rho_cells * self.rho_cell
 
 
+def theta_row(theta: Float[Array, "*lines"], settings: HoughSettings) -> Int[Array, "*lines"]:
+    """Row of the accumulator that holds the direction theta (radians, any turn)."""
+    row = jnp.floor((wrap_angle(theta) + jnp.pi) / settings.theta_cell).astype(jnp.int32)
+    return jnp.minimum(row, settings.theta_cells - 1)  # rounding just below pi
+
+
 def cell_of(
     rho: Float[Array, "*lines"],
-    theta: Float[Array, "*lines"],
+    row: Int[Array, "*lines"],
     counts: Bool[Array, "*lines"],
     settings: HoughSettings,
 ) -> Int[Array, "*lines"]:
-    """Flat index theta_row * rho_cells + rho_column of each line's cell.
+    """Flat index row * rho_cells + column of each line's cell, from its distance (any sign) and its row.
 
     Lines that do not count and lines beyond the accumulator get the index one past the last cell.
     """
-    rho, theta = fold_line(rho, theta)
-    row = jnp.floor((theta + jnp.pi) / settings.theta_cell).astype(jnp.int32)
-    row = jnp.minimum(row, settings.theta_cells - 1)  # rounding just below pi
-    column = jnp.floor(rho / settings.rho_cell)
+    turned = row + settings.theta_cells // 2  # (-rho, theta) is (rho, theta + pi)
+    turned = jnp.where(turned < settings.theta_cells, turned, turned - settings.theta_cells)
+    row = jnp.where(rho < 0, turned, row)
+    column = jnp.floor(jnp.abs(rho) / settings.rho_cell)
     inside = counts & (column < settings.rho_cells)
     column = jnp.where(inside, column, 0).astype(jnp.int32)
     return jnp.where(inside, row * settings.rho_cells + column, settings.theta_cells * settings.rho_cells)

@@ -155,7 +155,7 @@ def test_votes_fall_into_the_cells_of_their_lines(rng, run):
     rho = rng.uniform(-2.5, 2.5, 400).astype(np.float32)
     theta = rng.uniform(-9, 9, 400).astype(np.float32)
     counts = rng.random(400) < 0.8
-    voting = lambda rho, theta, counts: kernels.accumulate(kernels.cell_of(rho, theta, counts, SMALL), SMALL)  # noqa: E731
+    voting = lambda rho, theta, counts: kernels.accumulate(kernels.cell_of(rho, kernels.theta_row(theta, SMALL), counts, SMALL), SMALL)  # noqa: E731
     came = run(voting, rho, theta, counts)
     lines = zip(
         *(np.asarray(a, np.float64) for a in kernels.fold_line(jnp.asarray(rho), jnp.asarray(theta))),

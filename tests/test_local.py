@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from functools import partial
 from typing import Any
 
 import jax
@@ -252,7 +253,9 @@ def test_compiles_once_for_a_ring_whatever_the_scans(faw_ring, rng):
     compiled: list[Any] = [kernels.occupied_cells, kernels.cluster_lines, kernels.ring_arcs]
     for kernel in compiled:
         kernel.clear_cache()
-    moved = Ring(faw_ring.position * 1.01, faw_ring.heading, beam=1.05, neighbors=3, max_range=2.1, name="moved")
+    moved = Ring(
+        faw_ring.position * 1.01, faw_ring.heading, beam=faw_ring.beam, neighbors=3, max_range=2.1, name="moved"
+    )
     for k in range(4):
         ring = moved if k == 3 else faw_ring
         extract_lines(ring, dense(ring, a_scan(ring, rng, false=k * 3)))
@@ -261,10 +264,9 @@ def test_compiles_once_for_a_ring_whatever_the_scans(faw_ring, rng):
 
 def test_one_jitted_step_from_echoes_to_cells(faw_ring):
     """Votes, low pass and threshold are one program: nothing but the cells leaves it."""
-    program = jax.make_jaxpr(lambda arcs, echoes: kernels.occupied_cells(arcs, echoes, settings=HoughSettings()))(
-        arcs_of(faw_ring, HoughSettings()),
-        kernels.Echoes(jnp.zeros((2, 64), jnp.int32), jnp.full((2, 64), jnp.nan, jnp.float32)),
-    )
+    echoes = kernels.Echoes(jnp.zeros((2, 64), jnp.int32), jnp.full((2, 64), jnp.nan, jnp.float32))
+    step = partial(kernels.occupied_cells, settings=HoughSettings())
+    program = jax.make_jaxpr(step)(arcs_of(faw_ring, HoughSettings()), echoes)
     assert [str(out.dtype) for out in program.out_avals] == ["bool"]
     assert [out.shape for out in program.out_avals] == [(2, 100, 100)]
     assert len(program.eqns) == 1
