@@ -60,11 +60,16 @@ def lines(options: argparse.Namespace) -> None:
     def left_out(count: int) -> None:
         _say(f"left out {count} echoes of pairs of sensors that {ring.name!r} does not listen to")
 
-    models = local_models(ring, log, method=options.method, settings=settings, on_left_out=left_out)
+    try:
+        models = local_models(ring, log, method=options.method, settings=settings, on_left_out=left_out)
+    except SonarError as error:
+        raise SonarError(f"{shown(options.log)}: {error}") from None
     save_models(counted(_progress(models, len(log), "scans")), options.output)
     if options.output != "-" and Path(options.output).is_file():  # beside a device or a pipe there is no place
         save_settings(settings, Path(options.output).with_suffix(".settings.toml"))
-    if options.figure and drawn is not None:
+    if options.figure and drawn is None:
+        _say(f"no scan to draw: {options.figure} is not written")
+    elif options.figure:
         from . import figures
 
         scan = log[int((log.scan == drawn.scan).argmax())]

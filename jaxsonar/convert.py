@@ -48,5 +48,11 @@ def read_scans(source: str | os.PathLike[str], *, from_: str | None = None) -> L
         raise SonarError(f"{shown(source)}: format '{shown(from_)}' came; allowed are {known}")
     heard = RECORDINGS[from_](source)
     return Log.from_echoes(
-        heard.scan_index, heard.tx, heard.rx, heard.range, heard.amplitude, stamp=heard.stamp, pose=heard.pose
+        heard.scan_index,
+        heard.tx,
+        heard.rx,
+        heard.range,
+        amplitude=heard.amplitude,
+        stamp=heard.stamp,
+        pose=heard.pose,
     )

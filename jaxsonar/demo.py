@@ -16,6 +16,7 @@ from .modelfile import save_models
 from .office import Office, load_office
 from .ring import Ring
 from .ringfile import save_ring
+from .roompaths import save_path
 from .rooms import Room, random_pose, random_room, save_room
 from .settings import save_settings
 from .simulate import Simulation, simulate
@@ -71,6 +72,7 @@ def run_demo(output: Path, *, seed: int, on_step: Callable[[str], None]) -> list
     on_step("files and figures")
     save_ring(office.ring, output / "ring.toml")
     save_room(office.room, output / "office.geojson")
+    save_path(office.poses, office.stamps, output / "path.csv")
     save_log(log, output / "office.csv")
     save_models(models, output / "lines.jsonl")
     save_settings(settings_for(office.ring, None), output / "lines.settings.toml")

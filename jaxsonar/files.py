@@ -5,7 +5,7 @@ import os
 import secrets
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -80,7 +80,8 @@ def atomic_write(path: str | os.PathLike[str], *, binary: bool = False) -> Itera
         raise SonarError(f"{shown(path)}: cannot write: {reason(failure)}; allowed is {allowed}") from None
     finally:
         if temporary is not None:
-            temporary.unlink(missing_ok=True)
+            with suppress(OSError):  # it was never made; what went wrong is being told already
+                temporary.unlink()
 
 
 def _create(temporary: Path, target: Path) -> int:

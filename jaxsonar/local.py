@@ -148,13 +148,17 @@ def local_models(
         SonarError: a sensor number that the ring does not have, an unknown method.
     """
     _check_method(method)
+    settings = settings_for(ring, settings)
     echoes, left_out = FlatEchoes.from_log(ring, log)
     if left_out and on_left_out is not None:
         on_left_out(left_out)
-    paths, settings = ring.paths, settings_for(ring, settings)
+    return _models(ring, log, echoes, settings)
+
+
+def _models(ring: Ring, log: Log, echoes: FlatEchoes, settings: kernels.HoughSettings) -> Iterator[LocalModel]:
+    paths = ring.paths
     for scans, step in _extract(ring, echoes, settings):
         for row, index in enumerate(range(scans.start, scans.stop)):
-            found = np.flatnonzero(step.lines.echoes[row])
             lines = tuple(
                 Line(
                     rho=float(step.lines.rho[row, k]),
@@ -164,7 +168,7 @@ def local_models(
                     echoes=int(step.lines.echoes[row, k]),
                     paths=paths[np.unique(step.path[row][step.involved[row, k]])],
                 )
-                for k in found
+                for k in np.flatnonzero(step.lines.echoes[row])
             )
             empty = "" if lines else _why_empty(int(step.heard[row]), int(step.components[row]), settings.min_echoes)
             yield LocalModel(int(log.scan[index]), float(log.stamp[index]), lines, empty)

@@ -2,15 +2,26 @@
 
 import csv
 import os
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxsonar.hardware.errors import SonarError
 
+from .files import atomic_write, read_bytes, shown
+
 SECONDS_PER_POSE = 0.1
 """Between the stamps of poses that come without: about the rate of a full scan of the paper's ring."""
+
+
+def save_path(
+    poses: Float[np.ndarray, "poses 3"], stamps: Float[np.ndarray, " poses"], path: str | os.PathLike[str]
+) -> None:
+    """Write poses and stamps so that ``load_path`` gives the same ones."""
+    with atomic_write(path) as file:
+        file.write("stamp,x,y,theta\n")
+        for stamp, pose in zip(stamps.tolist(), poses.tolist(), strict=True):
+            file.write(",".join(map(repr, (stamp, *pose))) + "\n")
 
 
 def load_path(
@@ -29,30 +40,30 @@ def load_path(
         SonarError: no such file, no pose, other columns, or a value that is no finite number, with row and column.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise SonarError(f"{path}: {why}; allowed is a CSV file of poses") from None
+        text = read_bytes(path, what="poses (CSV)").decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise SonarError(f"{shown(path)}: this is no text; needed is a CSV file of poses") from None
     rows = [(number, row) for number, row in enumerate(csv.reader(text.splitlines()), start=1) if row]
     header = [name.strip() for name in rows[0][1]] if rows else []
     if sorted(header) not in (["theta", "x", "y"], ["stamp", "theta", "x", "y"]):
-        came = ",".join(header)[:80] or "nothing"
-        raise SonarError(f"{path}: row 1: {came} came; allowed are the columns x, y, theta and optionally stamp")
+        came = shown(",".join(header), 80) or "nothing"
+        raise SonarError(f"{shown(path)}: row 1: {came} came; allowed are the columns x, y, theta and optionally stamp")
     values = np.empty((len(rows) - 1, len(header)))
     for index, (number, row) in enumerate(rows[1:]):
         if len(row) != len(header):
-            raise SonarError(f"{path}: row {number}: {len(row)} values came; allowed are {len(header)}, as in row 1")
+            raise SonarError(
+                f"{shown(path)}: row {number}: {len(row)} values came; allowed are {len(header)}, as in row 1"
+            )
         for column, text in enumerate(row):
             try:
                 values[index, column] = float(text)
             except ValueError:
                 values[index, column] = np.nan
-            if not np.isfinite(values[index, column]):
-                raise SonarError(
-                    f"{path}: row {number}, column {header[column]}: {text!r} came; allowed is a finite number"
-                )
+            if not abs(values[index, column]) <= 1e9:  # nor NaN
+                place = f"{shown(path)}: row {number}, column {header[column]}"
+                raise SonarError(f"{place}: {shown(text, 40)!r} came; allowed is a finite number up to 1e9")
     if not len(values):
-        raise SonarError(f"{path}: no pose came; allowed is one or more")
+        raise SonarError(f"{shown(path)}: no pose came; allowed is one or more")
     column_of = {name: values[:, column] for column, name in enumerate(header)}
     poses = np.stack([column_of["x"], column_of["y"], column_of["theta"]], axis=-1)
     return poses, column_of.get("stamp", np.arange(len(poses)) * SECONDS_PER_POSE)

@@ -10,7 +10,7 @@ import tomli_w
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
-from .files import atomic_write
+from .files import atomic_write, read_bytes, reason, shown
 
 _File = msgspec.defstruct(
     "_File",
@@ -25,14 +25,13 @@ def load_settings(path: Path | str) -> kernels.HoughSettings:
     Raises:
         SonarError: no such file, no TOML, an unknown key, a value of another type or out of range.
     """
+    content = read_bytes(path, what="settings (TOML)")
     try:
-        text = Path(path).read_text(encoding="utf-8")
-        return kernels.HoughSettings(**msgspec.structs.asdict(msgspec.convert(tomllib.loads(text), _File)))
-    except OSError as error:
-        raise SonarError(f"{path}: {error.strerror}; allowed is a readable TOML file") from None
-    except (ValueError, msgspec.ValidationError) as error:  # ValueError: no text, no TOML, or out of range
+        given = msgspec.convert(tomllib.loads(content.decode()), _File)
+        return kernels.HoughSettings(**msgspec.structs.asdict(given))
+    except ValueError as failure:  # no text, no TOML, an unknown key, another type, out of range
         keys = ", ".join(field.name for field in fields(kernels.HoughSettings))
-        raise SonarError(f"{path}: {' '.join(str(error).split())}; the keys are {keys}") from None
+        raise SonarError(f"{shown(path)}: {reason(failure)}; the keys are {keys}") from None
 
 
 def save_settings(settings: kernels.HoughSettings, path: Path | str) -> None:

@@ -82,7 +82,7 @@ class Simulation:
     def as_log(self, ring: Ring, poses: Float[np.ndarray, "scans 3"]) -> Log:
         """A scan log of these echoes, the given poses (x, y, theta; metres, radians) in it as odometry."""
         tx, rx = ring.paths[self.path].T
-        return Log.from_echoes(self.scan, tx, rx, self.range, self.amplitude, stamp=self.stamps, pose=poses)
+        return Log.from_echoes(self.scan, tx, rx, self.range, amplitude=self.amplitude, stamp=self.stamps, pose=poses)
 
     def dense(self, paths: int, echoes: int) -> Float[np.ndarray, "scans paths echoes"]:
         """Ranges as ``extract_lines`` takes them: (scans, paths, echoes), nearest first, NaN = no echo.

@@ -39,10 +39,13 @@ class HoughSettings:
 
     def __post_init__(self):
         allowed = {
-            "theta_cells": (self.theta_cells >= 4 and self.theta_cells % 2 == 0, "an even number, at least 4"),
-            "rho_cells": (self.rho_cells >= 2, "2 or more"),
+            "theta_cells": (
+                4 <= self.theta_cells <= 10_000 and self.theta_cells % 2 == 0,
+                "an even number, 4 to 10000",
+            ),
+            "rho_cells": (2 <= self.rho_cells <= 10_000, "2 to 10000"),
             "rho_cell": (0 < self.rho_cell < np.inf, "more than 0 m"),
-            "point_pitch": (0 < self.point_pitch <= np.pi, "more than 0 and at most pi rad"),
+            "point_pitch": (1e-4 <= self.point_pitch <= np.pi, "0.0001 to pi rad"),
             "smoothing": (
                 len(self.smoothing) % 2 == 1
                 and len(self.smoothing) <= min(self.theta_cells, self.rho_cells)

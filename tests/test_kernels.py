@@ -155,7 +155,10 @@ def test_votes_fall_into_the_cells_of_their_lines(rng, run):
     rho = rng.uniform(-2.5, 2.5, 400).astype(np.float32)
     theta = rng.uniform(-9, 9, 400).astype(np.float32)
     counts = rng.random(400) < 0.8
-    voting = lambda rho, theta, counts: kernels.accumulate(kernels.cell_of(rho, kernels.theta_row(theta, SMALL), counts, SMALL), SMALL)  # noqa: E731
+
+    def voting(rho, theta, counts):
+        return kernels.accumulate(kernels.cell_of(rho, kernels.theta_row(theta, SMALL), counts, SMALL), SMALL)
+
     came = run(voting, rho, theta, counts)
     lines = zip(
         *(np.asarray(a, np.float64) for a in kernels.fold_line(jnp.asarray(rho), jnp.asarray(theta))),
@@ -235,7 +238,10 @@ def test_centres_of_gravity(rng, run):
     assert not far.all()
     label = np.where((np.arange(3) == 1)[:, None] & far[None], -label, label).astype(np.int32)
     label[0, :5] = 0  # points in no component
-    came = run(partial(kernels.centres_of_gravity, clusters=5), rho, theta, label)
+    other_side = rng.random(rho.shape) < 0.3  # (rho, n) and (-rho, -n) are one line
+    side = np.where(other_side, -1, 1).astype(np.float32)
+    points = (side * rho, side * np.cos(theta), side * np.sin(theta))
+    came = run(partial(kernels.centres_of_gravity, clusters=5), *points, label)
     np.testing.assert_array_equal(came.votes, [35, 40, 0, 40, 0])
     np.testing.assert_array_equal(np.isnan(came.rho), [False, False, True, False, True])
     np.testing.assert_array_equal(came.involved[:, :], np.eye(5, 3, dtype=bool)[[0, 1, 4, 2, 4]])

@@ -201,9 +201,7 @@ def test_defaults_are_given_by_keyword(name, function):
     assert not positional or name in POSITIONAL_DEFAULTS, f"{name}: {positional}"
 
 
-POSITIONAL_DEFAULTS = {
-    "Log.from_echoes",  # amplitude: the last column of the echoes, in the order of the file
-}
+POSITIONAL_DEFAULTS: set[str] = set()
 
 
 def test_public_methods_say_what_they_do():

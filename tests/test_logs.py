@@ -41,7 +41,7 @@ def log_of(scans):
         np.array(tx, np.int64),
         np.array(rx, np.int64),
         np.array(reported, np.float64),
-        np.array(amplitude, np.float64),
+        amplitude=np.array(amplitude, np.float64),
         stamp=np.array([s[1] for s in scans], np.float64),
         pose=np.array([s[2] for s in scans], np.float64).reshape(-1, 3),
         scan=np.array([s[0] for s in scans], np.int64),
@@ -134,7 +134,14 @@ def test_echo_scan_names_the_scan_of_every_echo(scans):
     expected = [i for i, scan in enumerate(log) for _ in scan.range]
     assert log.echo_scan.tolist() == expected
     again = Log.from_echoes(
-        log.echo_scan, log.tx, log.rx, log.range, log.amplitude, stamp=log.stamp, pose=log.pose, scan=log.scan
+        log.echo_scan,
+        log.tx,
+        log.rx,
+        log.range,
+        amplitude=log.amplitude,
+        stamp=log.stamp,
+        pose=log.pose,
+        scan=log.scan,
     )
     assert again == log
 
