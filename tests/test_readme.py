@@ -1,0 +1,60 @@
+"""What the README says a reader can run, runs: the Python example and the commands, in the order of the page."""
+
+import contextlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from jaxsonar import demo
+from jaxsonar.cli import main
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, flags=re.DOTALL)
+
+
+def blocks(language, containing):
+    return [text for kind, text in BLOCKS if kind == language and containing in text]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder in which the demo has run, with fewer random rooms."""
+    folder = tmp_path_factory.mktemp("readme")
+    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
+        patch.setattr(demo, "RANDOM_ROOMS", 1)
+        assert main(["demo"]) == 0
+    return folder
+
+
+def test_the_two_commands_stand_there_once_each():
+    setups = blocks("bash", "python3 -m venv .venv && .venv/bin/pip install")
+    assert [("bin/jaxsonar demo" in text, "bin/pytest" in text) for text in setups] == [(True, False), (False, True)]
+
+
+def test_the_python_example_runs(folder, capsys):
+    (example,) = blocks("python", "import jaxsonar")
+    with contextlib.chdir(folder):
+        exec(compile(example, "README.md", "exec"), {})
+    walls = capsys.readouterr().out.splitlines()
+    assert len(walls) == 3
+    assert all(wall.startswith("wall 1.") for wall in walls)
+
+
+def test_the_commands_run(folder, monkeypatch):
+    pytest.importorskip("pyarrow")
+    monkeypatch.setattr(demo, "RANDOM_ROOMS", 1)
+    (commands,) = blocks("bash", "jaxsonar simulate")
+    with contextlib.chdir(folder):
+        for command in commands.strip().splitlines():
+            program, *arguments = shlex.split(command)
+            assert program == "jaxsonar"
+            assert main(arguments) == 0, command
+        assert {"scans.csv", "scans.parquet", "lines.jsonl", "scan.svg"} <= {file.name for file in folder.iterdir()}
+
+
+def test_pictures_and_pages_exist():
+    for target in re.findall(r"\]\(([^)#:]+)\)", README):
+        assert (ROOT / target).is_file(), target
