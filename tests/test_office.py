@@ -181,7 +181,7 @@ def test_segments_of_true_walls_lie_on_them(office, noisy):
 FIGURES = ("1-ring", "2-reference", "3-arcs", "4-lines", "5-accumulator", "6-segments")
 FILES = {
     *(f"{name}.{suffix}" for name in FIGURES for suffix in ("svg", "png")),
-    *("office.csv", "office.geojson", "ring.toml", "lines.jsonl", "lines.settings.toml", "table.json"),
+    *("office.csv", "path.csv", "office.geojson", "ring.toml", "lines.jsonl", "lines.settings.toml", "table.json"),
 }
 
 
