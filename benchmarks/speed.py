@@ -20,7 +20,7 @@ from jaxsonar import HoughSettings, Ring, extract_lines, kernels
 from jaxsonar.components import label_components
 from jaxsonar.echoes import FlatEchoes, room_for
 from jaxsonar.local import arcs_of
-from jaxsonar.rooms import random_pose, random_room
+from jaxsonar.randomrooms import random_pose, random_room
 from jaxsonar.simulate import simulate
 
 SLOTS = 3

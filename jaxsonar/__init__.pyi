@@ -10,12 +10,13 @@ from .logs import Log as Log
 from .logs import Scan as Scan
 from .logs import load_log as load_log
 from .logs import save_log as save_log
+from .randomrooms import random_pose as random_pose
+from .randomrooms import random_room as random_room
 from .ring import Ring as Ring
 from .ringfile import load_ring as load_ring
 from .ringfile import save_ring as save_ring
+from .roomfile import load_room as load_room
+from .roomfile import save_room as save_room
 from .rooms import Room as Room
-from .rooms import load_room as load_room
-from .rooms import random_room as random_room
-from .rooms import save_room as save_room
 from .simulate import Simulation as Simulation
 from .simulate import simulate as simulate

@@ -8,10 +8,13 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+if TYPE_CHECKING:
+    from .local import LocalModel
 
 Item = TypeVar("Item")
 
@@ -42,20 +45,9 @@ def lines(options: argparse.Namespace) -> None:
         raise SonarError(f"--scan {options.scan} came alone; allowed is --scan with --figure, to which it belongs")
     ring, log = load_ring(options.ring), load_log(options.log)
     settings = settings_for(ring, load_settings(options.settings) if options.settings else None)
-    drawn = None
     if options.scan is not None and options.scan not in log.scan:
         held = f"numbers from {log.scan.min()} to {log.scan.max()}" if len(log) else "none"
         raise SonarError(f"--scan {options.scan}: no such scan in {shown(options.log)}; it holds {len(log)}, {held}")
-    found: Counter[str] = Counter()
-
-    def counted(models: Iterable) -> Iterator:
-        nonlocal drawn
-        for model in models:
-            found["scans" if model.lines else model.empty] += 1
-            found["lines"] += len(model.lines)
-            if drawn is None and options.scan in (None, model.scan):
-                drawn = model
-            yield model
 
     def left_out(count: int) -> None:
         _say(f"left out {count} echoes of pairs of sensors that {ring.name!r} does not listen to")
@@ -64,28 +56,26 @@ def lines(options: argparse.Namespace) -> None:
         models = local_models(ring, log, method=options.method, settings=settings, on_left_out=left_out)
     except SonarError as error:
         raise SonarError(f"{shown(options.log)}: {error}") from None
-    save_models(counted(_progress(models, len(log), "scans")), options.output)
+    tally = _Tally(options.scan)
+    save_models(tally.watch(_progress(models, len(log), "scans")), options.output)
     if options.output != "-" and Path(options.output).is_file():  # beside a device or a pipe there is no place
         save_settings(settings, Path(options.output).with_suffix(".settings.toml"))
-    if options.figure and drawn is None:
+    if options.figure and tally.wanted is None:
         _say(f"no scan to draw: {options.figure} is not written")
     elif options.figure:
         from . import figures
 
-        scan = log[int((log.scan == drawn.scan).argmax())]
-        figures.save(figures.lines_figure(ring, scan, drawn), options.figure)
-    total, lines_found, with_lines = len(log), found.pop("lines", 0), found.pop("scans", 0)
-    share = f" ({100 * with_lines / total:.1f} %)" if total else ""
-    reasons = "".join(f"; {count} without: {why}" for why, count in found.most_common())
-    _say(f"{total} scans, {lines_found} lines, {with_lines} scans with lines{share}{reasons}")
+        scan = log[int((log.scan == tally.wanted.scan).argmax())]
+        figures.save(figures.lines_figure(ring, scan, tally.wanted), options.figure)
+    _say(tally.summary())
 
 
 def simulate(options: argparse.Namespace) -> None:
     """``jaxsonar simulate``."""
     from .logs import log_format, save_log
     from .ringfile import load_ring
+    from .roomfile import load_room
     from .roompaths import load_path
-    from .rooms import load_room
     from .simulate import simulate as simulate_scans
 
     if options.output != "-":
@@ -123,6 +113,32 @@ def convert(options: argparse.Namespace) -> None:
 
     log = convert_log(options.source, options.destination, from_=options.from_)
     _say(f"{len(log)} scans, {len(log.range)} echoes")
+
+
+class _Tally:
+    """What a run over many scans came to, and the model that a figure is wanted of."""
+
+    def __init__(self, scan: int | None):
+        self.scans = self.lines = self.with_lines = 0
+        self.reasons: Counter[str] = Counter()
+        self.scan = scan
+        self.wanted: LocalModel | None = None
+
+    def watch(self, models: "Iterable[LocalModel]") -> "Iterator[LocalModel]":
+        for model in models:
+            self.scans += 1
+            self.lines += len(model.lines)
+            self.with_lines += bool(model.lines)
+            if model.empty:
+                self.reasons[model.empty] += 1
+            if self.wanted is None and self.scan in (None, model.scan):
+                self.wanted = model
+            yield model
+
+    def summary(self) -> str:
+        share = f" ({100 * self.with_lines / self.scans:.1f} %)" if self.scans else ""
+        reasons = "".join(f"; {count} without: {why}" for why, count in self.reasons.most_common())
+        return f"{self.scans} scans, {self.lines} lines, {self.with_lines} scans with lines{share}{reasons}"
 
 
 def _say(text: str) -> None:

@@ -35,13 +35,11 @@ def label_components(
     theta_seam = _touching(flat[:, 0], flat[:, -1], wrap=False)
     rho_seam = _touching(flat[:, :, 0], np.roll(flat[:, :, 0], rows // 2, axis=1), wrap=True)
     pairs = np.concatenate([theta_seam, rho_seam])
-    merged = np.arange(total)
+    cell = np.flatnonzero(flat)
+    component = flat.ravel()[cell]
     if len(pairs):
         graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(total, total))
-        merged = graph_components(graph, directed=False)[1]
-
-    cell = np.flatnonzero(flat)
-    component = merged[flat.ravel()[cell]]
+        component = graph_components(graph, directed=False)[1][component]
     _, first, component = np.unique(component, return_index=True, return_inverse=True)
     scan_of_component = cell[first] // (rows * columns)
     order = np.argsort(first)  # by scan, and within a scan by first cell

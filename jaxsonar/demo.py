@@ -14,10 +14,12 @@ from .local import LocalModel, local_models, settings_for
 from .logs import Log, save_log
 from .modelfile import save_models
 from .office import Office, load_office
+from .randomrooms import random_pose, random_room
 from .ring import Ring
 from .ringfile import save_ring
+from .roomfile import save_room
 from .roompaths import save_path
-from .rooms import Room, random_pose, random_room, save_room
+from .rooms import Room
 from .settings import save_settings
 from .simulate import Simulation, simulate
 

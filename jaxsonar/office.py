@@ -8,8 +8,9 @@ from jaxtyping import Float
 
 from .ring import Ring
 from .ringfile import load_ring
+from .roomfile import load_room
 from .roompaths import load_path
-from .rooms import Room, load_room
+from .rooms import Room
 
 
 class Office(NamedTuple):

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxsonar import Room, load_room, random_pose, random_room, save_room
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.rooms import Room, lines_in, load_room, point_to_walls, random_pose, random_room, save_room
+from jaxsonar.rooms import lines_in, point_to_walls
 
 SQUARE = [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]]
 seeds = st.integers(0, 2**32 - 1)

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxsonar import Room, random_pose, random_room
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.reflections import Reflections, reflections
 from jaxsonar.ring import Ring
-from jaxsonar.rooms import Room, random_pose, random_room
 from jaxsonar.simulate import Acoustics, Kind, Simulation, simulate
 
 seeds = st.integers(0, 2**32 - 1)
