@@ -60,13 +60,14 @@ def lines(options: argparse.Namespace) -> None:
     save_models(tally.watch(_progress(models, len(log), "scans")), options.output)
     if options.output != "-" and Path(options.output).is_file():  # beside a device or a pipe there is no place
         save_settings(settings, Path(options.output).with_suffix(".settings.toml"))
-    if options.figure and tally.wanted is None:
+    model = tally.wanted
+    if options.figure and model is None:
         _say(f"no scan to draw: {options.figure} is not written")
-    elif options.figure:
+    elif options.figure and model is not None:
         from . import figures
 
-        scan = log[int((log.scan == tally.wanted.scan).argmax())]
-        figures.save(figures.lines_figure(ring, scan, tally.wanted), options.figure)
+        scan = log[int((log.scan == model.scan).argmax())]
+        figures.save(figures.lines_figure(ring, scan, model), options.figure)
     _say(tally.summary())
 
 
