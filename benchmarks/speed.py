@@ -24,6 +24,7 @@ from jaxsonar.randomrooms import random_pose, random_room
 from jaxsonar.simulate import simulate
 
 SLOTS = 3
+CELLS = 100 * 100
 
 
 def scans_of_random_rooms(ring: Ring, count: int, *, seed: int = 0) -> np.ndarray:
@@ -115,7 +116,7 @@ def main() -> None:
     plain = seconds(lambda: [peer.lines(scan) for scan in ranges], repeats=max(repeats // 3, 2))
 
     arcs = arcs_of(ring, settings)
-    steps = list(FlatEchoes.from_dense(ring, ranges).steps())
+    steps = list(FlatEchoes.from_dense(ring, ranges).steps(CELLS))
     packed = [step.packed for step in steps]
     masks = [kernels.occupied_cells(arcs, echoes, settings=settings) for echoes in packed]
     labelled = [label_components(np.asarray(mask)) for mask in masks]
@@ -134,7 +135,7 @@ def main() -> None:
         )
 
     stages = {
-        "pack the echoes": lambda: list(FlatEchoes.from_dense(ring, ranges).steps()),
+        "pack the echoes": lambda: list(FlatEchoes.from_dense(ring, ranges).steps(CELLS)),
         "votes, low pass, threshold (one jitted step)": votes,
         "connected components (OpenCV, whole batch)": lambda: [label_components(np.asarray(mask)) for mask in masks],
         "centres of gravity, extents (jitted)": centres,

@@ -1,13 +1,12 @@
 """What the commands do: read, call the library, write, and say in one line what came of it."""
 
 import argparse
-import shutil
+import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
@@ -21,10 +20,11 @@ Item = TypeVar("Item")
 
 def demo(options: argparse.Namespace) -> None:
     """``jaxsonar demo``."""
-    from .demo import PAPER, run_demo, summary
+    from .demo import PAPER, RANDOM_ROOMS, run_demo, summary
     from .tables import deviation_table
 
-    rows = run_demo(Path(options.output), seed=options.seed, on_step=_say)
+    with _bar("rooms", RANDOM_ROOMS) as show:
+        rows = run_demo(Path(options.output), seed=options.seed, on_step=_say, on_room=show)
     Console(width=None if sys.stdout.isatty() else 140).print(
         deviation_table([(name, summary(row)) for name, row in rows], paper=PAPER)
     )
@@ -33,7 +33,7 @@ def demo(options: argparse.Namespace) -> None:
 
 def lines(options: argparse.Namespace) -> None:
     """``jaxsonar lines``."""
-    from .files import shown
+    from .files import refuse_folder, shown
     from .hardware.errors import SonarError
     from .local import local_models, settings_for
     from .logs import load_log
@@ -41,6 +41,9 @@ def lines(options: argparse.Namespace) -> None:
     from .ringfile import load_ring
     from .settings import load_settings, save_settings
 
+    _refuse_overwriting(options.output, options.log, options.ring)
+    if options.figure:
+        refuse_folder(options.figure)  # complain before the work, not after it
     if options.scan is not None and not options.figure:
         raise SonarError(f"--scan {options.scan} came alone; allowed is --scan with --figure, to which it belongs")
     ring, log = load_ring(options.ring), load_log(options.log)
@@ -58,8 +61,8 @@ def lines(options: argparse.Namespace) -> None:
         raise SonarError(f"{shown(options.log)}: {error}") from None
     tally = _Tally(options.scan)
     save_models(tally.watch(_progress(models, len(log), "scans")), options.output)
-    if options.output != "-" and Path(options.output).is_file():  # beside a device or a pipe there is no place
-        save_settings(settings, Path(options.output).with_suffix(".settings.toml"))
+    if beside := _settings_file(options.output):
+        save_settings(settings, beside)
     model = tally.wanted
     if options.figure and model is None:
         _say(f"no scan to draw: {options.figure} is not written")
@@ -73,12 +76,17 @@ def lines(options: argparse.Namespace) -> None:
 
 def simulate(options: argparse.Namespace) -> None:
     """``jaxsonar simulate``."""
+    import tomli_w
+
+    from .files import atomic_write
     from .logs import log_format, save_log
+    from .logs_csv import csv_lines
     from .ringfile import load_ring
     from .roomfile import load_room
     from .roompaths import load_path
     from .simulate import simulate as simulate_scans
 
+    _refuse_overwriting(options.output, options.room, options.ring, options.path)
     if options.output != "-":
         log_format(options.output)  # complain before the work, not after it
     ring, room = load_ring(options.ring), load_room(options.room)
@@ -99,12 +107,13 @@ def simulate(options: argparse.Namespace) -> None:
         )
     log = simulation.as_log(ring, poses)
     if options.output == "-":
-        with TemporaryDirectory() as folder:
-            save_log(log, file := Path(folder) / "log.csv")
-            with open(file, encoding="utf-8") as text:
-                shutil.copyfileobj(text, sys.stdout)
+        sys.stdout.writelines(csv_lines(log))
     else:
         save_log(log, options.output)
+    if beside := _settings_file(options.output):
+        said = {key: value for key, value in vars(options).items() if key not in ("command", "output")}
+        with atomic_write(beside, binary=True) as file:
+            tomli_w.dump(said, file)
     _say(f"{len(log)} scans, {len(log.range)} echoes")
 
 
@@ -114,6 +123,20 @@ def convert(options: argparse.Namespace) -> None:
 
     log = convert_log(options.source, options.destination, from_=options.from_)
     _say(f"{len(log)} scans, {len(log.range)} echoes")
+
+
+def _refuse_overwriting(output: str, *inputs: str) -> None:
+    from .files import shown
+    from .hardware.errors import SonarError
+
+    for given in inputs:
+        if os.path.exists(given) and os.path.exists(output) and os.path.samefile(given, output):
+            raise SonarError(f"-o {shown(output)}: this is an input; allowed is another file")
+
+
+def _settings_file(output: str) -> Path | None:
+    """Where the settings go that a result was made with; beside a device, a pipe or standard output is no place."""
+    return Path(output).with_suffix(".settings.toml") if output != "-" and Path(output).is_file() else None
 
 
 class _Tally:

@@ -60,7 +60,7 @@ def label_components(
 def _touching(
     one: Int[np.ndarray, "scans cells"], other: Int[np.ndarray, "scans cells"], *, wrap: bool
 ) -> Int[np.ndarray, "pairs 2"]:
-    """Pairs of different labels, cell k of one side touching cells k-1, k and k+1 of the other."""
+    """Pairs of labels that touch: cell k of one side touches cells k-1, k and k+1 of the other."""
     if not one.any() or not other.any():
         return np.zeros((0, 2), np.int32)
     found = []

@@ -38,17 +38,22 @@ def conventional_ring(ring: Ring) -> Ring:
         beam=np.radians(30.0),
         neighbors=0,
         max_range=ring.max_range,
+        range_offset=ring.range_offset,
+        speed_of_sound=float(ring.speed_of_sound),
         name="conventional ring",
     )
 
 
-def run_demo(output: Path, *, seed: int, on_step: Callable[[str], None]) -> list[tuple[str, Deviations]]:
+def run_demo(
+    output: Path, *, seed: int, on_step: Callable[[str], None], on_room: Callable[[int], None] = lambda done: None
+) -> list[tuple[str, Deviations]]:
     """Simulate, extract, compare, draw; everything is written to a folder.
 
     Args:
         output: the folder; made if it does not exist.
         seed: of rooms, poses and noise.
         on_step: told what comes next.
+        on_room: told how many random rooms are done.
 
     Returns:
         Rows of the table: what was looked at, and the deviations.
@@ -68,7 +73,7 @@ def run_demo(output: Path, *, seed: int, on_step: Callable[[str], None]) -> list
         ("office, first pose", _deviations(office.ring, models[:1], simulation, office)),
         ("office, 17 poses", _deviations(office.ring, models, simulation, office)),
         ("office, 17 poses, conventional ring", _deviations(usual, usual_models, usual_simulation, office, simulation)),
-        *_random_rows(office.ring, usual, seed),
+        *_random_rows(office.ring, usual, seed, on_room),
     ]
 
     on_step("files and figures")
@@ -120,7 +125,9 @@ def _deviations(
     return compare(ring, models, simulation, office.room, office.poses[: len(models)], sigma=SIGMA, judge=judge)
 
 
-def _random_rows(ring: Ring, usual: Ring, seed: int) -> Iterator[tuple[str, Deviations]]:
+def _random_rows(
+    ring: Ring, usual: Ring, seed: int, on_room: Callable[[int], None]
+) -> Iterator[tuple[str, Deviations]]:
     """Both rings in the same random rooms, the walls to be found being those that the first one hears well."""
     rng = np.random.default_rng(seed)
     full, conventional = [], []
@@ -133,6 +140,7 @@ def _random_rows(ring: Ring, usual: Ring, seed: int) -> Iterator[tuple[str, Devi
         first = simulate(usual, room, poses, sigma=SIGMA, seed=seed + k, max_echoes=1)
         models = list(local_models(usual, first.as_log(usual, poses)))
         conventional.append(compare(usual, models, first, room, poses, sigma=SIGMA, judge=heard))
+        on_room(k + 1)
     what = f"{RANDOM_ROOMS * POSES_PER_ROOM} random poses"
     yield what, pooled(full)
     yield f"{what}, conventional ring", pooled(conventional)

@@ -35,7 +35,7 @@ class Deviations:
     lines: int
     """Extracted lines."""
     false: int
-    """Lines that are no wall with a first-order echo."""
+    """Lines left over: no wall with a first-order echo, or a second line on one."""
     false_at_corners: int
     """Of those, lines that pass a right-angled corner which answered, square to the view of it."""
     rho: Float[np.ndarray, " matches"]

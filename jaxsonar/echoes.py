@@ -14,7 +14,9 @@ from .logs import Log
 from .ring import Ring
 
 SCANS_PER_STEP = (1, 16, 256)
-"""Numbers of scans that a compiled step takes: the smallest that holds the batch, padded with scans without echoes."""
+"""Numbers of scans that a compiled step takes; what remains of a batch is padded with scans without echoes."""
+_FARTHEST = 1e6  # m; beyond all rings, and within single precision
+_FEW_CELLS = 50_000  # accumulators larger than this are not stacked by the hundred
 
 
 def room_for(count: int, *, least: int) -> int:
@@ -106,10 +108,13 @@ class FlatEchoes:
         heard = path >= 0
         return cls(len(log), log.echo_scan[heard], path[heard], log.range[heard]), int((~heard).sum())
 
-    def steps(self) -> Iterator["Step"]:
-        """The scans in rectangles of few different shapes."""
-        step = next((size for size in SCANS_PER_STEP if size >= self.scans), SCANS_PER_STEP[-1])
-        for first in range(0, self.scans, step):
+    def steps(self, cells: int) -> Iterator["Step"]:
+        """The scans in rectangles of few different shapes, fewer scans at once if the accumulator has many cells."""
+        one, some, many = SCANS_PER_STEP
+        last = 0
+        while last < self.scans:
+            first, left = last, self.scans - last
+            step = one if left == 1 else some if left <= 4 * some or cells > _FEW_CELLS else many
             last = min(first + step, self.scans)
             begin, end = self.start[first], self.start[last]
             row = self.scan[begin:end] - first
@@ -118,5 +123,5 @@ class FlatEchoes:
             path = np.zeros((step, columns), np.int32)
             reported = np.full((step, columns), np.nan, np.float32)
             path[row, column] = self.path[begin:end]
-            reported[row, column] = self.reported[begin:end]
+            reported[row, column] = np.minimum(self.reported[begin:end], _FARTHEST)
             yield Step(slice(first, last), path, reported)

@@ -27,7 +27,7 @@ from jaxsonar.hardware.errors import SonarError
 
 from .components import label_components
 from .echoes import FlatEchoes
-from .files import atomic_write
+from .files import atomic_write, shown
 from .local import LocalModel, arcs_of, settings_for
 from .logs import Scan
 from .poses import to_world
@@ -62,7 +62,7 @@ def save(figure: Figure, path: Path | str) -> None:
     """
     path = Path(path)
     if path.suffix.lower() not in FORMATS:
-        raise SonarError(f"{path}: figure format {path.suffix!r}; allowed are {', '.join(FORMATS)}")
+        raise SonarError(f"{shown(path)}: figure format {path.suffix!r}; allowed are {', '.join(FORMATS)}")
     kind = path.suffix.lower()[1:]
     metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
     with styled(), atomic_write(path, binary=True) as file:
@@ -178,7 +178,7 @@ def accumulator_figure(
 ) -> Figure:
     """The accumulator before and after the low pass, and the components above the threshold (paper, section 4)."""
     settings = settings_for(ring, settings)
-    packed = next(FlatEchoes.from_log(ring, scan.as_log())[0].steps()).packed
+    packed = next(FlatEchoes.from_log(ring, scan.as_log())[0].steps(1)).packed
     arcs = arcs_of(ring, settings)
     votes, smooth = (np.asarray(image)[0] for image in kernels.accumulators(arcs, packed, settings=settings))
     level = float(arcs.level)

@@ -4,6 +4,7 @@ import errno
 import os
 import secrets
 import stat
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -38,6 +39,24 @@ def read_bytes(path: str | os.PathLike[str], *, what: str) -> bytes:
         return Path(path).read_bytes()
     except (OSError, ValueError) as failure:  # ValueError: a NUL in the path
         raise SonarError(f"{shown(path)}: {reason(failure)}; needed is a readable file with {what}") from None
+
+
+def read_toml(path: str | os.PathLike[str], *, what: str) -> dict[str, Any]:
+    """The tables of a TOML file.
+
+    Args:
+        path: the file.
+        what: what it should hold, for the message ("a ring").
+
+    Raises:
+        SonarError: the file cannot be read, is no text or no TOML.
+    """
+    try:
+        return tomllib.loads(read_bytes(path, what=f"{what} (TOML)").decode("utf-8-sig"))
+    except UnicodeDecodeError:
+        raise SonarError(f"{shown(path)}: this is no text; needed is {what} as TOML") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as failure:
+        raise SonarError(f"{shown(path)}: no TOML: {reason(failure)}; needed is {what} as TOML") from None
 
 
 @contextmanager
@@ -93,6 +112,16 @@ def _create(temporary: Path, target: Path) -> int:
     if target.exists():
         os.fchmod(descriptor, stat.S_IMODE(target.stat().st_mode))
     return descriptor
+
+
+def refuse_folder(path: str | os.PathLike[str]) -> None:
+    """Complain early about a file whose folder is missing.
+
+    Raises:
+        SonarError: the folder is missing or is a file.
+    """
+    if not Path(path).absolute().parent.is_dir():
+        raise SonarError(f"{shown(path)}: no such folder; allowed is a path in an existing folder")
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:

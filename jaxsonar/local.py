@@ -198,10 +198,13 @@ _latest: list[tuple[Ring, kernels.HoughSettings, kernels.RingArcs]] = []
 
 def arcs_of(ring: Ring, settings: kernels.HoughSettings) -> kernels.RingArcs:
     """Arcs of all paths of a ring; the latest ones are kept, so that a stream of single scans makes them once."""
-    if not (_latest and _latest[0][0] is ring and _latest[0][1] == settings):
-        points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
-        _latest[:] = [(ring, settings, kernels.ring_arcs(ring.sensors, settings=settings, points=points))]
-    return _latest[0][2]
+    for known_ring, known_settings, arcs in tuple(_latest):
+        if known_ring is ring and known_settings == settings:
+            return arcs
+    points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
+    arcs = kernels.ring_arcs(ring.sensors, settings=settings, points=points)
+    _latest[:] = [(ring, settings, arcs)]
+    return arcs
 
 
 def _check_method(method: str) -> None:
@@ -212,7 +215,7 @@ def _check_method(method: str) -> None:
 def _extract(ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings) -> Iterator[tuple[slice, _Extracted]]:
     """The paper's section 4 from echoes to lines, step by step over a batch of scans."""
     arcs = arcs_of(ring, settings)
-    for step in echoes.steps():
+    for step in echoes.steps(settings.theta_cells * settings.rho_cells):
         packed = step.packed
         # Echo arcs -> equidistant points -> tangent lines -> votes -> low pass -> threshold, in one compiled step.
         occupied = kernels.occupied_cells(arcs, packed, settings=settings)
@@ -224,7 +227,8 @@ def _extract(ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings) ->
         real = slice(0, step.scans.stop - step.scans.start)  # the rest is padding
         columns = (clusters.rho, clusters.theta, clusters.votes, segments, clusters.involved)
         lines, involved = _sift(*(np.asarray(column)[real] for column in columns), min_echoes=settings.min_echoes)
-        heard = (step.reported[real] < ring.max_range).sum(axis=1)
+        corrected = np.asarray(ring.corrected(step.reported[real], *np.moveaxis(ring.paths[step.path[real]], -1, 0)))
+        heard = (corrected < ring.max_range).sum(axis=1)
         yield step.scans, _Extracted(lines, involved, step.path[real], heard, counts[real])
 
 

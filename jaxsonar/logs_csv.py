@@ -270,10 +270,11 @@ def write_csv(log: Log, path: str | os.PathLike[str]) -> None:
         SonarError: the place cannot be written.
     """
     with atomic_write(path) as file:
-        file.writelines(_lines(log))
+        file.writelines(csv_lines(log))
 
 
-def _lines(log: Log) -> Iterator[str]:
+def csv_lines(log: Log) -> Iterator[str]:
+    """The rows of a scan log as CSV, header first, each with its line end."""
     amplitudes = not np.isnan(log.amplitude).all()
     yield ",".join((*COLUMNS, OPTIONAL) if amplitudes else COLUMNS) + "\n"
     silent = ",,,,\n" if amplitudes else ",,,\n"

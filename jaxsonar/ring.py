@@ -1,6 +1,7 @@
 """The ring: where the sensors sit, which of them hear each other, and in which directions (paper, section 3)."""
 
 from collections.abc import Sequence
+from operator import index
 
 import equinox as eqx
 import jax
@@ -16,6 +17,10 @@ REFERENCE_SPEED_OF_SOUND = 343.2
 
 AnyArray = np.ndarray | jax.Array
 """NumPy outside, JAX (a tracer too) where a loss is differentiated with respect to the ring."""
+
+
+LARGEST = 100.0
+"""Metres; no ultrasonic ring is wider, and none hears farther."""
 
 
 class Ring(eqx.Module):
@@ -72,10 +77,10 @@ class Ring(eqx.Module):
         self.position = np.array(position, dtype=np.float64).reshape(-1, 2)
         self.heading = np.array(heading, dtype=np.float64).reshape(-1)
         count = len(self.position)
-        self.beam = np.array(np.broadcast_to(np.asarray(beam, dtype=np.float64), (count,)))
-        self.range_offset = np.array(np.broadcast_to(np.asarray(range_offset, dtype=np.float64), (count,)))
+        self.beam = _one_each(beam, count, "beam")
+        self.range_offset = _one_each(range_offset, count, "range_offset")
         self.speed_of_sound = np.array(speed_of_sound, dtype=np.float64)
-        self.neighbors = int(neighbors)
+        self.neighbors = _whole(neighbors, "neighbors")
         self.max_range = float(max_range)
         self.name = name
         self._check()
@@ -96,10 +101,15 @@ class Ring(eqx.Module):
             raise SonarError(f"ring: beam {np.degrees(worst):g} deg; allowed is more than 0 and at most 180 deg")
         if not 0 <= self.neighbors < count:
             raise SonarError(f"ring: neighbors {self.neighbors}; allowed is 0 to {count - 1} with {count} sensors")
-        if not (np.isfinite(self.max_range) and self.max_range > 0):
-            raise SonarError(f"ring: max_range {self.max_range:g} m; allowed is more than 0")
-        if not self.speed_of_sound > 0:
-            raise SonarError(f"ring: speed_of_sound {self.speed_of_sound:g} m/s; allowed is more than 0")
+        if not 0 < self.max_range <= LARGEST:
+            raise SonarError(f"ring: max_range {self.max_range:g} m; allowed is more than 0 and at most {LARGEST:g} m")
+        for field, unit in (("position", "m"), ("range_offset", "m")):
+            if (worst := np.abs(getattr(self, field)).max()) > LARGEST:
+                raise SonarError(f"ring: {field} {worst:g} {unit}; allowed is at most {LARGEST:g} {unit} either way")
+        if (worst := np.degrees(np.abs(self.heading).max())) > 720:
+            raise SonarError(f"ring: heading {worst:g} deg; allowed is at most 720 deg either way")
+        if not 0 < self.speed_of_sound <= 10_000:
+            raise SonarError(f"ring: speed_of_sound {self.speed_of_sound:g} m/s; allowed is more than 0, at most 10000")
 
     @classmethod
     def circular(
@@ -129,10 +139,10 @@ class Ring(eqx.Module):
         Raises:
             SonarError: a value that no ring can have, named with what is allowed.
         """
-        if count < 1:
+        if _whole(count, "count") < 1:
             raise SonarError(f"ring: count {count}; allowed is 1 or more")
-        if not (np.isfinite(radius) and radius >= 0):
-            raise SonarError(f"ring: radius {radius:g} m; allowed is 0 or more")
+        if not 0 <= radius <= LARGEST:
+            raise SonarError(f"ring: radius {radius:g} m; allowed is 0 or more, at most {LARGEST:g} m")
         heading = first_heading + 2 * np.pi * np.arange(count) / count
         position = radius * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         return cls(
@@ -219,8 +229,24 @@ class Ring(eqx.Module):
         return tuple(np.array([block[k] for block in blocks if k < len(block)]) for k in range(longest))
 
     def corrected(
-        self, reported: Float[AnyArray, " echoes"], tx: Int[AnyArray, " echoes"], rx: Int[AnyArray, " echoes"]
-    ) -> Float[AnyArray, " echoes"]:
+        self, reported: Float[AnyArray, "*echoes"], tx: Int[AnyArray, "*echoes"], rx: Int[AnyArray, "*echoes"]
+    ) -> Float[AnyArray, "*echoes"]:
         """Half path lengths in metres from a log's ranges: offsets taken off, then scaled to this speed of sound."""
         offset = 0.5 * (self.range_offset[tx] + self.range_offset[rx])
         return (reported - offset) * (self.speed_of_sound / REFERENCE_SPEED_OF_SOUND)
+
+
+def _one_each(
+    value: Float[AnyArray, " sensors"] | Sequence[float] | float, count: int, field: str
+) -> Float[np.ndarray, " sensors"]:
+    values = np.array(value, dtype=np.float64)
+    if values.shape not in ((), (count,)):
+        raise SonarError(f"ring: {field} of shape {values.shape}; allowed is one for all, or one for each of {count}")
+    return np.array(np.broadcast_to(values, (count,)))
+
+
+def _whole(value: int, field: str) -> int:
+    try:
+        return index(value)
+    except TypeError:
+        raise SonarError(f"ring: {field} {value!r}; allowed is a whole number") from None

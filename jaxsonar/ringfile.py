@@ -3,7 +3,6 @@
 import math
 import os
 import re
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, get_type_hints
 
@@ -14,7 +13,7 @@ from msgspec import Meta
 
 from jaxsonar.hardware.errors import SonarError
 
-from .files import atomic_write, read_bytes, reason, shown
+from .files import atomic_write, read_toml, shown
 from .ring import REFERENCE_SPEED_OF_SOUND, Ring
 
 DATA = Path(__file__).with_name("data")
@@ -204,12 +203,7 @@ def _degrees(angle: float) -> float:
 
 
 def _read(file: Path) -> _File:
-    try:
-        data = tomllib.loads(read_bytes(file, what="a ring (TOML)").decode("utf-8-sig"))
-    except UnicodeDecodeError:
-        raise SonarError(f"{shown(file)}: this is no text; needed is a ring as TOML") from None
-    except (tomllib.TOMLDecodeError, RecursionError) as failure:
-        raise SonarError(f"{shown(file)}: no TOML: {reason(failure)}; needed is a ring as TOML") from None
+    data = read_toml(file, what="a ring")
     _refuse_not_finite(file, {key: value for key, value in data.items() if key != "calibration"}, "")
     try:
         return msgspec.convert(data, type=_File)

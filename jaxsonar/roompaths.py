@@ -1,7 +1,7 @@
 """A robot's way through a room: poses from a CSV file, for the simulator."""
 
-import csv
 import os
+import re
 
 import numpy as np
 from jaxtyping import Float
@@ -10,6 +10,7 @@ from jaxsonar.hardware.errors import SonarError
 
 from .files import atomic_write, read_bytes, shown
 
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 SECONDS_PER_POSE = 0.1
 """Between the stamps of poses that come without: about the rate of a full scan of the paper's ring."""
 
@@ -43,7 +44,8 @@ def load_path(
         text = read_bytes(path, what="poses (CSV)").decode("utf-8-sig")
     except UnicodeDecodeError:
         raise SonarError(f"{shown(path)}: this is no text; needed is a CSV file of poses") from None
-    rows = [(number, row) for number, row in enumerate(csv.reader(text.splitlines()), start=1) if row]
+    lines = enumerate(text.splitlines(), start=1)
+    rows = [(number, line.split(",")) for number, line in lines if line.strip()]
     header = [name.strip() for name in rows[0][1]] if rows else []
     if sorted(header) not in (["theta", "x", "y"], ["stamp", "theta", "x", "y"]):
         came = shown(",".join(header), 80) or "nothing"
@@ -55,15 +57,17 @@ def load_path(
                 f"{shown(path)}: row {number}: {len(row)} values came; allowed are {len(header)}, as in row 1"
             )
         for column, text in enumerate(row):
-            try:
-                values[index, column] = float(text)
-            except ValueError:
-                values[index, column] = np.nan
+            values[index, column] = float(text) if NUMBER.fullmatch(text.strip()) else np.nan
             if not abs(values[index, column]) <= 1e9:  # nor NaN
                 place = f"{shown(path)}: row {number}, column {header[column]}"
                 raise SonarError(f"{place}: {shown(text, 40)!r} came; allowed is a finite number up to 1e9")
     if not len(values):
         raise SonarError(f"{shown(path)}: no pose came; allowed is one or more")
+    if "stamp" in header and (np.diff(values[:, header.index("stamp")]) < 0).any():
+        late = int(np.argmax(np.diff(values[:, header.index("stamp")]) < 0)) + 2
+        place = f"{shown(path)}: row {rows[late][0]}, column stamp"
+        came = shown(rows[late][1][header.index("stamp")], 40)
+        raise SonarError(f"{place}: {came} came; allowed is no earlier than in the row before")
     column_of = {name: values[:, column] for column, name in enumerate(header)}
     poses = np.stack([column_of["x"], column_of["y"], column_of["theta"]], axis=-1)
     return poses, column_of.get("stamp", np.arange(len(poses)) * SECONDS_PER_POSE)

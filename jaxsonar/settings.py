@@ -1,6 +1,5 @@
 """Settings of the extraction in TOML: written beside every result, and taken back with ``--settings``."""
 
-import tomllib
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import tomli_w
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
-from .files import atomic_write, read_bytes, reason, shown
+from .files import atomic_write, read_toml, reason, shown
 
 _File = msgspec.defstruct(
     "_File",
@@ -25,11 +24,10 @@ def load_settings(path: Path | str) -> kernels.HoughSettings:
     Raises:
         SonarError: no such file, no TOML, an unknown key, a value of another type or out of range.
     """
-    content = read_bytes(path, what="settings (TOML)")
+    content = read_toml(path, what="settings")
     try:
-        given = msgspec.convert(tomllib.loads(content.decode()), _File)
-        return kernels.HoughSettings(**msgspec.structs.asdict(given))
-    except ValueError as failure:  # no text, no TOML, an unknown key, another type, out of range
+        return kernels.HoughSettings(**msgspec.structs.asdict(msgspec.convert(content, _File)))
+    except (ValueError, OverflowError) as failure:  # an unknown key, another type, out of range
         keys = ", ".join(field.name for field in fields(kernels.HoughSettings))
         raise SonarError(f"{shown(path)}: {reason(failure)}; the keys are {keys}") from None
 

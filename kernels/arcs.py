@@ -61,17 +61,10 @@ def arc(path: EchoPaths, *, pitch: float, points: int) -> Arc:
 
 
 def corrected_range(
-    reported: Float[Array, ""],
-    *,
-    range_offset: Float[Array, ""],
-    range_scale: Float[Array, ""],
-    max_range: Float[Array, ""],
+    reported: Float[Array, ""], *, range_offset: Float[Array, ""], range_scale: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Half the path length of ONE echo from what the ring reported, metres; 0 where nothing was heard.
-
-    Nothing heard is NaN, or the maximum range and more, as some devices write it.
-    """
-    heard = reported < max_range  # False for NaN
+    """Half the path length of ONE echo from what the ring reported, metres; 0 for NaN or inf: nothing heard."""
+    heard = jnp.isfinite(reported)
     reported = jnp.where(heard, reported, 1)  # before the arithmetic, so that no gradient is NaN
     return jnp.where(heard, (reported - range_offset) * range_scale, 0)
 

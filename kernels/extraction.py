@@ -74,9 +74,7 @@ def lines_of_scan(
     def one_echo(path: Int[Array, ""], reported: Float[Array, ""]):
         arc, row = jax.tree.map(lambda leaf: leaf[path], (ring.arcs, ring.rows))
         offset = ring.paths.range_offset[path]
-        reach = arcs.corrected_range(
-            reported, range_offset=offset, range_scale=ring.range_scale, max_range=ring.max_range
-        )
+        reach = arcs.corrected_range(reported, range_offset=offset, range_scale=ring.range_scale)
         rho, counts = arcs.tangent_rho(arc, reach, max_range=ring.max_range)
         return rho, hough.cell_of(rho, row, counts, settings)
 

@@ -20,7 +20,11 @@ _DIRECTIONS = 719  # samples of the full turn, in step with neither cones nor ce
 
 @dataclass(frozen=True)
 class HoughSettings:
-    """What the paper leaves to choose, with its values, or ours where it gives none (paper, section 4)."""
+    """What the paper leaves to choose, with its values, or ours where it gives none (paper, section 4).
+
+    Raises:
+        ValueError: a value out of range, named with what is allowed.
+    """
 
     theta_cells: int = 100
     """Cells around the full turn, an even number; 100 make the paper's 0.0628 rad."""
@@ -43,17 +47,20 @@ class HoughSettings:
                 4 <= self.theta_cells <= 10_000 and self.theta_cells % 2 == 0,
                 "an even number, 4 to 10000",
             ),
-            "rho_cells": (2 <= self.rho_cells <= 10_000, "2 to 10000"),
-            "rho_cell": (0 < self.rho_cell < np.inf, "more than 0 m"),
+            "rho_cells": (
+                2 <= self.rho_cells <= 10_000 and self.theta_cells * self.rho_cells <= 1_000_000,
+                "2 to 10000, with theta_cells at most a million cells",
+            ),
+            "rho_cell": (1e-4 <= self.rho_cell <= 100, "0.0001 to 100 m"),
             "point_pitch": (1e-4 <= self.point_pitch <= np.pi, "0.0001 to pi rad"),
             "smoothing": (
                 len(self.smoothing) % 2 == 1
                 and len(self.smoothing) <= min(self.theta_cells, self.rho_cells)
-                and all(0 <= tap < np.inf for tap in self.smoothing)
+                and all(0 <= tap <= 1e6 for tap in self.smoothing)
                 and sum(self.smoothing) > 0,
-                "an odd number of taps, none negative, not all 0",
+                "an odd number of taps, 0 to 1e6, not all 0",
             ),
-            "threshold": (0 <= self.threshold < np.inf, "0 or more"),
+            "threshold": (0 <= self.threshold <= 1e6, "0 to 1e6"),
             "min_echoes": (self.min_echoes >= 1, "1 or more"),
         }
         for key, (good, what) in allowed.items():

@@ -49,7 +49,7 @@ def lines_of_echo(ring, tx, rx, reported, pitch):
     """Tangent lines (rho >= 0, theta) at the points of one echo's arc; none for an echo that does not count."""
     reach = (reported - (ring.range_offset[tx] + ring.range_offset[rx]) / 2) * float(ring.speed_of_sound) / 343.2
     baseline = np.linalg.norm(ring.position[rx] - ring.position[tx])
-    if not (reported < ring.max_range and reach < ring.max_range and reach > baseline / 2 and reach > 0):
+    if not (reach < ring.max_range and reach > baseline / 2 and reach > 0):
         return []
     lines = []
     for theta in arc_normals(ring, tx, rx, pitch):

@@ -319,7 +319,7 @@ MISTAKES = {
     "settings that are no TOML": (
         f"{LINES} --settings s.toml",
         {"s.toml": "theta_cells"},
-        ["s.toml", "'='", "theta_cells"],
+        ["s.toml", "'='", "TOML"],
     ),
     "settings with an unknown key": (f"{LINES} --settings s.toml", {"s.toml": "cells = 9"}, ["cells", "theta_cells"]),
     "settings of a wrong type": (
@@ -389,10 +389,32 @@ MISTAKES = {
         {"p.csv": "x,y,theta\n"},
         ["p.csv", "no pose"],
     ),
+    "output over its input": (
+        "lines log.csv --ring faw -o log.csv",
+        {},
+        ["log.csv", "another file"],
+    ),
+    "figure into a missing folder": (f"{LINES} --figure nowhere/a.svg", {}, ["nowhere/a.svg", "folder"]),
+    "ring far too large": (
+        "lines log.csv --ring ring.toml -o o.jsonl",
+        {"ring.toml": RING.replace("max_range = 2", "max_range = 200")},
+        ["ring.toml", "max_range", "100 m"],
+    ),
+    "settings nested deeply": (f"{LINES} --settings s.toml", {"s.toml": "a = " + "[" * 3000}, ["s.toml", "TOML"]),
+    "settings with too many cells": (
+        f"{LINES} --settings s.toml",
+        {"s.toml": "theta_cells = 10000\nrho_cells = 10000"},
+        ["s.toml", "rho_cells", "million"],
+    ),
+    "path with an endless field": (
+        "simulate {office} --ring faw --path p.csv -o out.csv",
+        {"p.csv": "x,y,theta\n" + "1" * 200_000 + ",0,0\n"},
+        ["p.csv", "row 2", "finite"],
+    ),
     "path back in time": (
         "simulate {office} --ring faw --path p.csv -o out.csv",
         {"p.csv": "stamp,x,y,theta\n1,0,0,0\n0,0,0,0\n"},
-        ["stamps", "decrease"],
+        ["p.csv", "row 3", "stamp", "no earlier"],
     ),
     "log to an unknown suffix": ("convert log.csv out.txt", {}, ["out.txt", ".txt", ".csv", ".parquet"]),
     "log from an unknown suffix": (

@@ -276,9 +276,7 @@ def soft_votes(ring, ranges):
 
     def one_echo(path, reach):
         arc = kernels.arc(path, pitch=0.05, points=21)
-        reach = kernels.corrected_range(
-            reach, range_offset=path.range_offset, range_scale=sensors.range_scale, max_range=sensors.max_range
-        )
+        reach = kernels.corrected_range(reach, range_offset=path.range_offset, range_scale=sensors.range_scale)
         rho, counts = kernels.tangent_rho(arc, reach, max_range=sensors.max_range)
         return rho, arc.theta, counts.astype(rho.dtype)
 
@@ -319,6 +317,11 @@ def test_forward_reverse_and_numerical_gradients_agree(faw_ring):
     [
         ("theta_cells", 99),
         ("theta_cells", 2),
+        ("theta_cells", 10_002),
+        ("rho_cells", 10_001),
+        ("threshold", 1e308),
+        ("rho_cell", 1e300),
+        ("smoothing", (1e308, 1e308, 1e308)),
         ("rho_cells", 1),
         ("rho_cell", 0.0),
         ("point_pitch", -0.1),

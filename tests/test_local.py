@@ -262,14 +262,61 @@ def test_compiles_once_for_a_ring_whatever_the_scans(faw_ring, rng):
     assert [kernel._cache_size() for kernel in compiled] == [1, 1, 1]
 
 
+def primitives(jaxpr):
+    """Names of all operations of a program, those of its inner programs included."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for value in jax.tree.leaves(equation.params, is_leaf=lambda leaf: hasattr(leaf, "jaxpr")):
+            if hasattr(value, "jaxpr"):
+                yield from primitives(value.jaxpr)
+
+
 def test_one_jitted_step_from_echoes_to_cells(faw_ring):
-    """Votes, low pass and threshold are one program: nothing but the cells leaves it."""
+    """Votes, low pass and threshold are one program: no call of the host in it, and nothing but the cells leaves it."""
     echoes = kernels.Echoes(jnp.zeros((2, 64), jnp.int32), jnp.full((2, 64), jnp.nan, jnp.float32))
     step = partial(kernels.occupied_cells, settings=HoughSettings())
     program = jax.make_jaxpr(step)(arcs_of(faw_ring, HoughSettings()), echoes)
-    assert [str(out.dtype) for out in program.out_avals] == ["bool"]
-    assert [out.shape for out in program.out_avals] == [(2, 100, 100)]
-    assert len(program.eqns) == 1
+    assert [(out.shape, str(out.dtype)) for out in program.out_avals] == [((2, 100, 100), "bool")]
+    inside = set(primitives(program.jaxpr))
+    assert {"sqrt", "gt"} <= inside
+    assert any("scatter" in name for name in inside)
+    assert not any("callback" in name or name == "infeed" for name in inside)
+
+
+@pytest.mark.parametrize(("offset", "speed"), [(0.25, 343.2), (-0.1, 343.2), (0.0, 319.0), (0.1, 360.0)])
+def test_the_maximum_range_is_one_of_true_ranges(offset, speed):
+    """Echoes just within it vote and those beyond it do not, whatever the sensors add and the air does."""
+    plain = Ring.circular()
+    ring = Ring(
+        plain.position,
+        plain.heading,
+        beam=plain.beam,
+        neighbors=3,
+        max_range=2.0,
+        range_offset=offset,
+        speed_of_sound=speed,
+    )
+    for rho, heard in [(2.2, True), (2.5, False)]:
+        near = oracles.wall_echoes(Ring.circular(max_range=3.0), rho, 0.4)
+        near = [(k, r) for k, r in near if (r < 2.0) == heard]
+        reported = [(k, r * 343.2 / speed + offset) for k, r in near]
+        model = next(local_models(ring, as_log(ring, [reported])))
+        assert len(near) >= 10
+        assert bool(model.lines) == heard, (rho, model.empty)
+        assert heard or model.empty == "no echo within the maximum range"
+
+
+def test_ranges_beyond_single_precision_are_no_echo(faw_ring):
+    echoes = [*oracles.wall_echoes(faw_ring, 1.2, 0.3), (3, 1e39)]
+    assert len(next(local_models(faw_ring, as_log(faw_ring, [echoes]))).lines) == 1
+
+
+def test_large_accumulators_run_fewer_scans_at_once(faw_ring):
+    fine = HoughSettings(theta_cells=720, rho_cells=300, rho_cell=0.01)
+    ranges = np.concatenate([dense(faw_ring, oracles.wall_echoes(faw_ring, 1.2, 0.3))] * 40)
+    lines = extract_lines(faw_ring, ranges, settings=fine)
+    assert (lines.rho[:, 0] == lines.rho[0, 0]).all()
+    assert lines.rho[0, 0] == pytest.approx(1.2, abs=0.03)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Recordings of real devices come in as they were taken: counts, units, frames; and a malformed row is named."""
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxsonar.hardware.recordings import read_corridor8, read_scitos24, read_sew
 from jaxsonar.logs import load_log
 from jaxsonar.ringfile import load_ring
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
+DATA = Path(os.environ.get("JAXSONAR_DATA") or Path(__file__).parents[2] / "shared" / "data")
 
 
 def recorded(name):

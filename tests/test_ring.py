@@ -132,6 +132,9 @@ def test_a_ring_is_a_pytree_of_what_can_be_calibrated(faw_ring):
         ({"max_range": 0.0}, "more than 0"),
         ({"max_range": float("inf")}, "more than 0"),
         ({"speed_of_sound": -1.0}, "more than 0"),
+        ({"radius": 1e300}, "at most 100 m"),
+        ({"max_range": 410.0}, "at most 100 m"),
+        ({"first_heading": 1e6}, "at most 720 deg"),
     ],
 )
 def test_a_value_that_no_ring_can_have_is_refused_with_what_is_allowed(change, allowed):
