@@ -7,6 +7,7 @@ farther by 4 to 16 mm (10 mm is exact for the ring's radius and 15 deg between s
 """
 
 import argparse
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 from rich.table import Table
 
-from jaxsonar import LocalModel, Log, figures, load_ring, local_models
+from jaxsonar import LocalModel, Log, Ring, figures, load_ring, local_models
 from jaxsonar.convert import read_scans
 
 DIRECTIONS = {"front": (12, 0), "left": (18, 1), "right": (6, 2)}
@@ -77,19 +78,23 @@ def agreement(
     return Agreement(int(square.sum()), rho, theta)
 
 
-def heard_off_axis(ranges: Float[np.ndarray, "scans sensors"], radius: float) -> dict[int, float]:
-    """How often sensors off the normal of a square wall hear it too: share within 10 mm, by degrees off the normal."""
+def heard_off_axis(ranges: Float[np.ndarray, "scans sensors"], radius: float) -> dict[int, tuple[float, float]]:
+    """How often sensors off the normal of a square wall hear it too, by degrees off the normal.
+
+    Returns:
+        Share of readings within 10 mm of what the wall would make them, and within 10 mm of 80 mm more: chance.
+    """
     sensors = ranges.shape[1]
     pitch = 360 / sensors
     shares = {}
     for steps in (2, 3):
-        hits = []
+        off = []
         for sensor in range(sensors):
             mask = square_walls(ranges, sensor, radius)
-            nearer = ranges[mask, sensor] + radius * (1 - np.cos(np.radians(steps * pitch)))
-            for side in (-steps, steps):
-                hits.append(np.abs(ranges[mask, (sensor + side) % sensors] - nearer) < 0.010)
-        shares[round(steps * pitch)] = float(np.mean(np.concatenate(hits)))
+            expected = ranges[mask, sensor] + radius * (1 - np.cos(np.radians(steps * pitch)))
+            off += [ranges[mask, (sensor + side) % sensors] - expected for side in (-steps, steps)]
+        off = np.concatenate(off)
+        shares[round(steps * pitch)] = (float(np.mean(np.abs(off) < 0.010)), float(np.mean(np.abs(off - 0.08) < 0.010)))
     return shares
 
 
@@ -107,33 +112,77 @@ def deviation_figure(found: dict[str, Agreement]) -> Figure:
     return figure
 
 
+def shuffled(log: Log, rng: np.random.Generator) -> Log:
+    """Every sensor's readings in another order of scans: as many echoes, no geometry. Lines found here are chance."""
+    echo_scan = log.echo_scan.copy()
+    for sensor in np.unique(log.tx):
+        mine = log.tx == sensor
+        echo_scan[mine] = rng.permutation(len(log))[echo_scan[mine]]
+    order = np.argsort(echo_scan, kind="stable")
+    return Log.from_echoes(
+        echo_scan[order], log.tx[order], log.rx[order], log.range[order], stamp=log.stamp, pose=log.pose
+    )
+
+
+def narrow(ring: Ring, beam: float) -> Ring:
+    """The ring with other cones, radians."""
+    return Ring(ring.position, ring.heading, beam=beam, neighbors=0, max_range=ring.max_range, name=ring.name)
+
+
 def main() -> None:
     """Measure, print, draw."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("folder", type=Path)
     options.add_argument("-o", "--output", type=Path, default=Path("scitos24"))
     options = options.parse_args()
-    ring = load_ring("scitos24")
-    radius = float(np.linalg.norm(ring.position[0]))
+    shipped = load_ring("scitos24")
+    radius = float(np.linalg.norm(shipped.position[0]))
     log = read_scans(options.folder, from_="scitos24")
     minima = np.genfromtxt(options.folder / "sensor_readings_4.csv", delimiter=",", usecols=range(3))
-    ranges = dense_ranges(log, ring.count)
-    models = list(local_models(ring, log))
+    ranges = dense_ranges(log, shipped.count)
+    square = {
+        name: square_walls(ranges, sensor, radius) & (np.abs(minima[:, column] - ranges[:, sensor]) < 0.02)
+        for name, (sensor, column) in DIRECTIONS.items()
+    }
     options.output.mkdir(parents=True, exist_ok=True)
+    console = Console(width=110)
+    for ring in (shipped, narrow(shipped, np.radians(15.0))):
+        models = list(local_models(ring, log))
+        chance = list(local_models(ring, shuffled(log, np.random.default_rng(0))))
+        found = {
+            name: agreement(models, minima[:, column], square[name], float(ring.heading[sensor]), radius)
+            for name, (sensor, column) in DIRECTIONS.items()
+        }
+        console.print(agreement_table(f"cones of {np.degrees(ring.beam[0]):.0f} deg", found))
+        for what, result in {"as recorded": models, "readings shuffled, chance": chance}.items():
+            scans = np.mean([bool(model.lines) for model in result])
+            lines = np.mean([len(model.lines) for model in result])
+            reasons = Counter(model.empty for model in result if model.empty)
+            why = "".join(f"; {count} scans: {reason}" for reason, count in reasons.most_common())
+            console.print(f"{what}: {scans:.1%} of {len(log)} scans with lines, {lines:.2f} lines a scan{why}")
+        if ring is shipped:
+            figures.save(deviation_figure(found), options.output / "deviations.svg")
+            figures.save(deviation_figure(found), options.output / "deviations.png")
+            best = max(range(len(models)), key=lambda k: sum(line.echoes for line in models[k].lines[:3]))
+            for suffix in ("svg", "png"):
+                figure = figures.lines_figure(ring, log[best], models[best])
+                figures.save(figure, options.output / f"lines.{suffix}")
+    for degrees, (share, chance) in heard_off_axis(ranges, radius).items():
+        console.print(
+            f"a square wall is heard {degrees} deg off its normal in {share:.1%} of the cases; chance {chance:.1%}"
+        )
 
-    lines_a_scan = np.mean([len(model.lines) for model in models])
-    with_lines = np.mean([bool(model.lines) for model in models])
+
+def agreement_table(what: str, found: dict[str, Agreement]) -> Table:
+    """Lines less the recording's own minima, a row a direction."""
     table = Table(
-        title=f"{len(log)} scans, {with_lines:.1%} with lines, {lines_a_scan:.2f} lines a scan",
-        caption="lines less the recording's own minima, where a wall is square to the robot",
+        title=what,
+        caption=f"lines less the recording's own minima where a wall is square; counted up to {NEAR_RHO * 1e3:.0f} mm "
+        f"and {np.degrees(NEAR_THETA):.0f} deg",
     )
     for column in ("", "square walls", "with a line", "median Δρ (mm)", "RMS Δρ (mm)", "RMS Δθ (deg)"):
         table.add_column(column, justify="left" if not column else "right")
-    found = {}
-    for name, (sensor, column) in DIRECTIONS.items():
-        square = square_walls(ranges, sensor, radius) & (np.abs(minima[:, column] - ranges[:, sensor]) < 0.02)
-        found[name] = agreement(models, minima[:, column], square, float(ring.heading[sensor]), radius)
-        row = found[name]
+    for name, row in found.items():
         table.add_row(
             name,
             str(row.square),
@@ -142,14 +191,7 @@ def main() -> None:
             f"{np.sqrt(np.mean(row.rho**2)) * 1e3:.1f}",
             f"{np.degrees(np.sqrt(np.mean(row.theta**2))):.2f}",
         )
-    console = Console(width=110)
-    console.print(table)
-    for degrees, share in heard_off_axis(ranges, radius).items():
-        console.print(f"a square wall is heard {degrees} deg off its normal in {share:.1%} of the cases")
-    figures.save(deviation_figure(found), options.output / "deviations.svg")
-    figures.save(deviation_figure(found), options.output / "deviations.png")
-    best = max(range(len(models)), key=lambda k: sum(line.echoes for line in models[k].lines[:3]))
-    figures.save(figures.lines_figure(ring, log[best], models[best]), options.output / "lines.png")
+    return table
 
 
 if __name__ == "__main__":

@@ -155,7 +155,7 @@ def main() -> None:
     table.add_row(f"batch of {scans}", f"{whole:.0f}", "1")
     for name, stage in stages.items():
         took = per_scan(seconds(stage, repeats=repeats))
-        table.add_row(f"  {name}", f"{took:.0f}", f"{took / whole:.0%}")
+        table.add_row(f"  {name}, alone", f"{took:.0f}", f"{took / whole:.0%}")
     for name, took in {
         "plain NumPy + OpenCV, scan by scan": per_scan(plain),
         "one scan, warm, median": float(np.median(single)) * 1e6,

@@ -90,8 +90,7 @@ class _Extracted:
     lines: Lines
     involved: Bool[np.ndarray, "scans lines echoes"]
     path: Int[np.ndarray, "scans echoes"]
-    heard: Int[np.ndarray, " scans"]
-    """Echoes within the maximum range."""
+    reported: Float[np.ndarray, "scans echoes"]
     components: Int[np.ndarray, " scans"]
     """Components of occupied cells, before those with too few echoes were dropped."""
 
@@ -170,7 +169,11 @@ def _models(ring: Ring, log: Log, echoes: FlatEchoes, settings: kernels.HoughSet
                 )
                 for k in np.flatnonzero(step.lines.echoes[row])
             )
-            empty = "" if lines else _why_empty(int(step.heard[row]), int(step.components[row]), settings.min_echoes)
+            empty = ""
+            if not lines:
+                corrected = np.asarray(ring.corrected(step.reported[row], *paths[step.path[row]].T))
+                heard = int((corrected < ring.max_range).sum())
+                empty = _why_empty(heard, int(step.components[row]), settings.min_echoes)
             yield LocalModel(int(log.scan[index]), float(log.stamp[index]), lines, empty)
 
 
@@ -227,9 +230,7 @@ def _extract(ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings) ->
         real = slice(0, step.scans.stop - step.scans.start)  # the rest is padding
         columns = (clusters.rho, clusters.theta, clusters.votes, segments, clusters.involved)
         lines, involved = _sift(*(np.asarray(column)[real] for column in columns), min_echoes=settings.min_echoes)
-        corrected = np.asarray(ring.corrected(step.reported[real], *np.moveaxis(ring.paths[step.path[real]], -1, 0)))
-        heard = (corrected < ring.max_range).sum(axis=1)
-        yield step.scans, _Extracted(lines, involved, step.path[real], heard, counts[real])
+        yield step.scans, _Extracted(lines, involved, step.path[real], step.reported[real], counts[real])
 
 
 def _sift(

@@ -1,6 +1,7 @@
 """What the README says a reader can run, runs: the Python example and the commands, in the order of the page."""
 
 import contextlib
+import json
 import re
 import shlex
 from pathlib import Path
@@ -53,6 +54,17 @@ def test_the_commands_run(folder, monkeypatch):
             assert program == "jaxsonar"
             assert main(arguments) == 0, command
         assert {"scans.csv", "scans.parquet", "lines.jsonl", "scan.svg"} <= {file.name for file in folder.iterdir()}
+
+
+def test_the_table_shows_what_the_demo_measures(folder):
+    """The rows of the office, which no random room touches; other builds of JAX may round a vote differently."""
+    rows = {row["what"]: row for row in json.loads((folder / "table.json").read_text())}
+    for what in ("office, first pose", "office, 17 poses", "office, 17 poses, conventional ring"):
+        line = next(line for line in README.splitlines() if line.startswith(f"| {what} |"))
+        shown = [float(cell) for cell in line.split("|")[2:-2]]
+        keys = ("scans", "echoes_per_scan", "walls", "recall", "false_per_scan")
+        keys += ("rho_rms_mm", "rho_rms_over_crb", "theta_rms_deg", "theta_rms_over_crb")
+        assert shown == pytest.approx([rows[what][key] for key in keys], rel=0.1, abs=0.06), what
 
 
 def test_pictures_and_pages_exist():
