@@ -58,7 +58,7 @@ def test_the_commands_run(folder, monkeypatch):
 
 def test_the_table_shows_what_the_demo_measures(folder):
     """The rows of the office, which no random room touches; other builds of JAX may round a vote differently."""
-    rows = {row["what"]: row for row in json.loads((folder / "table.json").read_text())}
+    rows = {row["what"]: row for row in json.loads((folder / "demo" / "table.json").read_text())}
     for what in ("office, first pose", "office, 17 poses", "office, 17 poses, conventional ring"):
         line = next(line for line in README.splitlines() if line.startswith(f"| {what} |"))
         shown = [float(cell) for cell in line.split("|")[2:-2]]
