@@ -314,6 +314,7 @@ def _draw_robot(axes: Axes, ring: Ring, pose: Float[np.ndarray, "3"]) -> None:
     sensors = to_world(pose, np.asarray(ring.position))
     axes.plot(*sensors.T, "o", color=ROBOT, ms=2.2, zorder=6)
     nose = to_world(pose, np.array([[0.0, 0.0], [0.18, 0.0]]))
+    axes.update_datalim(nose)
     axes.annotate("", xy=tuple(nose[1]), xytext=tuple(nose[0]), arrowprops={"arrowstyle": "-|>", "color": ROBOT})
 
 
