@@ -20,6 +20,7 @@ from rich.table import Table
 
 from jaxsonar import LocalModel, Log, Ring, figures, load_ring, local_models
 from jaxsonar.convert import read_scans
+from jaxsonar.poses import wrap_angle
 
 DIRECTIONS = {"front": (12, 0), "left": (18, 1), "right": (6, 2)}
 """Sensor that looks there, and column of the recording's own minima."""
@@ -68,7 +69,7 @@ def agreement(
     found = []
     for index in np.flatnonzero(square):
         near = [
-            (line.rho - radius - minima[index], (line.theta - direction + np.pi) % (2 * np.pi) - np.pi)
+            (line.rho - radius - minima[index], float(wrap_angle(line.theta - direction)))
             for line in models[index].lines
         ]
         near = [pair for pair in near if abs(pair[0]) < NEAR_RHO and abs(pair[1]) < NEAR_THETA]

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from .local import LocalModel
+from .poses import wrap_angle
 from .ring import Ring
 from .rooms import Room, lines_in
 from .simulate import Kind, Simulation
@@ -99,7 +100,7 @@ def compare(
         for line, wall in zip(line_index, wall_index, strict=True):
             tx, rx = ring.paths[simulation.path[mine & (simulation.reflector == wall)]].T
             bound = line_bound(truth[wall], position[tx], position[rx], sigma)
-            turn = (found[line, 1] - truth[wall, 1] + np.pi) % (2 * np.pi) - np.pi
+            turn = wrap_angle(found[line, 1] - truth[wall, 1])
             rows.append(np.array([[found[line, 0] - truth[wall, 0], turn, *bound]]))
     table = np.concatenate(rows)
     return Deviations(
@@ -126,7 +127,7 @@ def match(
     found: Float[np.ndarray, "lines 2"], truth: Float[np.ndarray, "walls 2"]
 ) -> tuple[Int[np.ndarray, " matches"], Int[np.ndarray, " matches"]]:
     """One-to-one pairs of lines (rho, theta) within the gates, as many as there can be, then as near as can be."""
-    turn = np.abs((found[:, None, 1] - truth[None, :, 1] + np.pi) % (2 * np.pi) - np.pi) / GATE_THETA
+    turn = np.abs(wrap_angle(found[:, None, 1] - truth[None, :, 1])) / GATE_THETA
     apart = np.abs(found[:, None, 0] - truth[None, :, 0]) / GATE_RHO
     near = (turn <= 1) & (apart <= 1)
     cost = np.where(near, np.hypot(turn, apart), 1e6)
@@ -175,6 +176,6 @@ def _at_corner(
     corners = junctions.vertices[np.unique(junctions.wedge_vertex[junctions.corners])]
     offset = corners - pose[:2]
     direction = np.arctan2(offset[:, 1], offset[:, 0]) - pose[2]
-    turn = np.abs((lines[:, None, 1] - direction + np.pi) % (2 * np.pi) - np.pi)
+    turn = np.abs(wrap_angle(lines[:, None, 1] - direction))
     apart = np.abs(lines[:, None, 0] - np.hypot(*offset.T))
     return ((turn <= GATE_THETA) & (apart <= GATE_RHO)).any(axis=1)

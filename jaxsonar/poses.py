@@ -4,6 +4,12 @@ import numpy as np
 from jaxtyping import Float
 
 
+def wrap_angle(angle: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, "*batch"]:
+    """The same directions in [-pi, pi), radians."""
+    wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
+    return np.where(wrapped >= np.pi, -np.pi, wrapped)  # the modulo may round up to pi
+
+
 def rotation(theta: float) -> Float[np.ndarray, "2 2"]:
     """Matrix that turns counter-clockwise by theta radians."""
     c, s = np.cos(theta), np.sin(theta)

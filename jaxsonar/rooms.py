@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.hardware.errors import SonarError
 
+from .poses import wrap_angle
+
 TOUCH = 1e-3
 """Metres; ends of walls nearer than this are one vertex, and an end this near to another wall touches it."""
 ANGLE_TOLERANCE = np.radians(1.0)
@@ -132,8 +134,7 @@ def lines_in(
     rho = (normal * (start - world_from_robot[:2])).sum(-1)
     normal = np.where(rho < 0, -1.0, 1.0)[:, None] * normal
     theta = np.arctan2(normal[:, 1], normal[:, 0]) - world_from_robot[2]
-    theta = (theta + np.pi) % (2 * np.pi) - np.pi
-    return np.abs(rho), np.where(theta >= np.pi, -np.pi, theta)  # the modulo may round up to pi
+    return np.abs(rho), wrap_angle(theta)
 
 
 def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from jaxsonar.hardware.errors import SonarError
 
 from .logs import Log
+from .poses import wrap_angle
 from .reflections import Kind as Kind
 from .reflections import Reflections, trace
 from .ring import REFERENCE_SPEED_OF_SOUND, Ring
@@ -203,7 +204,7 @@ class _Array(NamedTuple):
         pairs, pair = np.unique(np.sort(ring.paths, axis=1), axis=0, return_inverse=True)
         path_of = np.full((len(pairs), 2), -1)
         path_of[pair, (tx > rx).astype(int)] = np.arange(len(tx))
-        apart = np.abs((heading[tx] - heading[rx] + np.pi) % (2 * np.pi) - np.pi)
+        apart = np.abs(wrap_angle(heading[tx] - heading[rx]))
         return cls(
             position=np.asarray(ring.position, dtype=np.float64),
             heading=heading,

@@ -541,7 +541,7 @@ def test_a_failed_write_leaves_the_old_file(failure, monkeypatch, small_csv):
         yield HEADER
         raise failure
 
-    monkeypatch.setattr(logs_csv, "_lines", some_lines)
+    monkeypatch.setattr(logs_csv, "csv_lines", some_lines)
     with pytest.raises(SonarError if isinstance(failure, OSError) else type(failure)) as caught:
         save_log(SMALL[:1], small_csv)
     assert small_csv.read_text() == SMALL_CSV

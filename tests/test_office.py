@@ -279,7 +279,7 @@ def test_the_demo_command_prints_the_table(tmp_path, capsys, monkeypatch):
     """With the work itself left out: rows in, table to standard output, the rest to standard error."""
     rows = []
 
-    def quick(output, *, seed, on_step):
+    def quick(output, *, seed, on_step, on_room):
         on_step(f"seed {seed}")
         return rows
 
