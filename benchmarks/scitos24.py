@@ -8,7 +8,7 @@ farther by 4 to 16 mm (10 mm is exact for the ring's radius and 15 deg between s
 
 import argparse
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 from rich.table import Table
 
-from jaxsonar import LocalModel, Log, Ring, figures, load_ring, local_models
+from jaxsonar import LocalModel, Log, figures, load_ring, local_models
 from jaxsonar.convert import read_scans
 from jaxsonar.poses import wrap_angle
 
@@ -125,11 +125,6 @@ def shuffled(log: Log, rng: np.random.Generator) -> Log:
     )
 
 
-def narrow(ring: Ring, beam: float) -> Ring:
-    """The ring with other cones, radians."""
-    return Ring(ring.position, ring.heading, beam=beam, neighbors=0, max_range=ring.max_range, name=ring.name)
-
-
 def main() -> None:
     """Measure, print, draw."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -147,7 +142,7 @@ def main() -> None:
     }
     options.output.mkdir(parents=True, exist_ok=True)
     console = Console(width=110)
-    for ring in (shipped, narrow(shipped, np.radians(15.0))):
+    for ring in (shipped, replace(shipped, beam=np.radians(15.0))):
         models = list(local_models(ring, log))
         chance = list(local_models(ring, shuffled(log, np.random.default_rng(0))))
         found = {

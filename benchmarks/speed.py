@@ -24,7 +24,6 @@ from jaxsonar.randomrooms import random_pose, random_room
 from jaxsonar.simulate import simulate
 
 SLOTS = 3
-CELLS = 100 * 100
 
 
 def scans_of_random_rooms(ring: Ring, count: int, *, seed: int = 0) -> np.ndarray:
@@ -67,7 +66,7 @@ class NumpyPeer:
         column = np.floor(rho / s.rho_cell).astype(int)
         used &= column < s.rho_cells
         cell = row * s.rho_cells + column
-        votes = np.bincount(cell[used], minlength=s.theta_cells * s.rho_cells).reshape(s.theta_cells, s.rho_cells)
+        votes = np.bincount(cell[used], minlength=s.cells).reshape(s.theta_cells, s.rho_cells)
         wide = np.pad(votes.astype(np.float32), ((1, 1), (0, 0)), mode="wrap")
         kernel = np.outer([1, 2, 1], [1, 2, 1]).astype(np.float32) / 16
         smooth = cv2.filter2D(wide, -1, kernel, borderType=cv2.BORDER_CONSTANT)[1:-1]
@@ -116,7 +115,7 @@ def main() -> None:
     plain = seconds(lambda: [peer.lines(scan) for scan in ranges], repeats=max(repeats // 3, 2))
 
     arcs = arcs_of(ring, settings)
-    steps = list(FlatEchoes.from_dense(ring, ranges).steps(CELLS))
+    steps = list(FlatEchoes.from_dense(ring, ranges).steps(settings.cells))
     packed = [step.packed for step in steps]
     masks = [kernels.occupied_cells(arcs, echoes, settings=settings) for echoes in packed]
     labelled = [label_components(np.asarray(mask)) for mask in masks]
@@ -135,7 +134,7 @@ def main() -> None:
         )
 
     stages = {
-        "pack the echoes": lambda: list(FlatEchoes.from_dense(ring, ranges).steps(CELLS)),
+        "pack the echoes": lambda: list(FlatEchoes.from_dense(ring, ranges).steps(settings.cells)),
         "votes, low pass, threshold (one jitted step)": votes,
         "connected components (OpenCV, whole batch)": lambda: [label_components(np.asarray(mask)) for mask in masks],
         "centres of gravity, extents (jitted)": centres,

@@ -13,8 +13,9 @@ from typing import NoReturn
 
 from jaxsonar.hardware.errors import SonarError
 
+from .files import FIGURE_FORMATS as FIGURES
+
 RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
-FIGURES = (".svg", ".png", ".pdf")
 
 
 class _Parser(argparse.ArgumentParser):

@@ -76,9 +76,7 @@ def lines(options: argparse.Namespace) -> None:
 
 def simulate(options: argparse.Namespace) -> None:
     """``jaxsonar simulate``."""
-    import tomli_w
-
-    from .files import atomic_write
+    from .files import write_toml
     from .logs import log_format, save_log
     from .logs_csv import csv_lines
     from .ringfile import load_ring
@@ -112,8 +110,7 @@ def simulate(options: argparse.Namespace) -> None:
         save_log(log, options.output)
     if beside := _settings_file(options.output):
         said = {key: value for key, value in vars(options).items() if key not in ("command", "output")}
-        with atomic_write(beside, binary=True) as file:
-            tomli_w.dump(said, file)
+        write_toml(said, beside)
     _say(f"{len(log)} scans, {len(log.range)} echoes")
 
 

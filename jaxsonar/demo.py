@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +33,7 @@ PAPER = {"rho_max_mm": 32.3, "theta_max_deg": 7.41}
 
 def conventional_ring(ring: Ring) -> Ring:
     """The usual way for comparison: cones of 30 deg, direct echoes only (paper, section 1)."""
-    return Ring(
-        ring.position,
-        ring.heading,
-        beam=np.radians(30.0),
-        neighbors=0,
-        max_range=ring.max_range,
-        range_offset=ring.range_offset,
-        speed_of_sound=float(ring.speed_of_sound),
-        name="conventional ring",
-    )
+    return replace(ring, beam=np.radians(30.0), neighbors=0, name="conventional ring")
 
 
 def run_demo(

@@ -27,6 +27,7 @@ from jaxsonar.hardware.errors import SonarError
 
 from .components import label_components
 from .echoes import FlatEchoes
+from .files import FIGURE_FORMATS as FORMATS
 from .files import atomic_write, shown
 from .local import LocalModel, arcs_of, settings_for
 from .logs import Scan
@@ -35,7 +36,6 @@ from .ring import Ring
 from .rooms import Room
 
 DIRECT, CROSS, LINE, WALL, FAINT, ROBOT = "#0072B2", "#E69F00", "#B5123E", "#8C8C8C", "#DDDDDD", "#222222"
-FORMATS = (".svg", ".png", ".pdf")
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -83,8 +83,8 @@ def ring_figure(ring: Ring, *, transmitter: int = 0, reach: float | None = None)
         from_, to = np.degrees([heading - beam / 2, heading + beam / 2])
         length = reach if sensor == transmitter else 0.4 * reach
         axes.add_patch(Wedge((x, y), length, from_, to, color=FAINT, alpha=0.3, lw=0))
-    mine = np.flatnonzero(ring.paths[:, 0] == transmitter)
-    audible = mine[np.asarray(ring.echo_paths.width)[mine] > 0]
+    widths = np.asarray(ring.echo_paths.width)
+    audible = np.flatnonzero((ring.paths[:, 0] == transmitter) & (widths > 0))
     offsets = (ring.paths[audible, 1] - transmitter + ring.count // 2) % ring.count - ring.count // 2
     shades = [DIRECT, CROSS, "#009E73", "#CC79A7"]
     arcs = arc_points(ring, audible, np.full(len(audible), reach))
@@ -97,7 +97,7 @@ def ring_figure(ring: Ring, *, transmitter: int = 0, reach: float | None = None)
         axes.text(inward[0], inward[1], str(k), ha="center", va="center", fontsize=6, color=ROBOT)
     handles = [Line2D([], [], color=LINE, marker="o", ls="", label=f"sensor {transmitter} fires")]
     for distance in sorted({abs(int(o)) for o in offsets}):
-        width = np.degrees(np.asarray(ring.echo_paths.width)[audible[np.abs(offsets) == distance][0]])
+        width = np.degrees(widths[audible[np.abs(offsets) == distance][0]])
         who = "direct echo" if distance == 0 else f"cross echo, neighbor {distance}"
         handles.append(Line2D([], [], color=shades[min(distance, 3)], lw=2.2, label=f"{who}: {width:.0f}°"))
     handles.append(Line2D([], [], color=FAINT, lw=6, label=f"detection cones, {np.degrees(ring.beam[0]):.0f}°"))
@@ -195,13 +195,13 @@ def accumulator_figure(
         axes.set_xlabel("direction of the normal θ (deg)")
         axes.xaxis.set_major_locator(MultipleLocator(90))
         if image is not None:
-            shown = axes.imshow(
+            drawn = axes.imshow(
                 np.ma.masked_equal(image.T, 0), origin="lower", extent=box, aspect="auto", cmap="viridis_r", vmax=top
             )
-            figure.colorbar(shown, ax=axes, pad=0.01, aspect=35, label="points")
+            figure.colorbar(drawn, ax=axes, pad=0.01, aspect=35, label="points")
     palette = ListedColormap(["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"])
-    shown = np.ma.masked_equal(labels.T, 0)
-    panels[2].imshow((shown - 1) % 6, origin="lower", extent=box, aspect="auto", cmap=palette, vmin=-0.5, vmax=5.5)
+    labelled = np.ma.masked_equal(labels.T, 0)
+    panels[2].imshow((labelled - 1) % 6, origin="lower", extent=box, aspect="auto", cmap=palette, vmin=-0.5, vmax=5.5)
     for line in model.lines:
         panels[2].plot(np.degrees(line.theta), line.rho, "+", color=ROBOT, ms=9, mew=1.6)
     panels[2].legend(

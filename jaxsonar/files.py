@@ -5,12 +5,17 @@ import os
 import secrets
 import stat
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 from jaxsonar.hardware.errors import SonarError
+
+FIGURE_FORMATS = (".svg", ".png", ".pdf")
+"""Suffixes of the figures that can be written."""
+DECIMAL = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
+"""A number in a CSV file: no nan, no inf, no underscores."""
 
 
 def shown(text: str | os.PathLike[str], limit: int = 200) -> str:
@@ -112,6 +117,14 @@ def _create(temporary: Path, target: Path) -> int:
     if target.exists():
         os.fchmod(descriptor, stat.S_IMODE(target.stat().st_mode))
     return descriptor
+
+
+def write_toml(table: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
+    """Write a table as TOML, whole or not at all (``atomic_write``)."""
+    import tomli_w
+
+    with atomic_write(path, binary=True) as file:
+        tomli_w.dump(table, file)
 
 
 def refuse_folder(path: str | os.PathLike[str]) -> None:

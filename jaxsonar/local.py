@@ -218,7 +218,7 @@ def _check_method(method: str) -> None:
 def _extract(ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings) -> Iterator[tuple[slice, _Extracted]]:
     """The paper's section 4 from echoes to lines, step by step over a batch of scans."""
     arcs = arcs_of(ring, settings)
-    for step in echoes.steps(settings.theta_cells * settings.rho_cells):
+    for step in echoes.steps(settings.cells):
         packed = step.packed
         # Echo arcs -> equidistant points -> tangent lines -> votes -> low pass -> threshold, in one compiled step.
         occupied = kernels.occupied_cells(arcs, packed, settings=settings)

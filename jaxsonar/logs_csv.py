@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from jaxsonar.hardware.errors import SonarError
 
-from .files import atomic_write, read_bytes, shown
+from .files import DECIMAL, atomic_write, read_bytes, shown
 from .logs import ALLOWED, LARGEST_SENSOR, Log, LogFault
 
 COLUMNS = ("scan", "stamp", "x", "y", "theta", "tx", "rx", "range")
@@ -27,7 +27,7 @@ BLOCK = 1 << 20  # bytes parsed at once: small enough for the cache and for long
 SCANS_AT_ONCE = 8192  # written at once, for the same reasons
 LONGEST = 64  # characters of one number; rows are parsed as tables of letters, as wide as their longest
 ALPHABET = b"0123456789+-.eE,\n"
-NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+NUMBER = re.compile(DECIMAL.encode())
 
 
 class _Rows(NamedTuple):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .rooms import Junctions, Room, crossings, point_to_walls
+from .rooms import Junctions, Room, cross, crossings, point_to_walls
 
 _TOL = 1e-9  # m; what may be missed by rounding when a point lies on a wall or at its end
 
@@ -332,12 +332,12 @@ def _corners(scene: _Scene, junctions: Junctions) -> Reflections:
     point = junctions.vertices[vertex] - scene.origin
     ends = junctions.wedge_start[wedge] + np.array([[0.0], [1.0]]) * junctions.wedge_width[wedge]
     e1, e2 = np.stack([np.cos(ends), np.sin(ends)], axis=-1)  # along the two walls, away from the vertex
-    turn = _cross(e1, e2)[:, None]
+    turn = cross(e1, e2)[:, None]
     reach1, reach2 = junctions.wedge_reach[wedge].T
     g, k = _near(scene, point)
     i, j = scene.pairs.T
     offset = scene.sensors[g] - point[k, None]
-    x, y = _cross(offset, e2[k, None]) / turn[k], _cross(e1[k, None], offset) / turn[k]  # (rows, sensors), oblique
+    x, y = cross(offset, e2[k, None]) / turn[k], cross(e1[k, None], offset) / turn[k]  # (rows, sensors), oblique
     inside = (x > _TOL) & (y > _TOL)
     middle_x, middle_y = (x[:, i] + x[:, j]) / 2, (y[:, i] + y[:, j]) / 2
     middle = (offset[:, i] + offset[:, j]) / 2
@@ -415,10 +415,6 @@ def _found(kind, group, pair, reflector, length, first, last) -> Reflections:
 def _none() -> Reflections:
     nothing = np.zeros(0, dtype=int)
     return _found(Kind.PLANE, nothing, nothing, nothing, np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2)))
-
-
-def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
 def _slices(rows: int, width: int, cells: int = 1 << 18) -> Iterator[slice]:

@@ -56,10 +56,12 @@ class Ring(eqx.Module):
         neighbors: int,
         max_range: float,
         range_offset: Float[AnyArray, " sensors"] | Sequence[float] | float = 0.0,
-        speed_of_sound: float = REFERENCE_SPEED_OF_SOUND,
+        speed_of_sound: Float[AnyArray, ""] | float = REFERENCE_SPEED_OF_SOUND,
         name: str = "ring",
     ):
         """Any arrangement of sensors: a ring, a car bumper, two rings one above the other.
+
+        The arguments are the fields, so ``dataclasses.replace(ring, neighbors=0)`` gives the same ring but for those.
 
         Args:
             position: (sensors, 2) mounting positions in the robot frame, metres.
@@ -103,9 +105,9 @@ class Ring(eqx.Module):
             raise SonarError(f"ring: neighbors {self.neighbors}; allowed is 0 to {count - 1} with {count} sensors")
         if not 0 < self.max_range <= LARGEST:
             raise SonarError(f"ring: max_range {self.max_range:g} m; allowed is more than 0 and at most {LARGEST:g} m")
-        for field, unit in (("position", "m"), ("range_offset", "m")):
+        for field in ("position", "range_offset"):
             if (worst := np.abs(getattr(self, field)).max()) > LARGEST:
-                raise SonarError(f"ring: {field} {worst:g} {unit}; allowed is at most {LARGEST:g} {unit} either way")
+                raise SonarError(f"ring: {field} {worst:g} m; allowed is at most {LARGEST:g} m either way")
         if (worst := np.degrees(np.abs(self.heading).max())) > 720:
             raise SonarError(f"ring: heading {worst:g} deg; allowed is at most 720 deg either way")
         if not 0 < self.speed_of_sound <= 10_000:

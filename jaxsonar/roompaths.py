@@ -8,11 +8,10 @@ from jaxtyping import Float
 
 from jaxsonar.hardware.errors import SonarError
 
-from .files import atomic_write, read_bytes, shown
+from .files import DECIMAL, atomic_write, read_bytes, shown
+from .simulate import SECONDS_PER_SCAN
 
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-SECONDS_PER_POSE = 0.1
-"""Between the stamps of poses that come without: about the rate of a full scan of the paper's ring."""
+NUMBER = re.compile(DECIMAL)
 
 
 def save_path(
@@ -63,11 +62,12 @@ def load_path(
                 raise SonarError(f"{place}: {shown(text, 40)!r} came; allowed is a finite number up to 1e9")
     if not len(values):
         raise SonarError(f"{shown(path)}: no pose came; allowed is one or more")
-    if "stamp" in header and (np.diff(values[:, header.index("stamp")]) < 0).any():
-        late = int(np.argmax(np.diff(values[:, header.index("stamp")]) < 0)) + 2
-        place = f"{shown(path)}: row {rows[late][0]}, column stamp"
-        came = shown(rows[late][1][header.index("stamp")], 40)
-        raise SonarError(f"{place}: {came} came; allowed is no earlier than in the row before")
     column_of = {name: values[:, column] for column, name in enumerate(header)}
+    falls = np.flatnonzero(np.diff(column_of.get("stamp", np.zeros(1))) < 0)
+    if len(falls):
+        number, row = rows[falls[0] + 2]  # the header is the first row
+        came = shown(row[header.index("stamp")], 40)
+        place = f"{shown(path)}: row {number}, column stamp"
+        raise SonarError(f"{place}: {came} came; allowed is no earlier than in the row before")
     poses = np.stack([column_of["x"], column_of["y"], column_of["theta"]], axis=-1)
-    return poses, column_of.get("stamp", np.arange(len(poses)) * SECONDS_PER_POSE)
+    return poses, column_of.get("stamp", np.arange(len(poses)) * SECONDS_PER_SCAN)

@@ -111,9 +111,9 @@ def crossings(
     u = (first[:, 1] - first[:, 0])[:, None]
     v = (second[:, 1] - second[:, 0])[None]
     offset = second[None, :, 0] - first[:, None, 0]
-    turn = _cross(u, v)
+    turn = cross(u, v)
     turn = np.where(np.abs(turn) > 1e-12, turn, np.nan)
-    return _cross(offset, v) / turn, _cross(offset, u) / turn
+    return cross(offset, v) / turn, cross(offset, u) / turn
 
 
 def lines_in(
@@ -137,7 +137,8 @@ def lines_in(
     return np.abs(rho), wrap_angle(theta)
 
 
-def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def cross(u: Float[np.ndarray, "*#batch 2"], v: Float[np.ndarray, "*#batch 2"]) -> Float[np.ndarray, "..."]:
+    """Cross product of vectors in the plane: positive where v is counter-clockwise from u."""
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
@@ -156,7 +157,7 @@ def _closed(walls: np.ndarray) -> np.ndarray:
         return walls  # the caller says so
     tangent = along / length[:, None]
     offset = walls.reshape(-1, 2)[:, None] - start
-    position, across = (offset * tangent).sum(-1), _cross(tangent, offset)
+    position, across = (offset * tangent).sum(-1), cross(tangent, offset)
     touches = (np.abs(across) <= TOUCH) & (position > TOUCH) & (position < length - TOUCH)
     end, wall = np.nonzero(touches & (np.abs(across) > 1e-12))
     ends = walls.reshape(-1, 2).copy()

@@ -4,12 +4,11 @@ from dataclasses import asdict, fields
 from pathlib import Path
 
 import msgspec
-import tomli_w
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
-from .files import atomic_write, read_toml, reason, shown
+from .files import read_toml, reason, shown, write_toml
 
 _File = msgspec.defstruct(
     "_File",
@@ -34,5 +33,4 @@ def load_settings(path: Path | str) -> kernels.HoughSettings:
 
 def save_settings(settings: kernels.HoughSettings, path: Path | str) -> None:
     """Write settings so that ``load_settings`` gives the same ones."""
-    with atomic_write(path, binary=True) as file:
-        tomli_w.dump(asdict(settings), file)
+    write_toml(asdict(settings), path)

@@ -48,7 +48,7 @@ class HoughSettings:
                 "an even number, 4 to 10000",
             ),
             "rho_cells": (
-                2 <= self.rho_cells <= 10_000 and self.theta_cells * self.rho_cells <= 1_000_000,
+                2 <= self.rho_cells <= 10_000 and self.cells <= 1_000_000,
                 "2 to 10000, with theta_cells at most a million cells",
             ),
             "rho_cell": (1e-4 <= self.rho_cell <= 100, "0.0001 to 100 m"),
@@ -71,6 +71,11 @@ class HoughSettings:
     def theta_cell(self) -> float:
         """Size of a cell in theta, radians."""
         return 2 * float(np.pi) / self.theta_cells
+
+    @property
+    def cells(self) -> int:
+        """Number of cells of the accumulator."""
+        return self.theta_cells * self.rho_cells
 
     @property
     def max_rho(self) -> float:
@@ -100,14 +105,13 @@ def cell_of(
     column = jnp.floor(jnp.abs(rho) / settings.rho_cell)
     inside = counts & (column < settings.rho_cells)
     column = jnp.where(inside, column, 0).astype(jnp.int32)
-    return jnp.where(inside, row * settings.rho_cells + column, settings.theta_cells * settings.rho_cells)
+    return jnp.where(inside, row * settings.rho_cells + column, settings.cells)
 
 
 def accumulate(cells: Int[Array, "*lines"], settings: HoughSettings) -> Int[Array, "theta rho"]:
     """Number of points in each cell. Whole numbers, so the order of votes, and the device, cannot matter."""
-    size = settings.theta_cells * settings.rho_cells
-    votes = jnp.zeros(size + 1, jnp.int32).at[cells.ravel()].add(1, mode="promise_in_bounds")
-    return votes[:size].reshape(settings.theta_cells, settings.rho_cells)
+    votes = jnp.zeros(settings.cells + 1, jnp.int32).at[cells.ravel()].add(1, mode="promise_in_bounds")
+    return votes[:-1].reshape(settings.theta_cells, settings.rho_cells)
 
 
 def soft_accumulate(

@@ -232,15 +232,7 @@ def test_json_is_plain_and_complete(faw_ring, rng):
 
 def test_offsets_and_speed_of_sound_are_taken_out():
     plain = Ring.circular()
-    ring = Ring(
-        plain.position,
-        plain.heading,
-        beam=plain.beam,
-        neighbors=3,
-        max_range=2.0,
-        range_offset=np.linspace(0.0, 0.1, 24),
-        speed_of_sound=350.0,
-    )
+    ring = dataclasses.replace(plain, range_offset=np.linspace(0.0, 0.1, 24), speed_of_sound=350.0)
     echoes = oracles.wall_echoes(plain, 1.1, 0.7)
     reported = [(k, r * 343.2 / 350.0 + ring.range_offset[list(ring.paths[k])].mean()) for k, r in echoes]
     lines = extract_lines(ring, dense(ring, reported))
@@ -253,9 +245,7 @@ def test_compiles_once_for_a_ring_whatever_the_scans(faw_ring, rng):
     compiled: list[Any] = [kernels.occupied_cells, kernels.cluster_lines, kernels.ring_arcs]
     for kernel in compiled:
         kernel.clear_cache()
-    moved = Ring(
-        faw_ring.position * 1.01, faw_ring.heading, beam=faw_ring.beam, neighbors=3, max_range=2.1, name="moved"
-    )
+    moved = dataclasses.replace(faw_ring, position=faw_ring.position * 1.01, max_range=2.1, name="moved")
     for k in range(4):
         ring = moved if k == 3 else faw_ring
         extract_lines(ring, dense(ring, a_scan(ring, rng, false=k * 3)))
@@ -286,16 +276,7 @@ def test_one_jitted_step_from_echoes_to_cells(faw_ring):
 @pytest.mark.parametrize(("offset", "speed"), [(0.25, 343.2), (-0.1, 343.2), (0.0, 319.0), (0.1, 360.0)])
 def test_the_maximum_range_is_one_of_true_ranges(offset, speed):
     """Echoes just within it vote and those beyond it do not, whatever the sensors add and the air does."""
-    plain = Ring.circular()
-    ring = Ring(
-        plain.position,
-        plain.heading,
-        beam=plain.beam,
-        neighbors=3,
-        max_range=2.0,
-        range_offset=offset,
-        speed_of_sound=speed,
-    )
+    ring = dataclasses.replace(Ring.circular(), range_offset=offset, speed_of_sound=speed)
     for rho, heard in [(2.2, True), (2.5, False)]:
         near = oracles.wall_echoes(Ring.circular(max_range=3.0), rho, 0.4)
         near = [(k, r) for k, r in near if (r < 2.0) == heard]

@@ -1,5 +1,7 @@
 """Section 3 of the paper: counts, order, detection ranges, virtual sensors, firing groups, for any arrangement."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import oracles
@@ -111,6 +113,17 @@ def test_reported_ranges_are_corrected_by_offsets_then_speed():
     ring = Ring(**BUMPER, beam=1.0, neighbors=1, max_range=3.0, range_offset=[0.1, 0.2, 0.4, 0.0], speed_of_sound=350.0)
     corrected = ring.corrected(np.array([1.0, 2.0]), np.array([0, 2]), np.array([0, 1]))
     np.testing.assert_allclose(corrected, [(1.0 - 0.1) * 350 / 343.2, (2.0 - 0.3) * 350 / 343.2])
+
+
+def test_a_ring_with_one_thing_replaced_keeps_the_others():
+    ring = Ring(**BUMPER, beam=1.0, neighbors=1, max_range=3.0, range_offset=[0.1, 0.2, 0.4, 0.0], speed_of_sound=350.0)
+    other = dataclasses.replace(ring, neighbors=2)
+    assert other.neighbors == 2
+    for ours, theirs in zip(jax.tree.leaves(ring), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert (other.max_range, other.name) == (ring.max_range, ring.name)
+    with pytest.raises(SonarError, match="0 to 3"):
+        dataclasses.replace(ring, neighbors=4)
 
 
 def test_a_ring_is_a_pytree_of_what_can_be_calibrated(faw_ring):
