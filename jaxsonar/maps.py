@@ -1,0 +1,32 @@
+"""The global map: wall segments in the world frame (paper, section 5)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+@dataclass(frozen=True, eq=False)
+class GlobalMap:
+    """Merged walls in the world frame, those with the most echoes first; the arrays are read-only.
+
+    ``len(world)`` counts segments.
+    """
+
+    segments: Float[np.ndarray, "segments 2 2"]
+    """Endpoints (x, y), metres."""
+    rho: Float[np.ndarray, " segments"]
+    """Distance of the line from the world's origin, metres, >= 0."""
+    theta: Float[np.ndarray, " segments"]
+    """Direction of the line's normal, radians, in [-pi, pi)."""
+    sigma_rho: Float[np.ndarray, " segments"]
+    """Standard deviation of rho, metres; NaN where it is not known."""
+    sigma_theta: Float[np.ndarray, " segments"]
+    """Standard deviation of theta, radians; NaN where it is not known."""
+    echoes: Int[np.ndarray, " segments"]
+    """Echoes that the segment rests on."""
+    scans: tuple[tuple[int, ...], ...]
+    """Numbers of the scans that the segment was seen in, ascending."""
+
+    def __len__(self) -> int:
+        return len(self.segments)
