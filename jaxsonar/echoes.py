@@ -36,11 +36,19 @@ class Step(NamedTuple):
     """Row of the ring's ``paths``; 0 where there is no echo."""
     reported: Float[np.ndarray, "rows columns"]
     """Half path length as reported, metres; NaN where there is no echo."""
+    echo: Int[np.ndarray, "rows columns"]
+    """Row of the echo in the columns of ``FlatEchoes``; 0 where there is none."""
+    pose: Float[np.ndarray, "rows columns 3"] | None
+    """model_from_robot of each echo: x, y (m), theta (rad); None: all at the origin."""
+    gathered: Float[np.ndarray, " rows"] | None
+    """How many scans each row was gathered from; None: one."""
 
     @property
     def packed(self) -> kernels.Echoes:
         """The echoes as the kernels take them."""
-        return kernels.Echoes(jnp.asarray(self.path), jnp.asarray(self.reported))
+        pose = None if self.pose is None else jnp.asarray(self.pose)
+        gathered = None if self.gathered is None else jnp.asarray(self.gathered)
+        return kernels.Echoes(jnp.asarray(self.path), jnp.asarray(self.reported), pose, gathered)
 
 
 class FlatEchoes:
@@ -52,6 +60,9 @@ class FlatEchoes:
         scan: Int[np.ndarray, " echoes"],
         path: Int[np.ndarray, " echoes"],
         reported: Float[np.ndarray, " echoes"],
+        *,
+        pose: Float[np.ndarray, "echoes 3"] | None = None,
+        gathered: Float[np.ndarray, " scans"] | None = None,
     ):
         """Take columns sorted by scan.
 
@@ -60,8 +71,11 @@ class FlatEchoes:
             scan: index of each echo's scan, ascending.
             path: row of the ring's ``paths``.
             reported: ranges as a log has them, metres.
+            pose: model_from_robot when each echo was taken, x, y (m), theta (rad); the same for all if left out.
+            gathered: how many scans each of these was gathered from; one if left out.
         """
         self.scans, self.path, self.reported = scans, path, reported
+        self.pose, self.gathered = pose, gathered
         self.start = np.searchsorted(scan, np.arange(scans + 1))
         self.scan = scan
 
@@ -124,4 +138,13 @@ class FlatEchoes:
             reported = np.full((step, columns), np.nan, np.float32)
             path[row, column] = self.path[begin:end]
             reported[row, column] = np.minimum(self.reported[begin:end], _FARTHEST)
-            yield Step(slice(first, last), path, reported)
+            echo = np.zeros((step, columns), np.int64)
+            echo[row, column] = np.arange(begin, end)
+            pose = gathered = None
+            if self.pose is not None:
+                pose = np.zeros((step, columns, 3), np.float32)
+                pose[row, column] = self.pose[begin:end]
+            if self.gathered is not None:
+                gathered = np.ones(step, np.float32)
+                gathered[: last - first] = self.gathered[first:last]
+            yield Step(slice(first, last), path, reported, echo, pose, gathered)

@@ -1,39 +1,27 @@
 """Local models: the straight walls around the robot, from one scan (paper, section 4)."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
-from .components import label_components
-from .echoes import FlatEchoes, room_for
+from .candidates import Lines as Lines
+from .candidates import arcs_of as arcs_of
+from .candidates import extract
+from .candidates import settings_for as settings_for
+from .echoes import FlatEchoes
 from .logs import Log, Scan
 from .ring import Ring
+from .verification import verified
+from .windows import Windows, gather
 
 METHODS = ("hough",)
 """How lines are found; hough is the paper's way."""
-
-
-@dataclass(frozen=True)
-class Lines:
-    """Lines of a batch of scans in their robots' frames, strongest first; NaN (0 echoes) where a scan has fewer."""
-
-    rho: Float[np.ndarray, "scans lines"]
-    """Distance from the origin, metres, >= 0."""
-    theta: Float[np.ndarray, "scans lines"]
-    """Direction of the normal, radians, in [-pi, pi)."""
-    votes: Float[np.ndarray, "scans lines"]
-    """Number of arc points in the line's component."""
-    echoes: Int[np.ndarray, "scans lines"]
-    """Number of echoes that have a point in the component."""
-    segments: Float[np.ndarray, "scans lines 2 2"]
-    """Endpoints (x, y), metres (paper, section 5)."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +40,8 @@ class Line:
     """Number of echoes that have a point in the component."""
     paths: Int[np.ndarray, "paths 2"]
     """(tx, rx) of those echoes: the involved real sensors, and virtual ones where tx and rx differ."""
+    scans: tuple[int, ...]
+    """Numbers of the scans that those echoes come from: one, unless scans were gathered over a window."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +49,7 @@ class LocalModel:
     """What one scan tells of its surroundings, robot frame."""
 
     scan: int
+    """Number of the scan; of a window's last one, in whose frame the lines are."""
     stamp: float
     """Seconds; NaN where the log has none."""
     lines: tuple[Line, ...]
@@ -83,18 +74,6 @@ class LocalModel:
         return model | {"empty": self.empty} if self.empty else model
 
 
-@dataclass(frozen=True)
-class _Extracted:
-    """Lines of one step's scans, sorted and sifted, with the echoes involved in each."""
-
-    lines: Lines
-    involved: Bool[np.ndarray, "scans lines echoes"]
-    path: Int[np.ndarray, "scans echoes"]
-    reported: Float[np.ndarray, "scans echoes"]
-    components: Int[np.ndarray, " scans"]
-    """Components of occupied cells, before those with too few echoes were dropped."""
-
-
 def extract_lines(
     ring: Ring,
     ranges: Float[np.ndarray, "scans paths echoes"],
@@ -115,7 +94,7 @@ def extract_lines(
     """
     _check_method(method)
     echoes = FlatEchoes.from_dense(ring, ranges)
-    steps = [step.lines for _, step in _extract(ring, echoes, settings_for(ring, settings))]
+    steps = [step.lines for step in extract(ring, echoes, settings_for(ring, settings))]
     return _concatenate(steps)
 
 
@@ -132,134 +111,64 @@ def local_models(
     *,
     method: str = "hough",
     settings: kernels.HoughSettings | None = None,
+    window: float | None = None,
     on_left_out: Callable[[int], None] | None = None,
 ) -> Iterator[LocalModel]:
     """The walls around the robot from every scan of a log, scan by scan, computed in batches.
 
     Args:
         ring: the sensors.
-        log: scans; their poses are not used.
+        log: scans; their poses are used for windows only.
         method: "hough", the paper's way.
         settings: accumulator, low pass and threshold; the paper's, as large as the ring needs, if left out.
+        window: gather the scans of this length of path into one local model, metres (``windows.gather``), for rings so
+            sparse that one scan cannot carry a line; every scan for itself if left out.
         on_left_out: told once how many echoes are of pairs (tx, rx) that this ring does not listen to.
 
     Raises:
-        SonarError: a sensor number that the ring does not have, an unknown method.
+        SonarError: a sensor number that the ring does not have, an unknown method, a window that is not positive.
     """
     _check_method(method)
-    settings = settings_for(ring, settings)
-    echoes, left_out = FlatEchoes.from_log(ring, log)
+    settings = settings_for(ring, settings, window=window)
+    if window is None:
+        echoes, left_out = FlatEchoes.from_log(ring, log)
+        windows = Windows.of_scans(echoes)
+    else:
+        windows, left_out = gather(ring, log, length=window)
     if left_out and on_left_out is not None:
         on_left_out(left_out)
-    return _models(ring, log, echoes, settings)
+    return _models(ring, log, windows, settings)
 
 
-def _models(ring: Ring, log: Log, echoes: FlatEchoes, settings: kernels.HoughSettings) -> Iterator[LocalModel]:
+def _models(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSettings) -> Iterator[LocalModel]:
     paths = ring.paths
-    for scans, step in _extract(ring, echoes, settings):
-        for row, index in enumerate(range(scans.start, scans.stop)):
+    for extracted in extract(ring, windows.echoes, settings):
+        step = extracted.step
+        walls = verified(ring, windows, extracted, settings) if windows.gap else extracted.of_scan
+        for row, index in enumerate(windows.last[step.scans]):
             lines = tuple(
                 Line(
-                    rho=float(step.lines.rho[row, k]),
-                    theta=float(step.lines.theta[row, k]),
-                    segment=step.lines.segments[row, k],
-                    votes=int(step.lines.votes[row, k]),
-                    echoes=int(step.lines.echoes[row, k]),
-                    paths=paths[np.unique(step.path[row][step.involved[row, k]])],
+                    rho=wall.rho,
+                    theta=wall.theta,
+                    segment=wall.segment,
+                    votes=wall.votes,
+                    echoes=len(wall.echoes),
+                    paths=paths[np.unique(step.path[row, wall.echoes])],
+                    scans=tuple(log.scan[np.unique(windows.scan[step.echo[row, wall.echoes]])].tolist()),
                 )
-                for k in np.flatnonzero(step.lines.echoes[row])
+                for wall in walls(row)
             )
             empty = ""
             if not lines:
                 corrected = np.asarray(ring.corrected(step.reported[row], *paths[step.path[row]].T))
                 heard = int((corrected < ring.max_range).sum())
-                empty = _why_empty(heard, int(step.components[row]), settings.min_echoes)
+                empty = _why_empty(heard, int(extracted.components[row]), settings.min_echoes)
             yield LocalModel(int(log.scan[index]), float(log.stamp[index]), lines, empty)
-
-
-def settings_for(ring: Ring, settings: kernels.HoughSettings | None) -> kernels.HoughSettings:
-    """The settings themselves, or the paper's with as many cells in rho as the ring can reach, at least 100.
-
-    Raises:
-        SonarError: the given accumulator is too small for lines that this ring can report.
-    """
-    reach = float(np.linalg.norm(ring.position, axis=1).max() + ring.max_range)
-    if settings is None:
-        settings = kernels.HoughSettings()
-        needed = int(np.ceil(reach / settings.rho_cell))
-        return replace(settings, rho_cells=max(settings.rho_cells, needed))
-    if settings.max_rho < reach:
-        raise SonarError(
-            f"settings: rho_cells {settings.rho_cells} x rho_cell {settings.rho_cell:g} m = {settings.max_rho:g} m; "
-            f"allowed is {reach:.3f} m or more, the reach of {ring.name!r}"
-        )
-    return settings
-
-
-_latest: list[tuple[Ring, kernels.HoughSettings, kernels.RingArcs]] = []
-
-
-def arcs_of(ring: Ring, settings: kernels.HoughSettings) -> kernels.RingArcs:
-    """Arcs of all paths of a ring; the latest ones are kept, so that a stream of single scans makes them once."""
-    for known_ring, known_settings, arcs in tuple(_latest):
-        if known_ring is ring and known_settings == settings:
-            return arcs
-    points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
-    arcs = kernels.ring_arcs(ring.sensors, settings=settings, points=points)
-    _latest[:] = [(ring, settings, arcs)]
-    return arcs
 
 
 def _check_method(method: str) -> None:
     if method not in METHODS:
         raise SonarError(f"method {method!r}; allowed is {' or '.join(METHODS)}")
-
-
-def _extract(ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings) -> Iterator[tuple[slice, _Extracted]]:
-    """The paper's section 4 from echoes to lines, step by step over a batch of scans."""
-    arcs = arcs_of(ring, settings)
-    for step in echoes.steps(settings.cells):
-        packed = step.packed
-        # Echo arcs -> equidistant points -> tangent lines -> votes -> low pass -> threshold, in one compiled step.
-        occupied = kernels.occupied_cells(arcs, packed, settings=settings)
-        # Clusters are regions of cohesive highly occupied cells.
-        labels, counts = label_components(np.asarray(occupied))
-        # Centres of gravity of the points in each cluster, and from the sensors involved the extent of each line.
-        size = room_for(int(counts.max(initial=0)), least=16)
-        clusters, segments = kernels.cluster_lines(arcs, packed, jnp.asarray(labels), settings=settings, size=size)
-        real = slice(0, step.scans.stop - step.scans.start)  # the rest is padding
-        columns = (clusters.rho, clusters.theta, clusters.votes, segments, clusters.involved)
-        lines, involved = _sift(*(np.asarray(column)[real] for column in columns), min_echoes=settings.min_echoes)
-        yield step.scans, _Extracted(lines, involved, step.path[real], step.reported[real], counts[real])
-
-
-def _sift(
-    rho: Float[np.ndarray, "scans clusters"],
-    theta: Float[np.ndarray, "scans clusters"],
-    votes: Int[np.ndarray, "scans clusters"],
-    segments: Float[np.ndarray, "scans clusters 2 2"],
-    involved: Bool[np.ndarray, "scans clusters echoes"],
-    *,
-    min_echoes: int,
-) -> tuple[Lines, Bool[np.ndarray, "scans lines echoes"]]:
-    """Lines with enough echoes, strongest first, and which echoes are involved in each."""
-    echoes = involved.sum(axis=-1)
-    kept = echoes >= min_echoes
-    order = np.argsort(np.where(kept, -votes, 1), axis=1, kind="stable")
-    order = order[:, : int(kept.sum(axis=1).max(initial=0))]
-
-    def sifted(values: np.ndarray) -> np.ndarray:
-        return np.take_along_axis(values, order.reshape(order.shape + (1,) * (values.ndim - 2)), axis=1)
-
-    kept = sifted(kept)
-    lines = Lines(
-        rho=np.where(kept, sifted(rho), np.nan),
-        theta=np.where(kept, sifted(theta), np.nan),
-        votes=np.where(kept, sifted(votes), np.nan),
-        echoes=np.where(kept, sifted(echoes), 0),
-        segments=np.where(kept[..., None, None], sifted(segments), np.nan),
-    )
-    return lines, sifted(involved)
 
 
 def _why_empty(heard: int, components: int, min_echoes: int) -> str:

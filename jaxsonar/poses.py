@@ -19,3 +19,13 @@ def rotation(theta: float) -> Float[np.ndarray, "2 2"]:
 def to_world(pose: Float[np.ndarray, "3"], points: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
     """Points of the robot frame in the world frame, metres."""
     return points @ rotation(pose[2]).T + pose[:2]
+
+
+def relative(
+    world_from_a: Float[np.ndarray, "*batch 3"], world_from_b: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 3"]:
+    """a_from_b: the poses b as seen from the poses a."""
+    offset = world_from_b[..., :2] - world_from_a[..., :2]
+    c, s = np.cos(world_from_a[..., 2]), np.sin(world_from_a[..., 2])
+    x, y = c * offset[..., 0] + s * offset[..., 1], c * offset[..., 1] - s * offset[..., 0]
+    return np.stack([x, y, wrap_angle(world_from_b[..., 2] - world_from_a[..., 2])], axis=-1)

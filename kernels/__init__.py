@@ -33,3 +33,5 @@ from .hough import theta_row as theta_row
 from .paths import EchoPaths as EchoPaths
 from .paths import Sensors as Sensors
 from .paths import echo_paths as echo_paths
+from .fitting import Fits as Fits
+from .fitting import fit_candidates as fit_candidates

@@ -21,6 +21,11 @@ class Echoes(eqx.Module):
     """Row of the ring's ``paths``; 0 where there is no echo."""
     range: Float[Array, "*scans echoes"]
     """Half path length as reported, metres; NaN where there is no echo."""
+    pose: Float[Array, "*scans echoes 3"] | None = None
+    """model_from_robot: where the robot stood when each echo was taken, in the frame of the lines: x, y (metres), theta
+    (radians). None: all were taken where that frame is."""
+    gathered: Float[Array, "*scans"] | None = None
+    """How many scans were gathered, the measure of the votes that a wall can collect. None: one."""
 
 
 class RingArcs(eqx.Module):
@@ -66,19 +71,42 @@ def points_of_widest_arc(beam: Float[np.ndarray, " sensors"], settings: HoughSet
     return max(1, int(np.ceil(np.max(beam) / settings.point_pitch - 1e-6)))
 
 
-def lines_of_scan(
-    ring: RingArcs, echoes: Echoes, settings: HoughSettings
-) -> tuple[Float[Array, "echoes points"], Int[Array, "echoes points"]]:
-    """Distance (metres, any sign) and cell of the tangent line at every point of every echo's arc, for ONE scan."""
+class TangentLines(eqx.Module):
+    """Tangent lines at the points of echo arcs: of one echo, or of all echoes of ONE scan."""
 
-    def one_echo(path: Int[Array, ""], reported: Float[Array, ""]):
+    rho: Float[Array, "*echoes points"]
+    """Distances, metres, any sign."""
+    normal_x: Float[Array, "*echoes points"]
+    """Cosines of the normals."""
+    normal_y: Float[Array, "*echoes points"]
+    """Sines of the normals."""
+    cell: Int[Array, "*echoes points"]
+    """Cells of the accumulator (``hough.cell_of``)."""
+    sensor: Float[Array, "*echoes 2"]
+    """Real or virtual sensor of each echo, metres."""
+
+
+def lines_of_scan(ring: RingArcs, echoes: Echoes, settings: HoughSettings) -> TangentLines:
+    """The tangent line at every point of every echo's arc, for ONE scan, or several gathered in one frame."""
+
+    def one_echo(path: Int[Array, ""], reported: Float[Array, ""], pose: Float[Array, "3"] | None):
         arc, row = jax.tree.map(lambda leaf: leaf[path], (ring.arcs, ring.rows))
         offset = ring.paths.range_offset[path]
         reach = arcs.corrected_range(reported, range_offset=offset, range_scale=ring.range_scale)
         rho, counts = arcs.tangent_rho(arc, reach, max_range=ring.max_range)
-        return rho, hough.cell_of(rho, row, counts, settings)
+        normal_x, normal_y, sensor = arc.normal_x, arc.normal_y, ring.paths.midpoint[path]
+        if pose is not None:  # the line n . p = rho, seen from a frame in which the robot stands at the pose
+            turn_x, turn_y = jnp.cos(pose[2]), jnp.sin(pose[2])
+            normal_x, normal_y = turn_x * normal_x - turn_y * normal_y, turn_y * normal_x + turn_x * normal_y
+            rho = rho + pose[0] * normal_x + pose[1] * normal_y
+            row = hough.theta_row(arc.theta + pose[2], settings)
+            sensor = pose[:2] + jnp.stack(
+                [turn_x * sensor[0] - turn_y * sensor[1], turn_y * sensor[0] + turn_x * sensor[1]]
+            )
+        return TangentLines(rho, normal_x, normal_y, hough.cell_of(rho, row, counts, settings), sensor)
 
-    return jax.vmap(one_echo)(echoes.path, echoes.range)
+    poses = None if echoes.pose is None else 0
+    return jax.vmap(one_echo, in_axes=(0, 0, poses))(echoes.path, echoes.range, echoes.pose)
 
 
 def _over_scans(one_scan: Callable, *scans):
@@ -104,10 +132,11 @@ def occupied_cells(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -
     """
 
     def one_scan(scan: Echoes) -> Bool[Array, "theta rho"]:
-        _, cells = lines_of_scan(ring, scan, settings)  # arcs -> equidistant points -> tangent lines
-        votes = hough.accumulate(cells, settings)  # points per cell
+        lines = lines_of_scan(ring, scan, settings)  # arcs -> equidistant points -> tangent lines
+        votes = hough.accumulate(lines.cell, settings)  # points per cell
         smooth = hough.lowpass(votes, settings)  # balance between neighbor cells
-        return smooth > ring.level  # highly occupied cells
+        level = ring.level if scan.gathered is None else ring.level * scan.gathered
+        return smooth > level  # highly occupied cells
 
     return _over_scans(one_scan, echoes)
 
@@ -119,7 +148,7 @@ def accumulators(
     """Votes before and after the low pass, to look at; arguments as ``occupied_cells``."""
 
     def one_scan(scan: Echoes):
-        votes = hough.accumulate(lines_of_scan(ring, scan, settings)[1], settings)
+        votes = hough.accumulate(lines_of_scan(ring, scan, settings).cell, settings)
         return votes, hough.lowpass(votes, settings)
 
     return _over_scans(one_scan, echoes)
@@ -148,13 +177,13 @@ def cluster_lines(
     """
 
     def one_scan(scan: Echoes, label: Int[Array, "theta rho"]):
-        rho, cells = lines_of_scan(ring, scan, settings)
-        normal_x, normal_y = ring.arcs.normal_x[scan.path], ring.arcs.normal_y[scan.path]
+        voting = lines_of_scan(ring, scan, settings)
         label_of_cell = jnp.append(label.ravel(), jnp.zeros(1, label.dtype))  # the last one: no cell, no component
-        lines = clusters.centres_of_gravity(rho, normal_x, normal_y, label_of_cell[cells], clusters=size)
-        sensors_of_echoes = ring.paths.midpoint[scan.path]
+        lines = clusters.centres_of_gravity(
+            voting.rho, voting.normal_x, voting.normal_y, label_of_cell[voting.cell], clusters=size
+        )
         segments = jax.vmap(clusters.extent, in_axes=(0, 0, None, 0))(
-            lines.rho, lines.theta, sensors_of_echoes, lines.involved
+            lines.rho, lines.theta, voting.sensor, lines.involved
         )
         return lines, segments
 

@@ -1,0 +1,158 @@
+"""From the echoes of a batch of scans to candidate lines: the paper's section 4, a comment a step."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxsonar import kernels
+from jaxsonar.hardware.errors import SonarError
+
+from .components import label_components
+from .echoes import FlatEchoes, Step, room_for
+from .ring import Ring
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines of a batch of scans in their robots' frames, strongest first; NaN (0 echoes) where a scan has fewer."""
+
+    rho: Float[np.ndarray, "scans lines"]
+    """Distance from the origin, metres, >= 0."""
+    theta: Float[np.ndarray, "scans lines"]
+    """Direction of the normal, radians, in [-pi, pi)."""
+    votes: Float[np.ndarray, "scans lines"]
+    """Number of arc points in the line's component."""
+    echoes: Int[np.ndarray, "scans lines"]
+    """Number of echoes that have a point in the component."""
+    segments: Float[np.ndarray, "scans lines 2 2"]
+    """Endpoints (x, y), metres (paper, section 5)."""
+
+
+@dataclass(frozen=True)
+class Extracted:
+    """Lines of one step's scans, sorted and sifted, with the echoes involved in each."""
+
+    step: Step
+    """The echoes; its rows may go on with padding."""
+    lines: Lines
+    involved: Bool[np.ndarray, "scans lines echoes"]
+    components: Int[np.ndarray, " scans"]
+    """Components of occupied cells, before those with too few echoes were dropped."""
+
+    def of_scan(self, row: int) -> Iterator["Candidate"]:
+        """The lines of one scan, strongest first."""
+        lines = self.lines
+        for k in np.flatnonzero(lines.echoes[row]):
+            yield Candidate(
+                rho=float(lines.rho[row, k]),
+                theta=float(lines.theta[row, k]),
+                segment=lines.segments[row, k],
+                votes=int(lines.votes[row, k]),
+                echoes=np.flatnonzero(self.involved[row, k]),
+            )
+
+
+class Candidate(NamedTuple):
+    """One line of one scan, robot frame."""
+
+    rho: float
+    """Distance, metres."""
+    theta: float
+    """Direction of the normal, radians."""
+    segment: Float[np.ndarray, "2 2"]
+    """Endpoints, metres."""
+    votes: int
+    """Arc points in its component."""
+    echoes: Int[np.ndarray, " echoes"]
+    """Columns of the step's row that hold its echoes."""
+
+
+def extract(ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings) -> Iterator[Extracted]:
+    """The paper's section 4 from echoes to lines, step by step over a batch of scans."""
+    arcs = arcs_of(ring, settings)
+    for step in echoes.steps(settings.cells):
+        packed = step.packed
+        # Echo arcs -> equidistant points -> tangent lines -> votes -> low pass -> threshold, in one compiled step.
+        occupied = kernels.occupied_cells(arcs, packed, settings=settings)
+        # Clusters are regions of cohesive highly occupied cells.
+        labels, counts = label_components(np.asarray(occupied))
+        # Centres of gravity of the points in each cluster, and from the sensors involved the extent of each line.
+        size = room_for(int(counts.max(initial=0)), least=16)
+        clusters, segments = kernels.cluster_lines(arcs, packed, jnp.asarray(labels), settings=settings, size=size)
+        real = slice(0, step.scans.stop - step.scans.start)  # the rest is padding
+        columns = (clusters.rho, clusters.theta, clusters.votes, segments, clusters.involved)
+        lines, involved = _sift(*(np.asarray(column)[real] for column in columns), min_echoes=settings.min_echoes)
+        yield Extracted(step, lines, involved, counts[real])
+
+
+def _sift(
+    rho: Float[np.ndarray, "scans clusters"],
+    theta: Float[np.ndarray, "scans clusters"],
+    votes: Int[np.ndarray, "scans clusters"],
+    segments: Float[np.ndarray, "scans clusters 2 2"],
+    involved: Bool[np.ndarray, "scans clusters echoes"],
+    *,
+    min_echoes: int,
+) -> tuple[Lines, Bool[np.ndarray, "scans lines echoes"]]:
+    """Lines with enough echoes, strongest first, and which echoes are involved in each."""
+    echoes = involved.sum(axis=-1)
+    kept = echoes >= min_echoes
+    order = np.argsort(np.where(kept, -votes, 1), axis=1, kind="stable")
+    order = order[:, : int(kept.sum(axis=1).max(initial=0))]
+
+    def sifted(values: np.ndarray) -> np.ndarray:
+        return np.take_along_axis(values, order.reshape(order.shape + (1,) * (values.ndim - 2)), axis=1)
+
+    kept = sifted(kept)
+    lines = Lines(
+        rho=np.where(kept, sifted(rho), np.nan),
+        theta=np.where(kept, sifted(theta), np.nan),
+        votes=np.where(kept, sifted(votes), np.nan),
+        echoes=np.where(kept, sifted(echoes), 0),
+        segments=np.where(kept[..., None, None], sifted(segments), np.nan),
+    )
+    return lines, sifted(involved)
+
+
+def settings_for(
+    ring: Ring, settings: kernels.HoughSettings | None, *, window: float | None = None
+) -> kernels.HoughSettings:
+    """The settings themselves, or the paper's with as many cells in rho as the ring can reach, at least 100.
+
+    Args:
+        ring: the sensors.
+        settings: what was asked for, if anything.
+        window: length of path that is gathered into one local model, metres.
+
+    Raises:
+        SonarError: the given accumulator is too small for lines that this ring can report.
+    """
+    reach = float(np.linalg.norm(ring.position, axis=1).max() + ring.max_range) + (window or 0.0)
+    if settings is None:
+        settings = kernels.HoughSettings()
+        needed = int(np.ceil(reach / settings.rho_cell))
+        return replace(settings, rho_cells=max(settings.rho_cells, needed))
+    if settings.max_rho < reach:
+        raise SonarError(
+            f"settings: rho_cells {settings.rho_cells} x rho_cell {settings.rho_cell:g} m = {settings.max_rho:g} m; "
+            f"allowed is {reach:.3f} m or more, the reach of {ring.name!r}"
+        )
+    return settings
+
+
+_latest: list[tuple[Ring, kernels.HoughSettings, kernels.RingArcs]] = []
+
+
+def arcs_of(ring: Ring, settings: kernels.HoughSettings) -> kernels.RingArcs:
+    """Arcs of all paths of a ring; the latest ones are kept, so that a stream of single scans makes them once."""
+    for known_ring, known_settings, arcs in tuple(_latest):
+        if known_ring is ring and known_settings == settings:
+            return arcs
+    points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
+    arcs = kernels.ring_arcs(ring.sensors, settings=settings, points=points)
+    _latest[:] = [(ring, settings, arcs)]
+    return arcs

@@ -1,0 +1,127 @@
+"""Windows of the path: the echoes of a short stretch gathered in one frame, for rings too sparse for one scan."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxsonar.hardware.errors import SonarError
+
+from .echoes import FlatEchoes
+from .logs import Log
+from .poses import relative, wrap_angle
+from .ring import Ring
+
+OVERLAP = 2
+"""Every echo enters this many windows: a wall that one window cuts off lies in the middle of the next."""
+RENEWAL = 2
+"""A reading that stays the same is taken to be renewed with every second scan."""
+SAME_PLACE, SAME_HEADING = 0.01, float(np.radians(1.0))
+"""Metres and radians; scans within one such step of the path are taken in one place."""
+LEAST_GAP = 0.4
+"""Metres; readings of a wall closer than this, along it, belong to one segment."""
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Stretches of a path, each to be treated like one scan taken at its last pose."""
+
+    last: Int[np.ndarray, " windows"]
+    """Row of the log's scan in whose frame the window is, its last."""
+    echoes: FlatEchoes
+    """Echoes of the windows, with the poses that they were taken at in the frame of the last one."""
+    scan: Int[np.ndarray, " echoes"]
+    """Row of the log's scan that each of these echoes comes from."""
+    gap: float
+    """Metres of a path that may lie between two readings of one wall; 0 where nothing was gathered."""
+
+    @classmethod
+    def of_scans(cls, echoes: FlatEchoes) -> "Windows":
+        """Every scan for itself."""
+        return cls(np.arange(echoes.scans), echoes, echoes.scan, 0.0)
+
+
+def gather(ring: Ring, log: Log, *, length: float) -> tuple[Windows, int]:
+    """Gather the echoes of a log over windows of its path (each echo with the pose that it was taken at).
+
+    Readings that have not been renewed (``renewed``) are left out: a stale reading belongs to an earlier pose. Scans without a pose are left out, and no window reaches across them.
+
+    Args:
+        ring: the sensors.
+        log: scans with poses, in the order in which the path was driven.
+        length: of a window along the path, metres. Windows follow one another at half this distance.
+
+    Returns:
+        The windows, and how many echoes are of pairs that the ring does not listen to, and left out.
+
+    Raises:
+        SonarError: a length that is not positive, a sensor number that the ring does not have.
+    """
+    if not length > 0:
+        raise SonarError(f"window = {length:g} m; allowed is a length above 0")
+    flat, left_out = FlatEchoes.from_log(ring, log)
+    fresh = renewed(flat) & moved(log.pose)[flat.scan]
+    share = np.bincount(flat.scan[fresh], minlength=len(log)) / np.maximum(np.bincount(flat.scan, minlength=len(log)), 1)
+    begin, last = _stretches(log.pose, length)
+    first_echo, end_echo = flat.start[begin], flat.start[last + 1]
+    counts = end_echo - first_echo
+    echo = np.repeat(first_echo - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+    window = np.repeat(np.arange(len(last)), counts)
+    kept = fresh[echo]
+    echo, window = echo[kept], window[kept]
+    poses = relative(log.pose[last][window], log.pose[flat.scan[echo]])
+    total = np.append(0, np.cumsum(share))
+    gathered = np.maximum(total[last + 1] - total[begin], 1)
+    echoes = FlatEchoes(
+        len(last), window, flat.path[echo], flat.reported[echo], pose=poses, gathered=gathered
+    )
+    strides = np.hypot(*np.diff(log.pose[moved(log.pose), :2], axis=0).T)
+    gap = max(LEAST_GAP, 2.5 * RENEWAL * float(np.median(strides))) if len(strides) else LEAST_GAP
+    return Windows(last, echoes, flat.scan[echo], gap), left_out
+
+
+def moved(pose: Float[np.ndarray, "scans 3"]) -> Bool[np.ndarray, " scans"]:
+    """Scans to which the robot has moved on: of those taken in one place the first, none without a pose.
+
+    A robot that waits hears the same echoes again and again; that must not weigh more than what it heard on its way.
+    """
+    known = np.isfinite(pose).all(axis=1)
+    step = np.zeros(len(pose))
+    both = known[1:] & known[:-1]
+    difference = np.where(both[:, None], np.diff(pose, axis=0), 0.0)
+    step[1:] = np.hypot(*difference[:, :2].T) / SAME_PLACE + np.abs(wrap_angle(difference[:, 2])) / SAME_HEADING
+    place = np.floor(np.cumsum(step))
+    return known & np.append(True, (np.diff(place) > 0) | ~both)[: len(pose)]
+
+
+def renewed(flat: FlatEchoes) -> Bool[np.ndarray, " echoes"]:
+    """Which echoes are new readings, as far as a log can tell.
+
+    A sensor that is slower than the log repeats its last reading. So does one that moves along a wall, and that must
+    not be lost. Hence, of a run of scans with the same range on the same path, every ``RENEWAL``-th reading counts.
+    """
+    order = np.lexsort((flat.scan, flat.reported, flat.path))
+    path, reported, scan = flat.path[order], flat.reported[order], flat.scan[order]
+    repeats = (path[1:] == path[:-1]) & (reported[1:] == reported[:-1]) & (scan[1:] == scan[:-1] + 1)
+    row = np.arange(len(order))
+    run = np.maximum.accumulate(np.where(np.append(False, repeats), 0, row)) if len(order) else row
+    fresh = np.ones(len(order), bool)
+    fresh[order] = (row - run) % RENEWAL == 0
+    return fresh
+
+
+def _stretches(
+    pose: Float[np.ndarray, "scans 3"], length: float
+) -> tuple[Int[np.ndarray, " windows"], Int[np.ndarray, " windows"]]:
+    """First and last scan of every window: each reaches back by ``length`` from its last pose."""
+    known = np.isfinite(pose).all(axis=1)
+    begins, lasts = [], []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]])))
+    for start, stop in edges.reshape(-1, 2):  # runs of scans with poses
+        way = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[start:stop, :2], axis=0).T)))
+        goals = np.arange(1, int(way[-1] // (length / OVERLAP)) + 1) * (length / OVERLAP)
+        last = np.unique(np.append(np.searchsorted(way, goals), stop - start - 1))
+        begins.append(start + np.searchsorted(way, way[last] - length))
+        lasts.append(start + last)
+    nothing = np.zeros(0, np.int64)
+    return np.concatenate([nothing, *begins]), np.concatenate([nothing, *lasts])

@@ -1,0 +1,180 @@
+"""Which reflector explains the ranges: a plane, or a point (corner or edge), fitted to the echoes around a candidate.
+
+The Hough step votes for planes only, but a corner or a post answers to many poses as well, and its tangent lines pile
+up almost like those of a wall. The ranges themselves tell them apart: a wall's foot travels along with the sensor, a
+point stays where it is. Both are fitted robustly: the scale of Geman and McClure's loss is lowered from step to step
+(graduated non-convexity), so that echoes of other reflectors lose their weight.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from . import arcs
+from .extraction import Echoes, RingArcs
+from .geometry import edge_range, fold_line, normal, plane_range, point_range, tangent, wrap_angle
+
+_STEPS = 12
+_WIDEST = 4.0  # the loss starts this many tolerances wide
+_SLACK = 0.05  # rad; how far beyond its nominal cone a sensor may have heard something
+_LONGEST_STEP = 0.1  # m and rad
+
+
+class Heard(eqx.Module):
+    """One echo, or the echoes of ONE model, in its frame."""
+
+    tx: Float[Array, "*echoes 2"]
+    """Transmitters when they fired, metres."""
+    rx: Float[Array, "*echoes 2"]
+    """Receivers, metres."""
+    reach: Float[Array, "*echoes"]
+    """Half path lengths, corrected, metres; 0 where there is no echo."""
+    start: Float[Array, "*echoes"]
+    """First direction from which the path hears a plane, radians."""
+    width: Float[Array, "*echoes"]
+    """Width of its detection range, radians."""
+
+
+class Fits(eqx.Module):
+    """Planes and points that explain the echoes around candidate lines; see ``fit_candidates``."""
+
+    rho: Float[Array, "*lines"]
+    """Distance of the fitted plane, metres, >= 0."""
+    theta: Float[Array, "*lines"]
+    """Direction of its normal, radians."""
+    explained: Bool[Array, "*lines echoes"]
+    """Echoes that the plane explains, to the tolerance."""
+    foot: Float[Array, "*lines echoes"]
+    """Where along the plane each echo's virtual sensor stands before it, metres from the foot of the origin."""
+    plane_score: Float[Array, "*lines"]
+    """Sum over the echoes of 1 - (residual / tolerance)^2, where positive: how much the plane explains."""
+    point_score: Float[Array, "*lines"]
+    """The same of the better one of a corner and an edge."""
+
+
+def heard(ring: RingArcs, echoes: Echoes) -> Heard:
+    """Where the sensors of every echo of ONE model stood, and how far the echo came from."""
+
+    def one_echo(path, reported, pose):
+        paths = jax.tree.map(lambda leaf: leaf[path], ring.paths)
+        reach = arcs.corrected_range(reported, range_offset=paths.range_offset, range_scale=ring.range_scale)
+        reach = jnp.where(reach < ring.max_range, reach, 0)
+        tx, rx, start = paths.midpoint - paths.half_baseline, paths.midpoint + paths.half_baseline, paths.start
+        if pose is not None:
+            forward, left = normal(pose[2]), tangent(pose[2])
+            tx = pose[:2] + tx[0] * forward + tx[1] * left
+            rx = pose[:2] + rx[0] * forward + rx[1] * left
+            start = start + pose[2]
+        return Heard(tx, rx, jnp.maximum(reach, 0), start, paths.width)
+
+    poses = None if echoes.pose is None else 0
+    return jax.vmap(one_echo, in_axes=(0, 0, poses))(echoes.path, echoes.range, echoes.pose)
+
+
+def fit(
+    model: Callable[[Float[Array, "2"], Heard], tuple[Float[Array, ""], Float[Array, ""]]],
+    start: Float[Array, "2"],
+    echoes: Heard,
+    *,
+    tolerance: float,
+) -> tuple[Float[Array, "2"], Float[Array, " echoes"]]:
+    """Robust Gauss-Newton fit of ONE reflector with two parameters to the echoes of ONE model.
+
+    Args:
+        model: range (metres) and direction (radians) from which an echo hears the reflector.
+        start: first guess.
+        echoes: all echoes, those of other reflectors included.
+        tolerance: residual up to which an echo counts as explained, metres.
+
+    Returns:
+        The parameters, and how well they explain every echo: 1 - (residual / tolerance)^2, at least 0.
+    """
+
+    def look(x):
+        def one(echo: Heard):
+            (predicted, direction), slope = jax.value_and_grad(model, has_aux=True)(x, echo)
+            off_axis = jnp.abs(wrap_angle(direction - echo.start - echo.width / 2))
+            audible = (echo.reach > 0) & (off_axis <= echo.width / 2 + _SLACK)
+            return jnp.where(audible, echo.reach - predicted, jnp.inf), slope
+
+        return jax.vmap(one)(echoes)
+
+    def step(x, scale):
+        residual, slope = look(x)
+        square = jnp.where(jnp.isfinite(residual), (residual / scale) ** 2, jnp.inf)
+        weight = 1 / (1 + square) ** 2
+        pull = jnp.where(weight > 0, weight * jnp.where(jnp.isfinite(residual), residual, 0), 0)
+        xx, xy, yy = ((weight * a * b).sum() for a, b in ((slope[:, 0],) * 2, slope.T, (slope[:, 1],) * 2))
+        damping = 1e-4 * (xx + yy) + 1e-9
+        xx, yy = xx + damping, yy + damping
+        gx, gy = slope.T @ pull
+        move = jnp.stack([yy * gx - xy * gy, xx * gy - xy * gx]) / (xx * yy - xy * xy)
+        return x + jnp.clip(move, -_LONGEST_STEP, _LONGEST_STEP), None
+
+    scales = tolerance * jnp.asarray(np.geomspace(_WIDEST, 1.0, _STEPS), start.dtype)
+    x, _ = jax.lax.scan(step, start, scales)
+    residual, _ = look(x)
+    return x, jnp.maximum(1 - (residual / tolerance) ** 2, 0)
+
+
+def plane(line: Float[Array, "2"], echo: Heard) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Range of a wall (rho, theta), and the direction it is heard from."""
+    return plane_range(line[0], line[1], echo.tx, echo.rx), line[1]
+
+
+def corner(place: Float[Array, "2"], echo: Heard) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Range of a right-angled corner, and the direction it is heard from."""
+    return point_range(place, echo.tx, echo.rx), _bearing(place, echo)
+
+
+def edge(place: Float[Array, "2"], echo: Heard) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Range of an edge or a thin pole, and the direction it is heard from."""
+    return edge_range(place, echo.tx, echo.rx), _bearing(place, echo)
+
+
+def _bearing(place: Float[Array, "2"], echo: Heard) -> Float[Array, ""]:
+    offset = place - (echo.tx + echo.rx) / 2
+    here = (offset == 0).all()
+    return jnp.arctan2(offset[1], jnp.where(here, 1, offset[0]))
+
+
+@partial(jax.jit, static_argnames="tolerance")
+def fit_candidates(
+    ring: RingArcs,
+    echoes: Echoes,
+    rho: Float[Array, "scans lines"],
+    theta: Float[Array, "scans lines"],
+    *,
+    tolerance: float,
+) -> Fits:
+    """Fit a plane, a corner and an edge to the echoes around every candidate line of a batch of scans.
+
+    Args:
+        ring: arcs of the ring's paths.
+        echoes: (scans, echoes) packed echoes.
+        rho: distances of the candidates, metres; NaN where there is none.
+        theta: directions of their normals, radians.
+        tolerance: residual up to which an echo counts as explained, metres.
+    """
+
+    def one_scan(scan: Echoes, rho: Float[Array, " lines"], theta: Float[Array, " lines"]) -> Fits:
+        echo = heard(ring, scan)
+        middle = (echo.tx + echo.rx) / 2
+
+        def one_candidate(rho: Float[Array, ""], theta: Float[Array, ""]) -> Fits:
+            line, score = fit(plane, jnp.stack([rho, theta]), echo, tolerance=tolerance)
+            foot = middle @ tangent(line[1])
+            mean = (score * foot).sum() / jnp.maximum(score.sum(), 1e-6)
+            place = line[0] * normal(line[1]) + mean * tangent(line[1])
+            points = [fit(model, place, echo, tolerance=tolerance)[1].sum() for model in (corner, edge)]
+            rho, theta = fold_line(line[0], line[1])
+            return Fits(rho, theta, score > 0, middle @ tangent(theta), score.sum(), jnp.maximum(*points))
+
+        return jax.vmap(one_candidate)(rho, theta)
+
+    return jax.lax.map(lambda one: one_scan(*one), (echoes, rho, theta))
