@@ -67,10 +67,10 @@ def lines(options: argparse.Namespace) -> None:
     if options.figure and model is None:
         _say(f"no scan to draw: {options.figure} is not written")
     elif options.figure and model is not None:
-        from . import figures
+        from . import figures, figures_scan
 
         scan = log[int((log.scan == model.scan).argmax())]
-        figures.save(figures.lines_figure(ring, scan, model), options.figure)
+        figures.save(figures_scan.lines_figure(ring, scan, model), options.figure)
     _say(tally.summary())
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from . import figures
+from . import figures, figures_map, figures_scan
 from .deviations import Deviations, compare, pooled
 from .files import atomic_write, make_folder
 from .local import LocalModel, local_models, settings_for
@@ -141,9 +141,9 @@ def _random_rows(
 def _figures(office: Office, log: Log, models: list[LocalModel]) -> Iterator[tuple[str, Any]]:
     """The paper's figures 1 to 4, the accumulator, and the segments of all scans (figure 6)."""
     ring, room, pose = office.ring, office.room, office.poses[0]
-    yield "1-ring", figures.ring_figure(ring)
-    yield "2-reference", figures.reference_figure(room, pose, ring=ring)
-    yield "3-arcs", figures.arcs_figure(ring, log[0], room=room, pose=pose)
-    yield "4-lines", figures.lines_figure(ring, log[0], models[0], room=room, pose=pose)
-    yield "5-accumulator", figures.accumulator_figure(ring, log[0], models[0])
-    yield "6-segments", figures.aggregate_figure(ring, models, office.poses, room=room)
+    yield "1-ring", figures_scan.ring_figure(ring)
+    yield "2-reference", figures_scan.reference_figure(room, pose, ring=ring)
+    yield "3-arcs", figures_scan.arcs_figure(ring, log[0], room=room, pose=pose)
+    yield "4-lines", figures_scan.lines_figure(ring, log[0], models[0], room=room, pose=pose)
+    yield "5-accumulator", figures_scan.accumulator_figure(ring, log[0], models[0])
+    yield "6-segments", figures_map.aggregate_figure(ring, models, office.poses, room=room)

@@ -1,41 +1,33 @@
-"""Figures of the ring, the echoes, the accumulator and the lines (paper, figures 1 to 4).
+"""What all figures share: their style, plan views in metres, and how a figure becomes a file.
 
-Each function draws one figure and returns it; ``save`` writes it. Colours stay distinct for colour-blind readers.
+Each function of ``figures_scan`` and ``figures_map`` draws one figure and returns it; ``save`` writes it. Colours stay
+distinct for colour-blind readers.
 """
 
-from collections.abc import Sequence
+import io
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Wedge
-from matplotlib.ticker import MultipleLocator
 
-from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
-from .components import label_components
-from .echoes import FlatEchoes
 from .files import FIGURE_FORMATS as FORMATS
 from .files import atomic_write, shown
-from .local import LocalModel, arcs_of, settings_for
-from .logs import Scan
 from .poses import to_world
 from .ring import Ring
 from .rooms import Room
 
-DIRECT, CROSS, LINE, WALL, FAINT, ROBOT = "#0072B2", "#E69F00", "#B5123E", "#8C8C8C", "#DDDDDD", "#222222"
+PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
+"""Okabe and Ito's colours, told apart by colour-blind readers too."""
+DIRECT, CROSS, LINE, WALL, FAINT, ROBOT = PALETTE[0], PALETTE[1], "#B5123E", "#8C8C8C", "#DDDDDD", "#222222"
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -47,6 +39,7 @@ STYLE: dict[Any, Any] = {
     "savefig.dpi": 160,
     "svg.hashsalt": "jaxsonar",  # the same figure gives the same file
 }
+_LONG_PLAN, _LONG_WIDTH, _TALLEST, _NARROWEST = 0.45, 10.0, 8.5, 4.2  # height / width; inches
 
 
 def styled() -> AbstractContextManager[None]:
@@ -63,206 +56,20 @@ def save(figure: Figure, path: Path | str) -> None:
     path = Path(path)
     if path.suffix.lower() not in FORMATS:
         raise SonarError(f"{shown(path)}: figure format {path.suffix!r}; allowed are {', '.join(FORMATS)}")
-    kind = path.suffix.lower()[1:]
+    with atomic_write(path, binary=True) as file:
+        file.write(rendered(figure, path.suffix.lower()[1:]))
+
+
+def rendered(figure: Figure, kind: str) -> bytes:
+    """A figure as the bytes of an svg, png or pdf file; the same figure gives the same bytes."""
     metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    with styled(), atomic_write(path, binary=True) as file:
-        figure.savefig(file, format=kind, metadata=metadata)
-
-
-def ring_figure(ring: Ring, *, transmitter: int = 0, reach: float | None = None) -> Figure:
-    """The sensors with their cones, and the arcs of all paths of one transmitter at one range (paper, figure 1).
-
-    Args:
-        ring: the sensors.
-        transmitter: the sensor that fires.
-        reach: half path length of the drawn arcs, metres; half the maximum range if left out.
-    """
-    reach = ring.max_range / 2 if reach is None else reach
-    figure, axes = _plan(f"{ring.name}: {ring.count} sensors, {len(ring.paths)} echo paths")
-    for sensor, ((x, y), heading, beam) in enumerate(zip(ring.position, ring.heading, ring.beam, strict=True)):
-        from_, to = np.degrees([heading - beam / 2, heading + beam / 2])
-        length = reach if sensor == transmitter else 0.4 * reach
-        axes.add_patch(Wedge((x, y), length, from_, to, color=FAINT, alpha=0.3, lw=0))
-    widths = np.asarray(ring.echo_paths.width)
-    audible = np.flatnonzero((ring.paths[:, 0] == transmitter) & (widths > 0))
-    offsets = (ring.paths[audible, 1] - transmitter + ring.count // 2) % ring.count - ring.count // 2
-    shades = [DIRECT, CROSS, "#009E73", "#CC79A7"]
-    arcs = arc_points(ring, audible, np.full(len(audible), reach))
-    for arc, offset in zip(arcs, offsets, strict=True):
-        axes.plot(*arc.T, color=shades[min(abs(int(offset)), 3)], lw=2.2)
-    axes.plot(*ring.position.T, "o", color=ROBOT, ms=4)
-    axes.plot(*np.asarray(ring.position[transmitter]), "o", color=LINE, ms=7)
-    for k, ((x, y), heading) in enumerate(zip(ring.position, ring.heading, strict=True)):
-        inward = np.array([x, y]) - 0.055 * np.array([np.cos(heading), np.sin(heading)])
-        axes.text(inward[0], inward[1], str(k), ha="center", va="center", fontsize=6, color=ROBOT)
-    handles = [Line2D([], [], color=LINE, marker="o", ls="", label=f"sensor {transmitter} fires")]
-    for distance in sorted({abs(int(o)) for o in offsets}):
-        width = np.degrees(widths[audible[np.abs(offsets) == distance][0]])
-        who = "direct echo" if distance == 0 else f"cross echo, neighbor {distance}"
-        handles.append(Line2D([], [], color=shades[min(distance, 3)], lw=2.2, label=f"{who}: {width:.0f}°"))
-    handles.append(Line2D([], [], color=FAINT, lw=6, label=f"detection cones, {np.degrees(ring.beam[0]):.0f}°"))
-    return _finish(figure, axes, handles)
-
-
-def reference_figure(room: Room, pose: Float[np.ndarray, "3"], *, ring: Ring) -> Figure:
-    """The true walls around the robot (paper, figure 2, from the room instead of a laser)."""
-    figure, axes = _plan("Reference: the true walls")
-    _draw_walls(axes, room)
-    _draw_robot(axes, ring, pose)
-    return _finish(figure, axes, [_wall_handle(), *_pole_handles(room), _robot_handle()])
-
-
-def arcs_figure(
-    ring: Ring, scan: Scan, *, room: Room | None = None, pose: Float[np.ndarray, "3"] | None = None
-) -> Figure:
-    """All arcs of one scan, paths without an echo as light arcs at the maximum range (paper, figure 3).
-
-    Args:
-        ring: the sensors.
-        scan: its echoes.
-        room: the true walls, if they are known.
-        pose: world_from_robot (x, y, theta); the robot frame if left out.
-    """
-    pose = np.zeros(3) if pose is None else pose
-    figure, axes = _plan(f"Scan {scan.scan}: {len(scan.tx)} echoes on {len(ring.paths)} paths")
-    _draw_arcs(axes, ring, scan, pose)
-    handles = _arc_handles(ring)
-    if room is not None:
-        _draw_walls(axes, room)
-        handles += [_wall_handle(), *_pole_handles(room)]
-    _draw_robot(axes, ring, pose)
-    return _finish(figure, axes, [*handles, _robot_handle()])
-
-
-def lines_figure(
-    ring: Ring,
-    scan: Scan,
-    model: LocalModel,
-    *,
-    room: Room | None = None,
-    pose: Float[np.ndarray, "3"] | None = None,
-) -> Figure:
-    """Extracted lines in bold over the arcs and, if it is known, the reference (paper, figure 4).
-
-    Args:
-        ring: the sensors.
-        scan: its echoes.
-        model: the lines found in it.
-        room: the true walls, if they are known.
-        pose: world_from_robot (x, y, theta); the robot frame if left out.
-    """
-    pose = np.zeros(3) if pose is None else pose
-    count = len(model.lines)
-    figure, axes = _plan(f"Scan {scan.scan}: {count} line{'' if count == 1 else 's'} from {len(scan.tx)} echoes")
-    _draw_arcs(axes, ring, scan, pose, alpha=0.35)
-    handles = [Line2D([], [], color=LINE, lw=3, label="extracted line, its extent")]
-    if room is not None:
-        _draw_walls(axes, room)
-        handles.append(_wall_handle())
-    for number, line in enumerate(model.lines, start=1):
-        along = _tangent(line.theta)
-        foot = line.rho * np.array([np.cos(line.theta), np.sin(line.theta)])
-        infinite = to_world(pose, foot + np.array([[-1.6], [1.6]]) * along)
-        axes.plot(*infinite.T, color=LINE, lw=0.8, ls=(0, (4, 3)), zorder=4, scalex=False, scaley=False)
-        axes.plot(*to_world(pose, line.segment).T, color=LINE, lw=3.2, solid_capstyle="butt", zorder=5)
-        place = to_world(pose, (foot * (1 + 0.12 / max(line.rho, 0.12)))[None])[0]
-        axes.text(place[0], place[1], str(number), color=LINE, fontweight="bold", ha="center", va="center", zorder=6)
-    handles.append(Line2D([], [], color=LINE, lw=0.8, ls=(0, (4, 3)), label="the same line, continued"))
-    _draw_robot(axes, ring, pose)
-    handles += _arc_handles(ring)
-    return _finish(figure, axes, [*handles, _robot_handle()])
-
-
-def accumulator_figure(
-    ring: Ring, scan: Scan, model: LocalModel, *, settings: kernels.HoughSettings | None = None
-) -> Figure:
-    """The accumulator before and after the low pass, and the components above the threshold (paper, section 4)."""
-    settings = settings_for(ring, settings)
-    packed = next(FlatEchoes.from_log(ring, scan.as_log())[0].steps(1)).packed
-    arcs = arcs_of(ring, settings)
-    votes, smooth = (np.asarray(image)[0] for image in kernels.accumulators(arcs, packed, settings=settings))
-    level = float(arcs.level)
-    labels = np.abs(label_components((smooth > level)[None])[0][0])
-
+    file = io.BytesIO()
     with styled():
-        figure = Figure(figsize=(10.5, 4.2), layout="constrained")
-        panels = figure.subplots(1, 3, sharex=True, sharey=True)
-    box = (-180, 180, 0, settings.max_rho)
-    top = float(votes.max(initial=1))
-    titles = ("Votes: points per cell", "After the low pass", f"Components above {level:.0f} points")
-    for axes, image, title in zip(panels, (votes, smooth, None), titles, strict=True):
-        axes.set_title(title, loc="left", fontsize=10)
-        axes.set_xlabel("direction of the normal θ (deg)")
-        axes.xaxis.set_major_locator(MultipleLocator(90))
-        if image is not None:
-            drawn = axes.imshow(
-                np.ma.masked_equal(image.T, 0), origin="lower", extent=box, aspect="auto", cmap="viridis_r", vmax=top
-            )
-            figure.colorbar(drawn, ax=axes, pad=0.01, aspect=35, label="points")
-    palette = ListedColormap(["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"])
-    labelled = np.ma.masked_equal(labels.T, 0)
-    panels[2].imshow((labelled - 1) % 6, origin="lower", extent=box, aspect="auto", cmap=palette, vmin=-0.5, vmax=5.5)
-    for line in model.lines:
-        panels[2].plot(np.degrees(line.theta), line.rho, "+", color=ROBOT, ms=9, mew=1.6)
-    panels[2].legend(
-        handles=[Line2D([], [], color=ROBOT, marker="+", ls="", ms=9, mew=1.6, label="centre of gravity: a line")],
-        loc="lower right",
-    )
-    panels[0].set_ylabel("distance ρ (m)")
-    used = np.flatnonzero(votes.any(axis=0))
-    panels[0].set_ylim(0, min(settings.max_rho, (used.max(initial=0) + 4) * settings.rho_cell))
-    return figure
+        figure.savefig(file, format=kind, metadata=metadata)
+    return file.getvalue()
 
 
-def aggregate_figure(
-    ring: Ring, models: Sequence[LocalModel], poses: Float[np.ndarray, "scans 3"], *, room: Room | None = None
-) -> Figure:
-    """The segments of all scans at their poses, in the world frame (paper, figure 6)."""
-    found = sum(len(model.lines) for model in models)
-    figure, axes = _plan(f"{found} segments from {len(models)} scans")
-    handles = [Line2D([], [], color=LINE, lw=2.2, label="segment from one scan")]
-    if room is not None:
-        _draw_walls(axes, room)
-        handles += [_wall_handle(), *_pole_handles(room)]
-    for model, pose in zip(models, poses, strict=True):
-        for line in model.lines:
-            axes.plot(*to_world(pose, line.segment).T, color=LINE, lw=2.2, alpha=0.75, solid_capstyle="butt", zorder=4)
-    axes.plot(*poses[:, :2].T, color=DIRECT, lw=0.7, zorder=2)
-    axes.plot(*poses[:, :2].T, "+", color=DIRECT, ms=7, zorder=3)
-    for number, (x, y, theta) in enumerate(poses, start=1):
-        axes.annotate(
-            str(number), (x, y), xytext=(4 * np.sin(theta), -8), textcoords="offset points", fontsize=6.5, color=DIRECT,
-            ha="center", va="center",
-        )  # fmt: skip
-    handles.append(Line2D([], [], color=DIRECT, marker="+", lw=0.7, ms=7, label="robot positions"))
-    return _finish(figure, axes, handles, width=8.4)
-
-
-def arc_points(
-    ring: Ring,
-    path: Int[np.ndarray, " arcs"],
-    reach: Float[np.ndarray, " arcs"],
-    *,
-    points: int = 33,
-) -> Float[np.ndarray, "arcs points 2"]:
-    """Points of echo arcs in the robot frame, metres: circles of direct, ellipses of cross paths."""
-    return np.asarray(_arc_points(ring.sensors, jnp.asarray(path), jnp.asarray(reach, jnp.float32), points))
-
-
-@partial(jax.jit, static_argnames="points")
-def _arc_points(sensors: kernels.Sensors, path: jax.Array, reach: jax.Array, points: int) -> jax.Array:
-    paths = jax.tree.map(lambda leaf: leaf[path], kernels.echo_paths(sensors))
-    theta = paths.start[:, None] + paths.width[:, None] * jnp.linspace(0, 1, points)[None]
-    one_arc = jax.vmap(kernels.arc_point, in_axes=(None, None, 0))
-    return jax.vmap(one_arc)(paths, reach, theta)
-
-
-def _tangent(theta: float) -> Float[np.ndarray, "2"]:
-    """Unit tangent of a line."""
-    return np.array([-np.sin(theta), np.cos(theta)])
-
-
-def _plan(title: str) -> tuple[Figure, Axes]:
+def plan(title: str) -> tuple[Figure, Axes]:
     """An empty plan view in metres."""
     with styled():
         figure = Figure(layout="constrained")
@@ -276,41 +83,37 @@ def _plan(title: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _finish(figure: Figure, axes: Axes, handles: list[Line2D], *, width: float = 6.8) -> Figure:
-    """Paper to the size of the plan, and the legend below it, where it covers nothing."""
+def finish(figure: Figure, axes: Axes, handles: list[Line2D], *, width: float = 6.8) -> Figure:
+    """Paper to the size of the plan, and the legend below it, where it covers nothing.
+
+    Args:
+        figure: the figure.
+        axes: its only axes, with everything drawn.
+        handles: of the legend.
+        width: of the paper, inches; long corridors get more, tall plans less.
+    """
     axes.autoscale_view()
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    legend_rows = -(-len(handles) // 3)
-    figure.set_size_inches(width, (width - 0.7) * (high - low) / (right - left) + 1.0 + 0.22 * legend_rows)
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    aspect = (high - low) / (right - left)
+    width = max(width, _LONG_WIDTH) if aspect < _LONG_PLAN else width
+    across = min(width - 0.7, _TALLEST / aspect)
+    width = max(across + 0.7, _NARROWEST)
+    columns = max(int(width / 2.1), 1)
+    legend_rows = -(-len(handles) // columns)
+    figure.set_size_inches(width, across * aspect + 1.0 + 0.22 * legend_rows)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=8)
     return figure
 
 
-def _draw_arcs(axes: Axes, ring: Ring, scan: Scan, pose: Float[np.ndarray, "3"], *, alpha: float = 0.8) -> None:
-    path = ring.path_index[scan.tx, scan.rx]
-    audible = np.asarray(ring.echo_paths.width) > 0
-    reach = np.asarray(ring.corrected(scan.range, scan.tx, scan.rx))
-    heard = (path >= 0) & (reach < ring.max_range)
-    silent = np.setdiff1d(np.flatnonzero(audible), path[heard])
-    direct = scan.tx == scan.rx
-    for rows, ranges, colour, width in (
-        (silent, np.full(len(silent), ring.max_range), FAINT, 0.6),
-        (path[heard & ~direct], reach[heard & ~direct], CROSS, 0.9),
-        (path[heard & direct], reach[heard & direct], DIRECT, 1.1),
-    ):
-        arcs = to_world(pose, arc_points(ring, rows, ranges))
-        axes.add_collection(
-            LineCollection(list(arcs), colors=colour, linewidths=width, alpha=1.0 if colour == FAINT else alpha)
-        )
-
-
-def _draw_walls(axes: Axes, room: Room) -> None:
+def draw_walls(axes: Axes, room: Room) -> None:
+    """The true walls, grey, and poles as crosses."""
     axes.add_collection(LineCollection(list(room.walls), colors=WALL, linewidths=1.4, zorder=3))
     if len(room.poles):
         axes.plot(*room.poles.T, "x", color=WALL, ms=6, mew=1.6, zorder=3)
 
 
-def _draw_robot(axes: Axes, ring: Ring, pose: Float[np.ndarray, "3"]) -> None:
+def draw_robot(axes: Axes, ring: Ring, pose: Float[np.ndarray, "3"]) -> None:
+    """The sensors at a pose, and an arrow that points forward."""
     sensors = to_world(pose, np.asarray(ring.position))
     axes.plot(*sensors.T, "o", color=ROBOT, ms=2.2, zorder=6)
     nose = to_world(pose, np.array([[0.0, 0.0], [0.18, 0.0]]))
@@ -318,20 +121,16 @@ def _draw_robot(axes: Axes, ring: Ring, pose: Float[np.ndarray, "3"]) -> None:
     axes.annotate("", xy=tuple(nose[1]), xytext=tuple(nose[0]), arrowprops={"arrowstyle": "-|>", "color": ROBOT})
 
 
-def _arc_handles(ring: Ring) -> list[Line2D]:
-    labels = {DIRECT: "direct echo", FAINT: f"no echo up to {ring.max_range:g} m"}
-    if ring.neighbors:
-        labels[CROSS] = "cross echo"
-    return [Line2D([], [], color=colour, lw=1.4, label=label) for colour, label in labels.items()]
-
-
-def _wall_handle() -> Line2D:
+def wall_handle() -> Line2D:
+    """Legend of the true walls."""
     return Line2D([], [], color=WALL, lw=1.4, label="true wall")
 
 
-def _pole_handles(room: Room) -> list[Line2D]:
+def pole_handles(room: Room) -> list[Line2D]:
+    """Legend of the poles, if there are any."""
     return [Line2D([], [], color=WALL, marker="x", ls="", mew=1.6, label="pole")] if len(room.poles) else []
 
 
-def _robot_handle() -> Line2D:
+def robot_handle() -> Line2D:
+    """Legend of the robot."""
     return Line2D([], [], color=ROBOT, marker="o", ls="", ms=3, label="sensors; the arrow is forward")

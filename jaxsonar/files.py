@@ -4,6 +4,7 @@ import errno
 import os
 import secrets
 import stat
+import sys
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -106,6 +107,17 @@ def atomic_write(path: str | os.PathLike[str], *, binary: bool = False) -> Itera
         if temporary is not None:
             with suppress(OSError):  # it was never made; what went wrong is being told already
                 temporary.unlink()
+
+
+@contextmanager
+def open_output(path: str | os.PathLike[str]) -> Iterator[IO[str]]:
+    """A handle for text that a command writes: standard output for ``-``, else a whole file (``atomic_write``)."""
+    if os.fspath(path) == "-":
+        yield sys.stdout
+        sys.stdout.flush()
+        return
+    with atomic_write(path) as file:
+        yield file
 
 
 def _create(temporary: Path, target: Path) -> int:

@@ -35,3 +35,5 @@ from .paths import Sensors as Sensors
 from .paths import echo_paths as echo_paths
 from .fitting import Fits as Fits
 from .fitting import fit_candidates as fit_candidates
+from .merging import merged_lines as merged_lines
+from .merging import occupied_by_lines as occupied_by_lines

@@ -1,0 +1,217 @@
+"""Global maps from many scans: all at once, or scan by scan (paper, section 5)."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsonar import kernels
+from jaxsonar.hardware.errors import SonarError
+
+from .echoes import FlatEchoes
+from .fusion import fuse
+from .ghosts import openings, trim, without_points
+from .local import LocalModel, local_models
+from .logs import Log
+from .maps import GlobalMap
+from .merging import merge_as_paper
+from .pieces import Pieces, add_up, aggregate, join
+from .ring import Ring
+from .seenthrough import SeenThrough, silence
+
+MERGINGS = ("fused", "paper")
+"""How pieces become walls: pieces that agree add up, or the paper's clusters of midpoints and Hough transform."""
+CONFIRMED = 2
+"""Scans in which a wall must be seen, unless there are only one or two, or scans were gathered over windows."""
+BRIDGE = 2.0
+"""Metres of a wall that may be hidden behind something; a gap that was seen through stays open however small."""
+_PLACE, _TURN = 0.05, float(np.radians(6.0))  # m, rad: pieces this near are kept as their sum
+_SCANS_KEPT = 32  # of a piece that is kept as a sum
+_BLOCK = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What scans say of the world's walls: where pieces of them were seen, and where they would have been heard.
+
+    Both add up: the evidence of two logs together is that of all their scans, in any order.
+    """
+
+    pieces: Pieces
+    """Segments of local models, world frame."""
+    seen: SeenThrough = field(default_factory=SeenThrough)
+    """Where walls would have been heard and were not."""
+    poses: int = 0
+    """Local models with a pose."""
+
+    def joined(self, other: "Evidence") -> "Evidence":
+        """The evidence of both."""
+        return Evidence(
+            join([self.pieces, other.pieces]), self.seen.joined(other.seen), self.poses + other.poses
+        )
+
+    def condensed(self) -> "Evidence":
+        """The same, with pieces of one place and direction kept as their sum: no larger than the walls allow."""
+        return replace(self, pieces=condense(self.pieces))
+
+
+class Spacing(NamedTuple):
+    """Distances that follow from how far apart the scans were taken, metres."""
+
+    cut: float
+    """Midpoints of segments of one wall lie at most this far apart (paper, section 5)."""
+    gap: float
+    """This much of a wall may lie between two segments of it."""
+
+
+def build_map(
+    ring: Ring,
+    log: Log,
+    *,
+    method: str = "hough",
+    settings: kernels.HoughSettings | None = None,
+    window: float | None = None,
+    merging: str = "fused",
+    on_left_out: Callable[[int], None] | None = None,
+) -> GlobalMap:
+    """The walls of the world, from a log of scans with poses (paper, section 5).
+
+    Args:
+        ring: the sensors.
+        log: scans; those without a pose are left out.
+        method: how lines are found in a scan, as ``local_models``.
+        settings: of the Hough step, as ``local_models``.
+        window: metres of path gathered into one local model, as ``local_models``.
+        merging: "fused", or "paper" for the paper's way.
+        on_left_out: told how many echoes are of pairs of sensors that this ring does not listen to.
+
+    Raises:
+        SonarError: as ``local_models``, an unknown way of merging, or no scan with a pose.
+    """
+    check_merging(merging)
+    require_poses(log)
+    models = list(
+        local_models(ring, log, method=method, settings=settings, window=window, on_left_out=on_left_out)
+    )
+    evidence = gather_evidence(ring, log, models)
+    return assemble(evidence, spacing(log, models), merging=merging, confirmed=1 if window else CONFIRMED)
+
+
+def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> Evidence:
+    """What local models and the silence of the sensors say of the world.
+
+    Args:
+        ring: the sensors.
+        log: the scans that the models come from, with their poses.
+        models: in the order of the log; a model of a window stands for the scans since the one before.
+    """
+    models = list(models)
+    row_of = {int(number): row for row, number in enumerate(log.scan)}
+    rows = np.array([row_of[model.scan] for model in models], dtype=np.int64)
+    poses = log.pose[rows]
+    known = np.isfinite(poses).all(axis=1)
+    pieces = aggregate(models, poses)
+    segment_model = np.repeat(np.flatnonzero(known), [len(models[k].lines) for k in np.flatnonzero(known)])
+    shows = [pieces.segments[segment_model == k] for k in range(len(models))]
+    flat, _ = FlatEchoes.from_log(ring, log)
+    reach = np.asarray(ring.corrected(flat.reported, *ring.paths[flat.path].T))
+    placed = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
+    placed = placed[placed <= rows.max(initial=-1)]
+    when = np.where(np.isnan(log.stamp), log.scan, log.stamp)
+    seen = SeenThrough()
+    for first in range(0, len(placed), _BLOCK):
+        block = placed[first : first + _BLOCK]
+        place = np.full(len(log), -1)
+        place[block] = np.arange(len(block))
+        scan = place[flat.scan]
+        mine = (scan >= 0) & (reach > 0) & (reach < ring.max_range)
+        walls = [shows[k] for k in np.searchsorted(rows, block)]
+        cells, who = silence(ring, log.pose[block], scan[mine], flat.path[mine], reach[mine], walls)
+        seen = seen.including(cells, when[block][who])
+    return Evidence(pieces, seen, int(known.sum()))
+
+
+def assemble(
+    evidence: Evidence, distances: Spacing, *, merging: str = "fused", confirmed: int = CONFIRMED
+) -> GlobalMap:
+    """The map that the evidence supports.
+
+    Args:
+        evidence: of all scans.
+        distances: how far apart they were taken (``spacing``).
+        merging: "fused" or "paper".
+        confirmed: scans in which a wall must be seen, where there are enough of them.
+    """
+    check_merging(merging)
+    if merging == "paper":
+        return _as_map(merge_as_paper(evidence.pieces, cut=distances.cut))
+    pieces, seen = condense(evidence.pieces), evidence.seen
+    confirmed = min(confirmed, max(1, evidence.poses - 1))
+    # Pieces of one wall add up; what later scans look through goes, and the rest adds up again.
+    walls, wall_of = fuse(pieces, gap=distances.gap)
+    pieces = trim(pieces, wall_of, seen)
+    walls, _ = fuse(pieces, gap=distances.gap)
+    # Corners and poles answer like walls, from every pose in another direction.
+    walls = without_points(walls)
+    walls = walls.take(walls.count >= confirmed)
+    # A wall goes on behind what hides it, but not across an opening that something was seen through.
+    walls, _ = fuse(walls, gap=BRIDGE, opening=lambda gaps, theta: openings(gaps, theta, pieces, seen))
+    return _as_map(walls)
+
+
+def condense(pieces: Pieces) -> Pieces:
+    """Pieces of one place (5 cm) and direction (6 deg) as their sum; the order of the pieces does not matter."""
+    if not len(pieces):
+        return pieces
+    cell = np.column_stack([np.floor(pieces.centre / _PLACE), np.floor(pieces.theta / _TURN)]).astype(np.int64)
+    _, group = np.unique(cell, axis=0, return_inverse=True)
+    return add_up(pieces, group.ravel())
+
+
+def spacing(log: Log, models: Sequence[LocalModel]) -> Spacing:
+    """Distances that decide what belongs together, from those between successive local models (paper, section 5)."""
+    row_of = {int(number): row for row, number in enumerate(log.scan)}
+    places = log.pose[[row_of[model.scan] for model in models], :2].reshape(-1, 2)
+    return spacing_of(np.linalg.norm(np.diff(places, axis=0), axis=1))
+
+
+def spacing_of(steps: Float[np.ndarray, " steps"]) -> Spacing:
+    """The same from the steps themselves, metres; steps of a robot that stands still, and unknown ones, do not count."""
+    steps = steps[steps > 0.01]  # False for NaN
+    cut = 1.5 * float(np.median(steps)) if len(steps) else 0.4
+    return Spacing(cut=cut, gap=float(np.clip(cut, 0.4, 0.7)))
+
+
+def check_merging(merging: str) -> None:
+    """Raise a SonarError for an unknown way of merging."""
+    if merging not in MERGINGS:
+        raise SonarError(f"merging {merging!r}; allowed is {' or '.join(MERGINGS)}")
+
+
+def require_poses(log: Log) -> None:
+    """Raise a SonarError for a log with scans but without a single pose."""
+    if len(log) and not np.isfinite(log.pose).any():
+        raise SonarError(f"none of the {len(log)} scans has a pose; allowed is a log with x, y, theta for a map")
+
+
+def _as_map(walls: Pieces) -> GlobalMap:
+    walls = walls.take(np.lexsort((walls.centre[:, 1], walls.centre[:, 0], -walls.echoes)))
+    normal, tangent = walls.normal, walls.tangent
+    rho, lever = (normal * walls.centre).sum(-1), (tangent * walls.centre).sum(-1)
+    # The spread of the pieces around their wall tells how good they are; one alone tells nothing.
+    freedom = 2 * (walls.count - 1)
+    scale = np.where(freedom > 0, walls.misfit / np.maximum(freedom, 1), np.nan)
+    sigma_theta = np.sqrt(scale / walls.info_theta)
+    sigma_rho = np.sqrt(scale / walls.info_offset + (lever * sigma_theta) ** 2)
+    theta = np.where(rho < 0, walls.theta + np.pi, walls.theta)
+    return GlobalMap(
+        segments=walls.segments,
+        rho=np.abs(rho),
+        theta=(theta + np.pi) % (2 * np.pi) - np.pi,
+        sigma_rho=sigma_rho,
+        sigma_theta=sigma_theta,
+        echoes=walls.echoes,
+        scans=walls.scan_lists(),
+    )

@@ -1,0 +1,176 @@
+"""No echo is free space: where, and facing which way, a wall would have been heard and was not.
+
+A sensor that stays silent does not say that its whole cone is empty: a smooth wall answers only where it faces the
+sensor. So what silence rules out is a wall at a place WITH a direction, and that is what is remembered: for every cell
+of the floor and every direction of the normal the latest scans that would have heard a wall there.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .ring import Ring
+
+CELL = 0.1
+"""Side of a cell of the floor, metres."""
+DIRECTIONS = 24
+"""Directions of the normal that are told apart around the full turn."""
+LATEST = 3
+"""So many of the latest scans are remembered: what no fewer later ones see through is gone."""
+MARGIN = 0.15
+"""Metres that a wall must be nearer than the first echo, to have been missed for certain."""
+SURE = 0.85
+"""Share of the cone's width and of the maximum range within which a wall is heard for certain."""
+HIDDEN = 1.0
+"""Metres that a wall is taken to go on beyond its ends, hiding what is behind."""
+_TILE = 32
+_RAYS = 9
+
+
+@dataclass(frozen=True, eq=False)
+class SeenThrough:
+    """The latest scans that saw through each place and direction; grows with the floor, not with the scans."""
+
+    tiles: Mapping[tuple[int, int], Float[np.ndarray, "tile tile directions latest"]] = field(default_factory=dict)
+    """When: seconds or scan numbers, as ``Pieces.latest``, latest first, -inf for never; tiles are never changed."""
+
+    def look(
+        self, points: Float[np.ndarray, "points 2"], theta: Float[np.ndarray, " points"]
+    ) -> Float[np.ndarray, "points latest"]:
+        """When walls at these points (metres) with these normals (radians) were seen through, latest first."""
+        cell, direction = np.floor(points / CELL).astype(np.int64), _direction(theta)
+        tile, inside = np.divmod(cell, _TILE)
+        found = np.full((len(points), LATEST), -np.inf)
+        for key in {tuple(t) for t in tile.tolist()} & self.tiles.keys():
+            here = (tile == key).all(axis=1)
+            found[here] = self.tiles[key][inside[here, 0], inside[here, 1], direction[here]]
+        return found
+
+    def including(self, cells: Int[np.ndarray, "cells 3"], when: Float[np.ndarray, " cells"]) -> "SeenThrough":
+        """With further scans: (cell x, cell y, direction) that each saw through, and when. Order does not matter."""
+        tiles = dict(self.tiles)
+        tile, inside = np.divmod(cells[:, :2], _TILE)
+        order = np.lexsort((-when, cells[:, 2], cells[:, 1], cells[:, 0], tile[:, 1], tile[:, 0]))
+        tile, inside, cells, when = tile[order], inside[order], cells[order], when[order]
+        new = np.ones(len(cells), dtype=bool)
+        new[1:] = (np.diff(cells, axis=0) != 0).any(axis=1)
+        row = np.arange(len(cells))
+        rank = row - np.maximum.accumulate(np.where(new, row, 0)) if len(row) else row
+        late = rank < LATEST
+        edges = np.flatnonzero(np.append(True, (np.diff(tile, axis=0) != 0).any(axis=1))) if len(tile) else []
+        for first, last in zip(edges, [*edges[1:], len(tile)], strict=True):
+            key = (int(tile[first, 0]), int(tile[first, 1]))
+            part = np.arange(first, last)[late[first:last]]
+            known = tiles.get(key)
+            times = np.full((_TILE, _TILE, DIRECTIONS, 2 * LATEST), -np.inf)
+            if known is not None:
+                times[..., :LATEST] = known
+            times[inside[part, 0], inside[part, 1], cells[part, 2], LATEST + rank[part]] = when[part]
+            times = -np.sort(-times, axis=-1)
+            tiles[key] = times[..., :LATEST]
+        return SeenThrough(tiles)
+
+    def joined(self, other: "SeenThrough") -> "SeenThrough":
+        """The latest of both."""
+        tiles = dict(self.tiles)
+        for key, times in other.tiles.items():
+            both = np.concatenate([tiles.get(key, np.full_like(times, -np.inf)), times], axis=-1)
+            tiles[key] = -np.sort(-both, axis=-1)[..., :LATEST]
+        return SeenThrough(tiles)
+
+
+def silence(
+    ring: Ring,
+    pose: Float[np.ndarray, "scans 3"],
+    scan: Int[np.ndarray, " echoes"],
+    path: Int[np.ndarray, " echoes"],
+    reach: Float[np.ndarray, " echoes"],
+    walls: Sequence[Float[np.ndarray, "walls 2 2"]],
+) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, " cells"]]:
+    """Where each scan would have heard a wall and did not: (cell x, cell y, direction), and whose scan it was.
+
+    Only direct echoes speak: of the places before its first echo that a sensor faces, at least two must agree where two
+    sensors face the same way, and no echo of another path may come from there. What stands behind a wall that the
+    scan itself shows is not judged.
+
+    Args:
+        ring: the sensors.
+        pose: world_from_robot, metres and radians, all finite.
+        scan: row of ``pose`` of each echo.
+        path: row of ``ring.paths``.
+        reach: corrected half path lengths, metres.
+        walls: segments that each scan shows, world frame, metres.
+    """
+    geometry = ring.echo_paths
+    midpoint, start, width = (np.asarray(values) for values in (geometry.midpoint, geometry.start, geometry.width))
+    direct = np.flatnonzero((ring.paths[:, 0] == ring.paths[:, 1]) & (width > 0))
+    first = np.full((len(pose), len(ring.paths)), SURE * ring.max_range + MARGIN)
+    np.minimum.at(first, (scan, path), reach)
+    ahead = np.arange(CELL / 2, SURE * ring.max_range, CELL * 0.7)
+
+    # Sensors x directions x distances of all scans at once.
+    turn = start[direct, None] + width[direct, None] * (0.5 + SURE * np.linspace(-0.5, 0.5, _RAYS))
+    theta = pose[:, None, None, 2] + turn
+    c, s = np.cos(pose[:, 2])[:, None], np.sin(pose[:, 2])[:, None]
+    x, y = midpoint[direct, 0], midpoint[direct, 1]
+    sensor = pose[:, None, :2] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    ray = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    free = np.broadcast_to(first[:, direct, None] - MARGIN, theta.shape).copy()
+    for k, segments in enumerate(walls):
+        if len(segments):
+            free[k] = np.minimum(free[k], _hidden_from(sensor[k], ray[k], segments) - MARGIN)
+    claimed = ahead < free[..., None]
+    who, sensor_row, ray_row, step = np.nonzero(claimed)
+    point = sensor[who, sensor_row] + ahead[step, None] * ray[who, sensor_row, ray_row]
+    cells = np.column_stack([who, np.floor(point / CELL).astype(np.int64), _direction(theta[who, sensor_row, ray_row])])
+    seen = np.unique(np.column_stack([cells, sensor_row]), axis=0)
+    cells, sensors = np.unique(seen[:, :4], axis=0, return_counts=True)
+    overlap = width[direct].sum() / (2 * np.pi)
+    cells = cells[sensors >= (2 if overlap >= 2 else 1)]
+
+    # An echo of any path speaks against it, wherever its arc passes.
+    turn = start[path, None] + width[path, None] * np.linspace(0, 1, _RAYS)
+    theta = pose[scan, 2][:, None] + turn
+    c, s = np.cos(pose[scan, 2]), np.sin(pose[scan, 2])
+    x, y = midpoint[path, 0], midpoint[path, 1]
+    origin = pose[scan, :2] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    ray = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    distance = reach[:, None] + np.array([-CELL, 0.0, CELL])
+    point = origin[:, None, None] + distance[:, None, :, None] * ray[:, :, None]
+    own = np.broadcast_to(scan[:, None, None], point.shape[:3])
+    facing = np.broadcast_to(_direction(theta)[..., None], point.shape[:3])
+    heard = np.concatenate([own[..., None], np.floor(point / CELL).astype(np.int64), facing[..., None]], axis=-1)
+    cells = cells[~_contained(cells, heard.reshape(-1, 4))]
+    return cells[:, 1:], cells[:, 0]
+
+
+def _hidden_from(
+    sensor: Float[np.ndarray, "sensors 2"],
+    ray: Float[np.ndarray, "sensors rays 2"],
+    segments: Float[np.ndarray, "walls 2 2"],
+) -> Float[np.ndarray, "sensors rays"]:
+    """How far each ray goes until it meets one of the walls, or where the wall may go on, metres."""
+    along = segments[:, 1] - segments[:, 0]
+    length = np.linalg.norm(along, axis=-1)
+    tangent = along / np.maximum(length, 1e-9)[:, None]
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
+    offset = segments[:, 0] - sensor[:, None]
+    toward = np.einsum("srk,wk->srw", ray, normal)
+    way = (offset * normal).sum(-1)[:, None] / np.where(np.abs(toward) > 1e-9, toward, np.nan)
+    where = way * np.einsum("srk,wk->srw", ray, tangent) - (offset * tangent).sum(-1)[:, None]
+    meets = (way > 0) & (where > -HIDDEN) & (where < length + HIDDEN)
+    return np.where(meets, way, np.inf).min(axis=-1)
+
+
+def _direction(theta: Float[np.ndarray, "*any"]) -> Int[np.ndarray, "*any"]:
+    return np.floor(np.mod(theta, 2 * np.pi) * (DIRECTIONS / (2 * np.pi))).astype(np.int64) % DIRECTIONS
+
+
+def _contained(rows: Int[np.ndarray, "rows k"], others: Int[np.ndarray, "others k"]) -> Bool[np.ndarray, " rows"]:
+    """Which rows are among the others."""
+    low = np.minimum(rows.min(axis=0, initial=0), others.min(axis=0, initial=0))
+    size = np.maximum(rows.max(axis=0, initial=0), others.max(axis=0, initial=0)) - low + 1
+    weight = np.cumprod(np.append(1, size[:0:-1]))[::-1]
+    return np.isin((rows - low) @ weight, (others - low) @ weight)
