@@ -16,6 +16,10 @@ from .echoes import FlatEchoes, Step, room_for
 from .ring import Ring
 
 
+WINDOW_THRESHOLD = 0.05
+"""Threshold for gathered windows, where a fit to the ranges decides and a wall may be seen by one sensor alone."""
+
+
 @dataclass(frozen=True)
 class Lines:
     """Lines of a batch of scans in their robots' frames, strongest first; NaN (0 echoes) where a scan has fewer."""
@@ -133,7 +137,7 @@ def settings_for(
     """
     reach = float(np.linalg.norm(ring.position, axis=1).max() + ring.max_range) + (window or 0.0)
     if settings is None:
-        settings = kernels.HoughSettings()
+        settings = kernels.HoughSettings(**({} if window is None else {"threshold": WINDOW_THRESHOLD}))
         needed = int(np.ceil(reach / settings.rho_cell))
         return replace(settings, rho_cells=max(settings.rho_cells, needed))
     if settings.max_rho < reach:

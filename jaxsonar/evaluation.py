@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.hardware.errors import SonarError
 
+from .polygonal import lengths
 from .rooms import cross
 
 GATE_DISTANCE = 0.15
@@ -54,7 +55,7 @@ class Evaluation:
     @property
     def precision(self) -> float:
         """Share of the map's segments of which at least half does; NaN without a map."""
-        return _share(_half(self.segment_matched, self.segment_length).sum(), len(self.segment_length))
+        return _share(int(_half(self.segment_matched, self.segment_length).sum()), len(self.segment_length))
 
     @property
     def recall_length(self) -> float:
@@ -64,7 +65,7 @@ class Evaluation:
     @property
     def recall(self) -> float:
         """Share of the reference's segments of which at least half is covered; NaN without a reference."""
-        return _share(_half(self.reference_covered, self.reference_length).sum(), len(self.reference_length))
+        return _share(int(_half(self.reference_covered, self.reference_length).sum()), len(self.reference_length))
 
     def as_json(self) -> dict[str, Any]:
         """Plain numbers for a JSON file; null where there is nothing to tell. SI units and radians."""
@@ -119,14 +120,14 @@ def evaluate(
     if not (0 < gate_distance < math.inf and 0 < gate_angle <= math.pi / 2):
         came = f"gates {gate_distance:g} m, {gate_angle:g} rad"
         raise SonarError(f"evaluate: {came}; allowed are a finite distance above 0, and above 0 to pi/2 rad")
-    length, reference_length = _lengths(segments), _lengths(reference)
+    length, reference_length = lengths(segments), lengths(reference)
     along, across, angle = _beside(segments, reference)
     # Along a segment of the map, from share 0 to 1, both are linear: so every piece is one interval of shares.
     bounds = zip(_shares(along, 0.0, reference_length), _shares(across, -gate_distance, gate_distance), strict=True)
     (low, low_across), (high, high_across) = bounds
     low, high = np.clip(np.maximum(low, low_across), 0.0, None), np.clip(np.minimum(high, high_across), None, 1.0)
     on = (high > low) & (np.abs(angle) < gate_angle)
-    pieces = np.stack([low, high], axis=-1)
+    pieces = np.where(on[..., None], np.stack([low, high], axis=-1), 0.0)
     feet = np.sort(along[..., :1] + pieces * (along[..., 1:] - along[..., :1]), axis=-1)
     matched = [union(piece[near]) * metres for piece, near, metres in zip(pieces, on, length, strict=True)]
     covered = [union(foot[near]) for foot, near in zip(feet.swapaxes(0, 1), on.T, strict=True)]
@@ -179,10 +180,10 @@ def _beside(
     NaN where one of the two has no length.
     """
     run = reference[:, 1] - reference[:, 0]
-    tangent = run / _known(_lengths(reference))[:, None]
+    tangent = run / _known(lengths(reference))[:, None]
     offset = segments[:, None] - reference[:, None, 0, None].swapaxes(0, 1)
     along, across = (offset * tangent[:, None]).sum(-1), cross(tangent[:, None], offset)
-    turn = np.arctan2(np.diff(across)[..., 0], np.diff(along)[..., 0]) + 0 * _known(_lengths(segments))[:, None]
+    turn = np.arctan2(np.diff(across)[..., 0], np.diff(along)[..., 0]) + 0 * _known(lengths(segments))[:, None]
     return along, across, (turn + np.pi / 2) % np.pi - np.pi / 2  # a line has no direction
 
 
@@ -213,10 +214,6 @@ def _nearest(
         mine = inside[k] & (first == k)
         if mine.any():
             yield wall, float(part[mine].sum()), float((part * middle)[mine].sum() / part[mine].sum())
-
-
-def _lengths(segments: Float[np.ndarray, "segments 2 2"]) -> Float[np.ndarray, " segments"]:
-    return np.linalg.norm(segments[:, 1] - segments[:, 0], axis=-1)
 
 
 def _known(length: Float[np.ndarray, " segments"]) -> Float[np.ndarray, " segments"]:

@@ -92,7 +92,7 @@ def extract_lines(
     Raises:
         SonarError: another shape, a range that is not positive, an unknown method.
     """
-    _check_method(method)
+    check_method(method)
     echoes = FlatEchoes.from_dense(ring, ranges)
     steps = [step.lines for step in extract(ring, echoes, settings_for(ring, settings))]
     return _concatenate(steps)
@@ -128,7 +128,7 @@ def local_models(
     Raises:
         SonarError: a sensor number that the ring does not have, an unknown method, a window that is not positive.
     """
-    _check_method(method)
+    check_method(method)
     settings = settings_for(ring, settings, window=window)
     if window is None:
         echoes, left_out = FlatEchoes.from_log(ring, log)
@@ -137,10 +137,11 @@ def local_models(
         windows, left_out = gather(ring, log, length=window)
     if left_out and on_left_out is not None:
         on_left_out(left_out)
-    return _models(ring, log, windows, settings)
+    return models_of(ring, log, windows, settings)
 
 
-def _models(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSettings) -> Iterator[LocalModel]:
+def models_of(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSettings) -> Iterator[LocalModel]:
+    """A local model of every window of a log; windows of single scans are the scans themselves."""
     paths = ring.paths
     for extracted in extract(ring, windows.echoes, settings):
         step = extracted.step
@@ -166,7 +167,8 @@ def _models(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSetti
             yield LocalModel(int(log.scan[index]), float(log.stamp[index]), lines, empty)
 
 
-def _check_method(method: str) -> None:
+def check_method(method: str) -> None:
+    """Raise a SonarError for an unknown method."""
     if method not in METHODS:
         raise SonarError(f"method {method!r}; allowed is {' or '.join(METHODS)}")
 

@@ -2,7 +2,7 @@
 
 import operator
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, SupportsIndex, overload
@@ -64,16 +64,7 @@ class Scan:
 
     def as_log(self) -> "Log":
         """A log of this scan alone."""
-        return Log.from_echoes(
-            np.zeros(len(self.tx), np.int64),
-            self.tx,
-            self.rx,
-            self.range,
-            amplitude=self.amplitude,
-            stamp=np.array([self.stamp]),
-            pose=self.pose[None],
-            scan=np.array([self.scan]),
-        )
+        return Log.from_scans([self])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -192,6 +183,24 @@ class Log:
             rx=rx,
             range=range,
             amplitude=np.full(np.shape(range), np.nan) if amplitude is None else amplitude,
+        )
+
+    @classmethod
+    def from_scans(cls, scans: Sequence[Scan]) -> "Log":
+        """A log of single scans, in the order given."""
+        columns = {
+            name: np.concatenate([np.zeros(0), *(getattr(scan, name) for scan in scans)])
+            for name in ("tx", "rx", "range", "amplitude")
+        }
+        return cls.from_echoes(
+            np.repeat(np.arange(len(scans)), [len(scan.tx) for scan in scans]),
+            columns["tx"].astype(np.int64),
+            columns["rx"].astype(np.int64),
+            columns["range"],
+            amplitude=columns["amplitude"],
+            stamp=np.array([scan.stamp for scan in scans], dtype=np.float64),
+            pose=np.array([scan.pose for scan in scans], dtype=np.float64).reshape(-1, 3),
+            scan=np.array([scan.scan for scan in scans], dtype=np.int64),
         )
 
     @property

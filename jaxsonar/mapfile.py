@@ -1,7 +1,7 @@
 """Global maps as GeoJSON, world frame, metres; and the segments of any GeoJSON, to hold maps against."""
 
 import os
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from jaxtyping import Float
@@ -107,7 +107,7 @@ def _row(
     return ends, numbers, echoes, tuple(scans)
 
 
-def _is_whole(value: Any) -> bool:
+def _is_whole(value: Any) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool)
 
 

@@ -1,11 +1,11 @@
 """Global maps from many scans: all at once, or scan by scan (paper, section 5)."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Int
+from scipy.spatial import cKDTree
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
@@ -25,10 +25,13 @@ MERGINGS = ("fused", "paper")
 """How pieces become walls: pieces that agree add up, or the paper's clusters of midpoints and Hough transform."""
 CONFIRMED = 2
 """Scans in which a wall must be seen, unless there are only one or two, or scans were gathered over windows."""
-BRIDGE = 2.0
+BRIDGE = 1.0
 """Metres of a wall that may be hidden behind something; a gap that was seen through stays open however small."""
+LEAST_GAP, MOST_GAP = 0.4, 0.7
+"""Metres; less than a door, more than what two neighboring scans leave of a wall between them."""
+SCANS_KEPT = 32
+"""Scans whose numbers a piece keeps when maps are built scan by scan, the latest ones."""
 _PLACE, _TURN = 0.05, float(np.radians(6.0))  # m, rad: pieces this near are kept as their sum
-_SCANS_KEPT = 32  # of a piece that is kept as a sum
 _BLOCK = 64
 
 
@@ -41,29 +44,42 @@ class Evidence:
 
     pieces: Pieces
     """Segments of local models, world frame."""
-    seen: SeenThrough = field(default_factory=SeenThrough)
+    seen: SeenThrough
     """Where walls would have been heard and were not."""
-    poses: int = 0
+    places: Int[np.ndarray, "places 2"]
+    """Where the robot was when it made a local model: cells of 5 cm, each once."""
+    models: int
     """Local models with a pose."""
 
     def joined(self, other: "Evidence") -> "Evidence":
         """The evidence of both."""
         return Evidence(
-            join([self.pieces, other.pieces]), self.seen.joined(other.seen), self.poses + other.poses
+            join([self.pieces, other.pieces]),
+            self.seen.joined(other.seen),
+            np.unique(np.concatenate([self.places, other.places]), axis=0),
+            self.models + other.models,
         )
 
     def condensed(self) -> "Evidence":
         """The same, with pieces of one place and direction kept as their sum: no larger than the walls allow."""
-        return replace(self, pieces=condense(self.pieces))
+        return replace(self, pieces=condense(self.pieces, scans=SCANS_KEPT))
 
+    @property
+    def cut(self) -> float:
+        """How far apart the midpoints of segments of one wall may lie, metres (paper, section 5).
 
-class Spacing(NamedTuple):
-    """Distances that follow from how far apart the scans were taken, metres."""
+        Deduced from how far apart neighboring models were made, which unlike the way between successive ones does not
+        depend on the order of the scans.
+        """
+        if len(self.places) < 2:
+            return MOST_GAP
+        nearest = cKDTree(self.places * _PLACE).query(self.places * _PLACE, k=2)[0][:, 1]
+        return max(LEAST_GAP, 1.5 * float(np.median(nearest)))
 
-    cut: float
-    """Midpoints of segments of one wall lie at most this far apart (paper, section 5)."""
-    gap: float
-    """This much of a wall may lie between two segments of it."""
+    @property
+    def gap(self) -> float:
+        """How much of a wall may lie between two segments of it, metres."""
+        return min(self.cut, MOST_GAP)
 
 
 def build_map(
@@ -96,7 +112,7 @@ def build_map(
         local_models(ring, log, method=method, settings=settings, window=window, on_left_out=on_left_out)
     )
     evidence = gather_evidence(ring, log, models)
-    return assemble(evidence, spacing(log, models), merging=merging, confirmed=1 if window else CONFIRMED)
+    return assemble(evidence, merging=merging, confirmed=1 if window else CONFIRMED)
 
 
 def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> Evidence:
@@ -130,29 +146,27 @@ def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> Evide
         walls = [shows[k] for k in np.searchsorted(rows, block)]
         cells, who = silence(ring, log.pose[block], scan[mine], flat.path[mine], reach[mine], walls)
         seen = seen.including(cells, when[block][who])
-    return Evidence(pieces, seen, int(known.sum()))
+    places = np.unique(np.round(poses[known, :2] / _PLACE).astype(np.int64), axis=0)
+    return Evidence(pieces, seen, places, int(known.sum()))
 
 
-def assemble(
-    evidence: Evidence, distances: Spacing, *, merging: str = "fused", confirmed: int = CONFIRMED
-) -> GlobalMap:
+def assemble(evidence: Evidence, *, merging: str = "fused", confirmed: int = CONFIRMED) -> GlobalMap:
     """The map that the evidence supports.
 
     Args:
         evidence: of all scans.
-        distances: how far apart they were taken (``spacing``).
         merging: "fused" or "paper".
         confirmed: scans in which a wall must be seen, where there are enough of them.
     """
     check_merging(merging)
     if merging == "paper":
-        return _as_map(merge_as_paper(evidence.pieces, cut=distances.cut))
+        return _as_map(merge_as_paper(evidence.pieces, cut=evidence.cut))
     pieces, seen = condense(evidence.pieces), evidence.seen
-    confirmed = min(confirmed, max(1, evidence.poses - 1))
+    confirmed = min(confirmed, max(1, evidence.models - 1))
     # Pieces of one wall add up; what later scans look through goes, and the rest adds up again.
-    walls, wall_of = fuse(pieces, gap=distances.gap)
+    walls, wall_of = fuse(pieces, gap=evidence.gap)
     pieces = trim(pieces, wall_of, seen)
-    walls, _ = fuse(pieces, gap=distances.gap)
+    walls, _ = fuse(pieces, gap=evidence.gap)
     # Corners and poles answer like walls, from every pose in another direction.
     walls = without_points(walls)
     walls = walls.take(walls.count >= confirmed)
@@ -161,27 +175,24 @@ def assemble(
     return _as_map(walls)
 
 
-def condense(pieces: Pieces) -> Pieces:
-    """Pieces of one place (5 cm) and direction (6 deg) as their sum; the order of the pieces does not matter."""
+def condense(pieces: Pieces, *, scans: int | None = None) -> Pieces:
+    """Pieces of one place (5 cm) and direction (6 deg) as their sum; the order of the pieces does not matter.
+
+    Args:
+        pieces: pieces of walls.
+        scans: keep the numbers of at most so many scans of each, the largest ones; all if left out.
+    """
     if not len(pieces):
         return pieces
     cell = np.column_stack([np.floor(pieces.centre / _PLACE), np.floor(pieces.theta / _TURN)]).astype(np.int64)
     _, group = np.unique(cell, axis=0, return_inverse=True)
-    return add_up(pieces, group.ravel())
-
-
-def spacing(log: Log, models: Sequence[LocalModel]) -> Spacing:
-    """Distances that decide what belongs together, from those between successive local models (paper, section 5)."""
-    row_of = {int(number): row for row, number in enumerate(log.scan)}
-    places = log.pose[[row_of[model.scan] for model in models], :2].reshape(-1, 2)
-    return spacing_of(np.linalg.norm(np.diff(places, axis=0), axis=1))
-
-
-def spacing_of(steps: Float[np.ndarray, " steps"]) -> Spacing:
-    """The same from the steps themselves, metres; steps of a robot that stands still, and unknown ones, do not count."""
-    steps = steps[steps > 0.01]  # False for NaN
-    cut = 1.5 * float(np.median(steps)) if len(steps) else 0.4
-    return Spacing(cut=cut, gap=float(np.clip(cut, 0.4, 0.7)))
+    summed = add_up(pieces, group.ravel())
+    if scans is not None:
+        row, number = summed.scans
+        last = np.searchsorted(row, row, side="right")
+        kept = np.arange(len(row)) >= last - scans
+        summed = replace(summed, scans=(row[kept], number[kept]))
+    return summed
 
 
 def check_merging(merging: str) -> None:

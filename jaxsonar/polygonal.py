@@ -134,14 +134,14 @@ def check_scan(bearing: Float[np.ndarray, " beams"], ranges: Float[np.ndarray, "
         raise SonarError("laser: a range below 0 or infinite came; allowed are metres, NaN = nothing came back")
 
 
-def unit(angle: Float[np.ndarray, " angles"]) -> Float[np.ndarray, "angles 2"]:
+def unit(angle: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, "*batch 2"]:
     """Unit vectors in these directions, radians."""
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def lengths(segments: Float[np.ndarray, "*batch 2 2"]) -> Float[np.ndarray, "*batch"]:
+def lengths(segments: Float[np.ndarray, "segments 2 2"]) -> Float[np.ndarray, " segments"]:
     """Metres."""
-    return np.linalg.norm(segments[..., 1, :] - segments[..., 0, :], axis=-1)
+    return np.linalg.norm(segments[:, 1] - segments[:, 0], axis=-1)
 
 
 def _pieces(
@@ -160,10 +160,10 @@ def _pieces(
     allowed = np.minimum(reach[1:], reach[:-1]) * np.sin(turn) / grazing + _NOISE
     jumps = np.flatnonzero((step > allowed) | (turn >= _LEAST_INCIDENCE)) + 1
     found = []
-    for a, b in zip([0, *jumps], [*jumps, len(points)], strict=True):
+    for a, b in zip([0, *jumps.tolist()], [*jumps.tolist(), len(points)], strict=True):
         found += split(points, a, b, max_deviation) if b - a >= min_points else []
     long = [(a, b) for a, b in found if b - a >= min_points]
-    return [(a, b) for a, b in long if lengths(fitted(points[a:b])) >= min_length]
+    return [(a, b) for a, b in long if lengths(fitted(points[a:b])[None])[0] >= min_length]
 
 
 def _deviation(points: Float[np.ndarray, "points 2"]) -> float:

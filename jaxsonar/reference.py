@@ -121,7 +121,7 @@ def _walls_on(
     min_scans: int,
 ) -> tuple[list[Float[np.ndarray, "2 2"]], Bool[np.ndarray, " returns"]]:
     """The walls of the longest piece along a line, recesses told apart, and which returns are done with."""
-    normal = unit(line[0])
+    normal = unit(float(line[0]))
     tangent = np.array([normal[1], -normal[0]])
     near = np.flatnonzero((np.abs(points @ normal - line[1]) <= JOIN) & (facing @ normal > 0))
     position = points[near] @ tangent
@@ -132,7 +132,7 @@ def _walls_on(
     done = np.zeros(len(points), dtype=bool)
     steps = _steps(profile @ normal, max_deviation)
     walls = []
-    for a, b in zip([0, *steps], [*steps, len(run)], strict=True):
+    for a, b in zip([0, *steps.tolist()], [*steps.tolist(), len(run)], strict=True):
         for i, j in split(profile, a, b, max_deviation) if b - a > 2 else []:
             if j - i < 3:
                 continue
@@ -146,8 +146,7 @@ def _walls_on(
                 done[of_wall] = True
     if not walls:
         # What voted for the line must not do so again.
-        done[near if not len(run) else near[np.isin(cell, run)]] = True
-        done |= np.abs(points @ normal - line[1]) <= _BIN if not len(near) else False
+        done[near[np.isin(cell, run)] if len(run) else near] = True
     return walls, done
 
 

@@ -182,9 +182,9 @@ figcaption { margin-top: 0.5rem; }
 caption { padding-bottom: 0.5rem; }
 .table { overflow-x: auto; margin: 1.5rem 0; }
 table { border-collapse: collapse; font-size: 0.875rem; line-height: 1.4; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.35rem 0.75rem; text-align: left; vertical-align: baseline; border-bottom: 1px solid #e2e2e2; }
+th, td { padding: 0.35rem 0.5rem; text-align: left; vertical-align: baseline; border-bottom: 1px solid #e2e2e2; }
 thead th { vertical-align: bottom; border-bottom: 2px solid #8c8c8c; }
-tbody th { font-weight: normal; }
+tbody th { font-weight: normal; min-width: 8rem; }
 .number { text-align: right; white-space: nowrap; }
 thead .number { white-space: normal; }
 .unit { color: #4a4a4a; font-weight: normal; white-space: nowrap; }
@@ -194,6 +194,9 @@ thead .number { white-space: normal; }
   h2 { break-after: avoid; }
   figure, tr { break-inside: avoid; }
   .table { overflow: visible; }
+  table { font-size: 7pt; }
+  th, td { padding: 0.2rem 0.25rem; }
+  tbody th { min-width: 0; }
   img { max-height: 22cm; width: auto; }
 }
 """

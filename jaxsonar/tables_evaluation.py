@@ -27,8 +27,8 @@ def evaluation_table(evaluation: Evaluation) -> Table:
             str(evaluation.segment[k]),
             str(evaluation.reference[k]),
             f"{evaluation.overlap[k]:.2f}",
-            _shown(1e3 * evaluation.distance[k], 1),
-            _shown(np.degrees(evaluation.angle[k]), 2),
+            _shown(1e3 * float(evaluation.distance[k]), 1),
+            _shown(math.degrees(evaluation.angle[k]), 2),
         )
     table.add_section()
     for name, summary in (("largest", largest), ("RMS", rms)):

@@ -1,6 +1,7 @@
 """Windows of the path: the echoes of a short stretch gathered in one frame, for rings too sparse for one scan."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -8,10 +9,12 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.hardware.errors import SonarError
 
 from .echoes import FlatEchoes
-from .logs import Log
+from .logs import Log, Scan
 from .poses import relative, wrap_angle
 from .ring import Ring
 
+Reading = tuple[int, int, float]
+"""Transmitter, receiver and reported range of an echo."""
 OVERLAP = 2
 """Every echo enters this many windows: a wall that one window cuts off lies in the middle of the next."""
 RENEWAL = 2
@@ -44,7 +47,8 @@ class Windows:
 def gather(ring: Ring, log: Log, *, length: float) -> tuple[Windows, int]:
     """Gather the echoes of a log over windows of its path (each echo with the pose that it was taken at).
 
-    Readings that have not been renewed (``renewed``) are left out: a stale reading belongs to an earlier pose. Scans without a pose are left out, and no window reaches across them.
+    Readings that have not been renewed (``renewed``) are left out: a stale reading belongs to an earlier pose. So are
+    the scans of a robot that waits (``moved``), and those without a pose, which no window reaches across.
 
     Args:
         ring: the sensors.
@@ -57,27 +61,89 @@ def gather(ring: Ring, log: Log, *, length: float) -> tuple[Windows, int]:
     Raises:
         SonarError: a length that is not positive, a sensor number that the ring does not have.
     """
-    if not length > 0:
-        raise SonarError(f"window = {length:g} m; allowed is a length above 0")
+    check_window(length)
     flat, left_out = FlatEchoes.from_log(ring, log)
-    fresh = renewed(flat) & moved(log.pose)[flat.scan]
-    share = np.bincount(flat.scan[fresh], minlength=len(log)) / np.maximum(np.bincount(flat.scan, minlength=len(log)), 1)
-    begin, last = _stretches(log.pose, length)
-    first_echo, end_echo = flat.start[begin], flat.start[last + 1]
-    counts = end_echo - first_echo
+    new = renewed(flat) & moved(log.pose)[flat.scan]
+    return _windows(flat, log.pose, new, *_stretches(log.pose, length), length=length), left_out
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """The latest stretch of a path, scan by scan: what the next window is gathered from."""
+
+    scans: tuple[Scan, ...] = ()
+    """Scans with poses, one window's length of them."""
+    way: tuple[float, ...] = ()
+    """How far the robot had come at each of them, metres."""
+    new: tuple[frozenset[Reading], ...] = ()
+    """The readings of each scan that were renewed."""
+    runs: Mapping[Reading, int] = field(default_factory=dict)
+    """For how many scans each reading of the latest one has been there."""
+    place: float = 0.0
+    """Count of places, as ``moved`` counts."""
+
+    def including(self, scan: Scan, *, length: float) -> tuple["Stretch", bool]:
+        """The stretch with one more scan, and whether that one ends a window; one without a pose breaks the path."""
+        readings = [*zip(scan.tx.tolist(), scan.rx.tolist(), scan.range.tolist(), strict=True)]
+        runs = {reading: self.runs.get(reading, -1) + 1 for reading in readings}
+        if not np.isfinite(scan.pose).all():
+            return Stretch(runs=runs, place=self.place), False
+        way, place, waits = 0.0, self.place, False
+        if self.scans:
+            step = scan.pose - self.scans[-1].pose
+            forward = float(np.hypot(step[0], step[1]))
+            way = self.way[-1] + forward
+            place += forward / SAME_PLACE + abs(float(wrap_angle(step[2]))) / SAME_HEADING
+            waits = np.floor(place) == np.floor(self.place)
+        new = frozenset() if waits else frozenset(r for r, run in runs.items() if run % RENEWAL == 0)
+        begin = int(np.searchsorted([*self.way, way], way - length))
+        ends = bool(self.scans) and way // (length / OVERLAP) > self.way[-1] // (length / OVERLAP)
+        stretch = Stretch(
+            (*self.scans, scan)[begin:], (*self.way, way)[begin:], (*self.new, new)[begin:], runs, place
+        )
+        return stretch, ends
+
+    def window(self, ring: Ring, *, length: float) -> tuple[Log, Windows]:
+        """The window that ends at the latest scan, and the log that it refers to."""
+        log = Log.from_scans(self.scans)
+        flat, _ = FlatEchoes.from_log(ring, log)
+        listened = ring.path_index[log.tx, log.rx] >= 0
+        columns = (log.echo_scan[listened], log.tx[listened], log.rx[listened], log.range[listened])
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        new = np.array([(tx, rx, reach) in self.new[scan] for scan, tx, rx, reach in rows], dtype=bool)
+        begin, last = np.zeros(1, np.int64), np.array([len(log) - 1])
+        return log, _windows(flat, log.pose, new, begin, last, length=length)
+
+
+def _windows(
+    flat: FlatEchoes,
+    pose: Float[np.ndarray, "scans 3"],
+    new: Bool[np.ndarray, " echoes"],
+    begin: Int[np.ndarray, " windows"],
+    last: Int[np.ndarray, " windows"],
+    *,
+    length: float,
+) -> Windows:
+    """The new readings of the scans from ``begin`` to ``last``, in the frame of the last one."""
+    first_echo = flat.start[begin]
+    counts = flat.start[last + 1] - first_echo
     echo = np.repeat(first_echo - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
     window = np.repeat(np.arange(len(last)), counts)
-    kept = fresh[echo]
+    kept = new[echo]
     echo, window = echo[kept], window[kept]
-    poses = relative(log.pose[last][window], log.pose[flat.scan[echo]])
+    poses = relative(pose[last][window], pose[flat.scan[echo]])
+    # A scan of which half the readings are new can add half the votes.
+    share = np.bincount(flat.scan[new], minlength=len(pose)) / np.maximum(np.diff(flat.start), 1)
     total = np.append(0, np.cumsum(share))
     gathered = np.maximum(total[last + 1] - total[begin], 1)
-    echoes = FlatEchoes(
-        len(last), window, flat.path[echo], flat.reported[echo], pose=poses, gathered=gathered
-    )
-    strides = np.hypot(*np.diff(log.pose[moved(log.pose), :2], axis=0).T)
-    gap = max(LEAST_GAP, 2.5 * RENEWAL * float(np.median(strides))) if len(strides) else LEAST_GAP
-    return Windows(last, echoes, flat.scan[echo], gap), left_out
+    echoes = FlatEchoes(len(last), window, flat.path[echo], flat.reported[echo], pose=poses, gathered=gathered)
+    return Windows(last, echoes, flat.scan[echo], gap=max(LEAST_GAP, length / 4))
+
+
+def check_window(length: float | None) -> None:
+    """Raise a SonarError for a window that is no length."""
+    if length is not None and not 0 < length < np.inf:
+        raise SonarError(f"window = {length:g} m; allowed is a length above 0")
 
 
 def moved(pose: Float[np.ndarray, "scans 3"]) -> Bool[np.ndarray, " scans"]:

@@ -1,0 +1,120 @@
+"""Maps that grow scan by scan: the robot keeps what the walls amount to, and forgets the scans (paper, section 5)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsonar import kernels
+
+from .candidates import settings_for
+from .local import LocalModel, check_method, local_model, models_of
+from .logs import Log, Scan
+from .mapping import CONFIRMED, Evidence, assemble, check_merging, gather_evidence
+from .maps import GlobalMap
+from .pieces import aggregate
+from .ring import Ring
+from .seenthrough import SeenThrough
+from .windows import Stretch, check_window
+
+
+@dataclass(frozen=True, eq=False)
+class MapState:
+    """What a robot remembers between two scans; grows with the walls and the floor, not with the scans."""
+
+    evidence: Evidence
+    """What all scans so far say of the walls."""
+    stretch: Stretch
+    """The path of the window that is being gathered; empty without windows."""
+    waiting: tuple[Scan, ...]
+    """Scans of that window that are not in the evidence yet."""
+
+
+@dataclass(frozen=True, eq=False)
+class StepInfo:
+    """What one scan came to."""
+
+    model: LocalModel | None
+    """The local model; None while a window is being gathered."""
+    segments: Float[np.ndarray, "segments 2 2"]
+    """Its segments in the world frame, metres."""
+    ignored: str
+    """Why the scan is not in the map; empty if it is."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Mapper:
+    """Builds a map scan by scan: ``state, info = mapper.step(state, scan)``; ``mapper.map(state)`` is the map so far.
+
+    The evidence adds up, so the order of the scans does not matter, and the map is that of ``build_map`` on the same
+    scans (to rounding, 1e-6 m and rad; only the latest ``SCANS_KEPT`` scans of a piece are listed). With windows the
+    scans must come along the path.
+
+    Raises:
+        SonarError: arguments as for ``build_map``.
+    """
+
+    ring: Ring
+    method: str = "hough"
+    settings: kernels.HoughSettings | None = None
+    window: float | None = None
+    """Metres of path gathered into one local model; None: every scan is one."""
+    merging: str = "fused"
+
+    def __post_init__(self):
+        check_method(self.method)
+        check_merging(self.merging)
+        check_window(self.window)
+        object.__setattr__(self, "settings", settings_for(self.ring, self.settings, window=self.window))
+
+    def start(self) -> MapState:
+        """A state that knows nothing."""
+        nothing = aggregate([], np.zeros((0, 3)))
+        return MapState(Evidence(nothing, SeenThrough(), np.zeros((0, 2), np.int64), 0), Stretch(), ())
+
+    def step(self, state: MapState, scan: Scan) -> tuple[MapState, StepInfo]:
+        """Take in one scan; the state given is left as it was.
+
+        Raises:
+            SonarError: a sensor number that the ring does not have.
+        """
+        if self.window is None:
+            if not np.isfinite(scan.pose).all():
+                return state, _nothing("no pose")
+            model = local_model(self.ring, scan, method=self.method, settings=self.settings)
+            return self._with(state, model, Log.from_scans([scan]))
+        if not np.isfinite(scan.pose).all():
+            state, info = self._closed(state)
+            stretch, _ = state.stretch.including(scan, length=self.window)
+            return replace(state, stretch=stretch), replace(info, ignored="no pose")
+        stretch, ends = state.stretch.including(scan, length=self.window)
+        state = replace(state, stretch=stretch, waiting=(*state.waiting, scan))
+        return self._closed(state) if ends else (state, _nothing(""))
+
+    def finish(self, state: MapState) -> MapState:
+        """Take in what is left of the last window."""
+        return self._closed(state)[0]
+
+    def map(self, state: MapState) -> GlobalMap:
+        """The map so far."""
+        return assemble(state.evidence, merging=self.merging, confirmed=1 if self.window else CONFIRMED)
+
+    def _closed(self, state: MapState) -> tuple[MapState, StepInfo]:
+        """The window ends here."""
+        if self.window is None or not state.waiting:
+            return state, _nothing("")
+        assert self.settings is not None
+        log, windows = state.stretch.window(self.ring, length=self.window)
+        model = next(models_of(self.ring, log, windows, self.settings))
+        return self._with(replace(state, waiting=()), model, Log.from_scans(state.waiting))
+
+    def _with(self, state: MapState, model: LocalModel, log: Log) -> tuple[MapState, StepInfo]:
+        new = gather_evidence(self.ring, log, [model])
+        evidence = state.evidence.joined(new)
+        if self.merging != "paper":
+            evidence = evidence.condensed()
+        return replace(state, evidence=evidence), StepInfo(model, new.pieces.segments, "")
+
+
+def _nothing(why: str) -> StepInfo:
+    return StepInfo(None, np.zeros((0, 2, 2)), why)
