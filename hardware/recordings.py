@@ -49,24 +49,32 @@ def read_corridor8(path: str | os.PathLike[str]) -> Recording:
         SonarError: a file is missing, a row is malformed, or the two files do not agree.
     """
     measurements = Path(path) / "measurement.txt" if Path(path).is_dir() else Path(path)
-    poses = measurements.with_name("poses.txt")
     sensors = [f"range {k}" for k in range(8)]
-    sonar = _Table(measurements, _lines(measurements), ("t_ms", *sensors), separator=None)
-    odometry = _Table(poses, _lines(poses), ("t_ms", "x_mm", "y_mm", "heading"), separator=None)
-    time, reported = sonar.number[:, 0], sonar.number[:, 1:]
-    heading = odometry.number[:, 3]
+    sonar = Table(measurements, text_lines(measurements), ("t_ms", *sensors), separator=None)
+    reported = sonar.number[:, 1:]
     sonar.refuse((reported <= 0) | (reported > 5110), sensors, "a range above 0 and up to 5110 mm, which is no echo")
-    odometry.refuse((heading < 0) | (heading > 3600), "heading", "0 to 3600 tenths of a degree")
-    falls = np.append(False, np.diff(time) <= 0)
-    sonar.refuse(falls, "t_ms", "a later time than in the row before")
-    if len(time) != len(heading):
-        counts = f"{len(heading)} rows beside {len(time)} in {measurements.name}"
-        raise SonarError(f"{_shown(poses)}: {counts} came; allowed is a pose for every measurement")
-    odometry.refuse(odometry.number[:, 0] != time, "t_ms", f"the time in the same row of {measurements.name}")
+    stamp, pose = corridor8_poses(sonar)
+    return _direct(stamp, pose, np.where(reported == 5110, np.nan, reported / 1000))
 
+
+def corridor8_poses(table: "Table") -> tuple[Float[np.ndarray, " scans"], Float[np.ndarray, "scans 3"]]:
+    """Time (s) and odometry (m, rad) of every row of a corridor8 file that starts with t_ms, from its ``poses.txt``.
+
+    Raises:
+        SonarError: that file is missing or malformed, or the two do not agree.
+    """
+    poses = table.file.with_name("poses.txt")
+    odometry = Table(poses, text_lines(poses), ("t_ms", "x_mm", "y_mm", "heading"), separator=None)
+    time, heading = table.number[:, 0], odometry.number[:, 3]
+    odometry.refuse((heading < 0) | (heading > 3600), "heading", "0 to 3600 tenths of a degree")
+    table.refuse(np.append(False, np.diff(time) <= 0), "t_ms", "a later time than in the row before")
+    if len(time) != len(heading):
+        counts = f"{len(heading)} rows beside {len(time)} in {table.file.name}"
+        raise SonarError(f"{shown(poses)}: {counts} came; allowed is a pose for every measurement")
+    odometry.refuse(odometry.number[:, 0] != time, "t_ms", f"the time in the same row of {table.file.name}")
     angle = np.radians(heading / 10)
     pose = np.column_stack([odometry.number[:, 1:3] / 1000, np.mod(angle + np.pi, 2 * np.pi) - np.pi])
-    return _direct(time / 1000, pose, np.where(reported == 5110, np.nan, reported / 1000))
+    return time / 1000, pose
 
 
 def read_scitos24(path: str | os.PathLike[str]) -> Recording:
@@ -82,13 +90,13 @@ def read_scitos24(path: str | os.PathLike[str]) -> Recording:
         SonarError: the file is missing or a row is malformed.
     """
     file = Path(path) / "sensor_readings_24.data" if Path(path).is_dir() else Path(path)
-    lines = _lines(file)
+    lines = text_lines(file)
     sensors = [f"S{k}" for k in range(1, 25)]
     header = (*sensors, "OUTPUT")
     if not lines or tuple(lines[0].split(",")) != header:
-        came = f"'{_shown(lines[0])}'" if lines else "nothing"
-        raise SonarError(f"{_shown(file)}: row 1: {came} came; allowed is the header S1,...,S24,OUTPUT")
-    table = _Table(file, lines[1:], header, separator=",", first_row=2, words=1)
+        came = f"'{shown(lines[0])}'" if lines else "nothing"
+        raise SonarError(f"{shown(file)}: row 1: {came} came; allowed is the header S1,...,S24,OUTPUT")
+    table = Table(file, lines[1:], header, separator=",", first_row=2, words=1)
     table.refuse(table.number <= 0, sensors, "a range above 0 m; 5.0 and more is no echo")
     scans = len(table.number)
     nowhere = np.full((scans, 3), np.nan)
@@ -113,7 +121,7 @@ def read_sew_amr(path: str | os.PathLike[str]) -> Recording:
     if Path(path).is_dir():
         files = sorted(Path(path).rglob("dist*.csv"), key=_by_value)
         if not files:
-            raise SonarError(f"{_shown(path)}: no dist.csv in this folder; needed is at least one")
+            raise SonarError(f"{shown(path)}: no dist.csv in this folder; needed is at least one")
     messages = np.concatenate([_sew_messages(file) for file in files])
     begins = messages[:, :, 0::2, :].swapaxes(2, 3)  # (messages, tx, rx, objects)
     scan_index, tx, rx, nearest_first = np.nonzero(begins != 65535)
@@ -130,18 +138,18 @@ def read_sew_amr(path: str | os.PathLike[str]) -> Recording:
 
 def _sew_messages(file: Path) -> Float[np.ndarray, "messages 4 12 4"]:
     """Distances in mm: message, tx, begin or end, rx."""
-    lines = _lines(file)
+    lines = text_lines(file)
     if not lines:
-        raise SonarError(f"{_shown(file)}: row 1: nothing came; allowed is a header and 48 rows a message")
+        raise SonarError(f"{shown(file)}: row 1: nothing came; allowed is a header and 48 rows a message")
     if len(lines[0].split(",")) != 4 or re.fullmatch(r"[\d.,\s+-]+", lines[0]):
-        raise SonarError(f"{_shown(file)}: row 1: '{_shown(lines[0])}' came; allowed is a header of 4 column names")
+        raise SonarError(f"{shown(file)}: row 1: '{shown(lines[0])}' came; allowed is a header of 4 column names")
     columns = [f"{name.strip()} (rx {rx})" for rx, name in enumerate(lines[0].split(","))]
-    table = _Table(file, lines[1:], tuple(columns), separator=",", first_row=2)
+    table = Table(file, lines[1:], tuple(columns), separator=",", first_row=2)
     table.refuse((table.number <= 0) | (table.number > 65535), columns, "above 0 and up to 65535 mm, which is none")
     if len(table.number) % 48 or not len(table.number):
         came = f"{len(table.number)} rows below the header"
         raise SonarError(
-            f"{_shown(file)}: {came} came; allowed are 48 a message (12 a transmitter), one message or more"
+            f"{shown(file)}: {came} came; allowed are 48 a message (12 a transmitter), one message or more"
         )
     return table.number.reshape(-1, 4, 12, 4)
 
@@ -162,7 +170,7 @@ def _direct(
     )
 
 
-class _Table:
+class Table:
     """The numbers in a file's rows, each of which can be named once it turns out to be wrong."""
 
     def __init__(
@@ -181,7 +189,7 @@ class _Table:
         for row, fields in enumerate(self.fields):
             if len(fields) != len(columns):
                 names = ", ".join(columns) if len(columns) < 10 else f"{columns[0]} to {columns[-1]}"
-                place = f"{_shown(file)}: row {first_row + row}"
+                place = f"{shown(file)}: row {first_row + row}"
                 raise SonarError(f"{place}: {len(fields)} columns came; allowed are {len(columns)}: {names}")
         count = len(columns) - words
         try:
@@ -206,20 +214,20 @@ class _Table:
             self._fail(int(row), column[rest[0]] if isinstance(column, list) else column, allowed)
 
     def _fail(self, row: int, column: str, allowed: str) -> NoReturn:
-        came = _shown(self.fields[row][self.columns.index(column)])
-        place = f"{_shown(self.file)}: row {self.first_row + row}, column {_shown(column)}"
+        came = shown(self.fields[row][self.columns.index(column)])
+        place = f"{shown(self.file)}: row {self.first_row + row}, column {shown(column)}"
         raise SonarError(f"{place}: '{came}' came; allowed is {allowed}")
 
 
-def _lines(file: Path) -> list[str]:
+def text_lines(file: Path) -> list[str]:
     """The lines of a text file, without their ends (LF or CRLF)."""
     try:
         text = file.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise SonarError(f"{_shown(file)}: this is no text; needed is a recording as text") from None
+        raise SonarError(f"{shown(file)}: this is no text; needed is a recording as text") from None
     except (OSError, ValueError) as failure:
         reason = getattr(failure, "strerror", None) or str(failure)
-        raise SonarError(f"{_shown(file)}: {reason}; needed is a readable file of the recording") from None
+        raise SonarError(f"{shown(file)}: {reason}; needed is a readable file of the recording") from None
     return text.replace("\r\n", "\n").removesuffix("\n").split("\n") if text else []
 
 
@@ -229,7 +237,7 @@ def _by_value(file: Path) -> list[tuple[int, str]]:
     return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in pieces]
 
 
-def _shown(text: object) -> str:
+def shown(text: object) -> str:
     """One printable line for a message."""
     line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
     return line if len(line) <= 200 else f"{line[:40]}..."

@@ -133,7 +133,7 @@ class FlatEchoes:
             begin, end = self.start[first], self.start[last]
             row = self.scan[begin:end] - first
             column = np.arange(begin, end) - self.start[first + row]
-            columns = room_for(int(column.max(initial=-1)) + 1, least=64)
+            columns = room_for(int(column.max(initial=-1)) + 1, least=64 if self.pose is None else 256)
             path = np.zeros((step, columns), np.int32)
             reported = np.full((step, columns), np.nan, np.float32)
             path[row, column] = self.path[begin:end]

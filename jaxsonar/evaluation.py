@@ -55,7 +55,7 @@ class Evaluation:
     @property
     def precision(self) -> float:
         """Share of the map's segments of which at least half does; NaN without a map."""
-        return _share(int(_half(self.segment_matched, self.segment_length).sum()), len(self.segment_length))
+        return _mean(_half(self.segment_matched, self.segment_length))
 
     @property
     def recall_length(self) -> float:
@@ -65,7 +65,7 @@ class Evaluation:
     @property
     def recall(self) -> float:
         """Share of the reference's segments of which at least half is covered; NaN without a reference."""
-        return _share(int(_half(self.reference_covered, self.reference_length).sum()), len(self.reference_length))
+        return _mean(_half(self.reference_covered, self.reference_length))
 
     def as_json(self) -> dict[str, Any]:
         """Plain numbers for a JSON file; null where there is nothing to tell. SI units and radians."""
@@ -208,7 +208,8 @@ def _nearest(
     bounds = np.unique(pieces[walls])
     part, middle = np.diff(bounds), (bounds[1:] + bounds[:-1]) / 2
     inside = (pieces[walls, :1] < middle) & (middle < pieces[walls, 1:])
-    away = np.abs(across[walls, :1] * (1 - middle) + across[walls, 1:] * middle)
+    # At both ends of a part: in its middle, lines that cross there would be as near as the wall itself.
+    away = sum(np.abs(across[walls, :1] * (1 - end) + across[walls, 1:] * end) for end in (bounds[:-1], bounds[1:]))
     first = np.argmin(np.where(inside, away, np.inf), axis=0) if len(walls) else np.zeros(0, dtype=np.int64)
     for k, wall in enumerate(walls.tolist()):
         mine = inside[k] & (first == k)
@@ -224,6 +225,10 @@ def _known(length: Float[np.ndarray, " segments"]) -> Float[np.ndarray, " segmen
 def _half(part: Float[np.ndarray, " segments"], whole: Float[np.ndarray, " segments"]) -> Bool[np.ndarray, " segments"]:
     """Whether at least half of each is there; of something without length nothing is."""
     return (part >= whole / 2) & (whole > 0)
+
+
+def _mean(holds: Bool[np.ndarray, " segments"]) -> float:
+    return float(holds.mean()) if len(holds) else math.nan
 
 
 def _share(part: float, whole: float) -> float:

@@ -27,9 +27,7 @@ _LEVER = 2.0  # metres that a radian counts for, when neighbors are looked for
 _NEAREST = 12
 
 
-def fuse(
-    pieces: Pieces, *, gap: float, opening: Opening | None = None
-) -> tuple[Pieces, Int[np.ndarray, " pieces"]]:
+def fuse(pieces: Pieces, *, gap: float, opening: Opening | None = None) -> tuple[Pieces, Int[np.ndarray, " pieces"]]:
     """Walls from pieces: in rounds, those that are each other's best match add up, until no two of them match.
 
     Two pieces match if they face the same way, their directions agree, they lie on one line (``OFFSET_GATE``), and not

@@ -108,9 +108,7 @@ def build_map(
     """
     check_merging(merging)
     require_poses(log)
-    models = list(
-        local_models(ring, log, method=method, settings=settings, window=window, on_left_out=on_left_out)
-    )
+    models = list(local_models(ring, log, method=method, settings=settings, window=window, on_left_out=on_left_out))
     evidence = gather_evidence(ring, log, models)
     return assemble(evidence, merging=merging, confirmed=1 if window else CONFIRMED)
 

@@ -78,7 +78,9 @@ def single_linkage(points: Float[np.ndarray, "points 2"], cut: float) -> Int[np.
 
 def _batches(
     cluster: Int[np.ndarray, " lines"], size: Int[np.ndarray, " clusters"], rho: Float[np.ndarray, " lines"]
-) -> Iterator[tuple[kernels.HoughSettings, Int[np.ndarray, " some"], Int[np.ndarray, " some"], Int[np.ndarray, " some"]]]:
+) -> Iterator[
+    tuple[kernels.HoughSettings, Int[np.ndarray, " some"], Int[np.ndarray, " some"], Int[np.ndarray, " some"]]
+]:
     """Clusters of like size and extent together: settings, rows of the lines, their columns, and their cluster."""
     farthest = np.zeros(len(size))
     np.maximum.at(farthest, cluster, np.abs(rho))

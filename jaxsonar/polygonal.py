@@ -9,7 +9,7 @@ from jaxsonar.hardware.errors import SonarError
 
 from .rooms import cross, crossings
 
-JOIN = 0.15
+JOIN = 0.2
 """Metres; walls whose ends are nearer than this to the crossing of their lines meet there."""
 _LEAST_INCIDENCE = np.radians(10.0)  # a wall seen under less than this falls apart into single returns
 _NOISE = 0.03  # m; three sigma of common laser range finders

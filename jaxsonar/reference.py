@@ -11,11 +11,12 @@ from jaxsonar.hardware.lasers import LaserRecording
 
 from .evaluation import evaluate
 from .geojson import feature, write_features
-from .polygonal import JOIN, PolygonalModel, check_scan, fitted, joined, lengths, split, unit
+from .polygonal import PolygonalModel, check_scan, fitted, joined, lengths, split, unit
 from .poses import rotation, to_world
 from .rooms import cross
 
 _BIN = 0.05  # m; pitch of the cells that vote, and at which the profile of a wall is sampled
+_BAND = 0.15  # m; what is nearer than this to a line is looked at together: a wall with its recesses
 _SIDE = 4  # cells on each side of a step that tell its height, and of a cell that tell how many scans saw it
 
 
@@ -123,7 +124,7 @@ def _walls_on(
     """The walls of the longest piece along a line, recesses told apart, and which returns are done with."""
     normal = unit(float(line[0]))
     tangent = np.array([normal[1], -normal[0]])
-    near = np.flatnonzero((np.abs(points @ normal - line[1]) <= JOIN) & (facing @ normal > 0))
+    near = np.flatnonzero((np.abs(points @ normal - line[1]) <= _BAND) & (facing @ normal > 0))
     position = points[near] @ tangent
     cell = np.floor(position / _BIN).astype(np.int64)
     cell -= cell.min(initial=0)
@@ -136,8 +137,15 @@ def _walls_on(
         for i, j in split(profile, a, b, max_deviation) if b - a > 2 else []:
             if j - i < 3:
                 continue
-            here = near[(cell >= run[i]) & (cell <= run[j - 1])]
+            inside = (cell >= run[i]) & (cell <= run[j - 1])
+            here, at = near[inside], cell[inside]
             start, end = fitted(profile[i:j])
+            for _ in range(2):
+                along = (end - start) / np.hypot(*(end - start))
+                close = np.abs(cross(along, points[here] - start)) <= 1.5 * max_deviation
+                if len(np.unique(at[close])) < 3:
+                    break
+                start, end = fitted(_profile(points[here[close]], at[close]))
             along = (end - start) / np.hypot(*(end - start))
             of_wall = here[np.abs(cross(along, points[here] - start)) <= 1.5 * max_deviation]
             share = (points[of_wall] - start) @ along
@@ -148,6 +156,13 @@ def _walls_on(
         # What voted for the line must not do so again.
         done[near[np.isin(cell, run)] if len(run) else near] = True
     return walls, done
+
+
+def _profile(points: Float[np.ndarray, "returns 2"], cell: Int[np.ndarray, " returns"]) -> Float[np.ndarray, "cells 2"]:
+    """The median of the returns in every cell; of a long wall without the ends, where its neighbors' returns are."""
+    cells = np.unique(cell)
+    cells = cells[1:-1] if len(cells) > 4 else cells
+    return np.array([np.median(points[cell == k], axis=0) for k in cells])
 
 
 def _supported(

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from .ring import Ring
 
@@ -124,12 +124,7 @@ def silence(
     claimed = ahead < free[..., None]
     who, sensor_row, ray_row, step = np.nonzero(claimed)
     point = sensor[who, sensor_row] + ahead[step, None] * ray[who, sensor_row, ray_row]
-    cells = np.column_stack([who, np.floor(point / CELL).astype(np.int64), _direction(theta[who, sensor_row, ray_row])])
-    seen = np.unique(np.column_stack([cells, sensor_row]), axis=0)
-    cells, sensors = np.unique(seen[:, :4], axis=0, return_counts=True)
-    overlap = width[direct].sum() / (2 * np.pi)
-    cells = cells[sensors >= (2 if overlap >= 2 else 1)]
-
+    claims = (who, *np.floor(point / CELL).astype(np.int64).T, _direction(theta[who, sensor_row, ray_row]))
     # An echo of any path speaks against it, wherever its arc passes.
     turn = start[path, None] + width[path, None] * np.linspace(0, 1, _RAYS)
     theta = pose[scan, 2][:, None] + turn
@@ -139,11 +134,19 @@ def silence(
     ray = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     distance = reach[:, None] + np.array([-CELL, 0.0, CELL])
     point = origin[:, None, None] + distance[:, None, :, None] * ray[:, :, None]
-    own = np.broadcast_to(scan[:, None, None], point.shape[:3])
-    facing = np.broadcast_to(_direction(theta)[..., None], point.shape[:3])
-    heard = np.concatenate([own[..., None], np.floor(point / CELL).astype(np.int64), facing[..., None]], axis=-1)
-    cells = cells[~_contained(cells, heard.reshape(-1, 4))]
-    return cells[:, 1:], cells[:, 0]
+    own = np.broadcast_to(scan[:, None, None], point.shape[:3]).ravel()
+    facing = np.broadcast_to(_direction(theta)[..., None], point.shape[:3]).ravel()
+    heard = (own, *np.floor(point / CELL).astype(np.int64).reshape(-1, 2).T, facing)
+
+    code, low, size = _coded(np.concatenate([claims, heard], axis=1))
+    count = len(who)
+    seen = np.unique(code[:count] * len(direct) + sensor_row)
+    cells, sensors = np.unique(seen // len(direct), return_counts=True)
+    overlap = width[direct].sum() / (2 * np.pi)
+    cells = cells[sensors >= (2 if overlap >= 2 else 1)]
+    cells = cells[~np.isin(cells, code[count:])]
+    scan_of, x, y, facing = (value + first for value, first in zip(np.unravel_index(cells, size), low, strict=True))
+    return np.column_stack([x, y, facing]), scan_of
 
 
 def _hidden_from(
@@ -168,9 +171,10 @@ def _direction(theta: Float[np.ndarray, "*any"]) -> Int[np.ndarray, "*any"]:
     return np.floor(np.mod(theta, 2 * np.pi) * (DIRECTIONS / (2 * np.pi))).astype(np.int64) % DIRECTIONS
 
 
-def _contained(rows: Int[np.ndarray, "rows k"], others: Int[np.ndarray, "others k"]) -> Bool[np.ndarray, " rows"]:
-    """Which rows are among the others."""
-    low = np.minimum(rows.min(axis=0, initial=0), others.min(axis=0, initial=0))
-    size = np.maximum(rows.max(axis=0, initial=0), others.max(axis=0, initial=0)) - low + 1
-    weight = np.cumprod(np.append(1, size[:0:-1]))[::-1]
-    return np.isin((rows - low) @ weight, (others - low) @ weight)
+def _coded(
+    rows: Int[np.ndarray, "columns rows"],
+) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " columns"], tuple[int, ...]]:
+    """One whole number for each row, the smallest value of each column, and how many values each may have."""
+    low = rows.min(axis=1, initial=0)
+    size = tuple((rows.max(axis=1, initial=0) - low + 1).tolist())
+    return np.ravel_multi_index(tuple(rows - low[:, None]), size), low, size

@@ -36,7 +36,7 @@ def verified(
     heard over more than ``windows.gap`` of its length (a door) is two.
     """
     step, lines = extracted.step, extracted.lines
-    size = room_for(lines.rho.shape[1], least=4)
+    size = room_for(lines.rho.shape[1], least=16)
     shape = (len(step.path), size)
     rho, theta = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
     rows, columns = lines.rho.shape

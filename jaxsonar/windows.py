@@ -98,9 +98,7 @@ class Stretch:
         new = frozenset() if waits else frozenset(r for r, run in runs.items() if run % RENEWAL == 0)
         begin = int(np.searchsorted([*self.way, way], way - length))
         ends = bool(self.scans) and way // (length / OVERLAP) > self.way[-1] // (length / OVERLAP)
-        stretch = Stretch(
-            (*self.scans, scan)[begin:], (*self.way, way)[begin:], (*self.new, new)[begin:], runs, place
-        )
+        stretch = Stretch((*self.scans, scan)[begin:], (*self.way, way)[begin:], (*self.new, new)[begin:], runs, place)
         return stretch, ends
 
     def window(self, ring: Ring, *, length: float) -> tuple[Log, Windows]:

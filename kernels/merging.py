@@ -67,9 +67,7 @@ def merged_lines(
         label_of_cell = jnp.append(label.ravel(), jnp.zeros(1, label.dtype))
         of_line = label_of_cell[cells_of_lines(rho, theta, settings)]
         rho, n = jnp.where(of_line == 0, 0, rho), normal(jnp.where(of_line == 0, 0, theta))
-        lines = clusters.centres_of_gravity(
-            rho[:, None], n[:, :1], n[:, 1:], of_line[:, None], clusters=size
-        )
+        lines = clusters.centres_of_gravity(rho[:, None], n[:, :1], n[:, 1:], of_line[:, None], clusters=size)
         return lines.rho, lines.theta, jnp.abs(of_line)
 
     return jax.lax.map(one_cluster, (rho, theta, labels))

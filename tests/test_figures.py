@@ -244,8 +244,8 @@ def test_many_positions_are_a_path_without_numbers(poses, numbers):
     axes = figures_map.map_figure(map_of([[[0, 0], [25, 0]]]), poses=path).axes[0]
     assert len(axes.texts) == numbers
     line, crosses = axes.lines
-    assert len(line.get_xdata()) == poses
-    assert len(crosses.get_xdata()) <= figures_map.MOST_NUMBERS
+    assert np.size(line.get_xdata()) == poses
+    assert np.size(crosses.get_xdata()) <= figures_map.MOST_NUMBERS
 
 
 @pytest.mark.parametrize("size", [(25, 4), (4, 25), (4, 4), (200, 1), (1, 200), (0.3, 0.3)])
@@ -270,7 +270,7 @@ def test_every_end_of_a_segment_has_a_tick_across():
     axes = figures_map.map_figure(world).axes[0]
     _, ticks = axes.collections
     np.testing.assert_array_equal(ticks.get_offsets(), world.segments.reshape(-1, 2))
-    across = np.array([path.vertices[1] - path.vertices[0] for path in ticks.get_paths()])
+    across = np.array([np.diff(path.vertices, axis=0)[0] for path in ticks.get_paths()])
     along = np.repeat(world.segments[:, 1] - world.segments[:, 0], 2, axis=0)
     np.testing.assert_allclose((across * along).sum(axis=-1), 0)
     np.testing.assert_allclose(np.linalg.norm(across, axis=-1), 8)  # points
