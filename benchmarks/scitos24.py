@@ -161,7 +161,7 @@ def main() -> None:
             figures.save(deviation_figure(found), options.output / "deviations.png")
             best = max(range(len(models)), key=lambda k: sum(line.echoes for line in models[k].lines[:3]))
             for suffix in ("svg", "png"):
-                figure = figures.lines_figure(ring, log[best], models[best])
+                figure = figures_scan.lines_figure(ring, log[best], models[best])
                 figures.save(figure, options.output / f"lines.{suffix}")
     for degrees, (share, chance) in heard_off_axis(ranges, radius).items():
         console.print(

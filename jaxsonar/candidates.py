@@ -15,7 +15,6 @@ from .components import label_components
 from .echoes import FlatEchoes, Step, room_for
 from .ring import Ring
 
-
 WINDOW_THRESHOLD = 0.05
 """Threshold for gathered windows, where a fit to the ranges decides and a wall may be seen by one sensor alone."""
 
@@ -47,17 +46,23 @@ class Extracted:
     components: Int[np.ndarray, " scans"]
     """Components of occupied cells, before those with too few echoes were dropped."""
 
-    def of_scan(self, row: int) -> Iterator["Candidate"]:
-        """The lines of one scan, strongest first."""
+    @property
+    def candidates(self) -> list[list["Candidate"]]:
+        """The lines of each scan, strongest first."""
         lines = self.lines
-        for k in np.flatnonzero(lines.echoes[row]):
-            yield Candidate(
-                rho=float(lines.rho[row, k]),
-                theta=float(lines.theta[row, k]),
-                segment=lines.segments[row, k],
-                votes=int(lines.votes[row, k]),
-                echoes=np.flatnonzero(self.involved[row, k]),
-            )
+        return [
+            [
+                Candidate(
+                    rho=float(lines.rho[row, k]),
+                    theta=float(lines.theta[row, k]),
+                    segment=lines.segments[row, k],
+                    votes=int(lines.votes[row, k]),
+                    echoes=np.flatnonzero(self.involved[row, k]),
+                )
+                for k in np.flatnonzero(lines.echoes[row])
+            ]
+            for row in range(len(lines.rho))
+        ]
 
 
 class Candidate(NamedTuple):
@@ -137,7 +142,9 @@ def settings_for(
     """
     reach = float(np.linalg.norm(ring.position, axis=1).max() + ring.max_range) + (window or 0.0)
     if settings is None:
-        settings = kernels.HoughSettings(**({} if window is None else {"threshold": WINDOW_THRESHOLD}))
+        settings = kernels.HoughSettings()
+        if window is not None:
+            settings = replace(settings, threshold=WINDOW_THRESHOLD)
         needed = int(np.ceil(reach / settings.rho_cell))
         return replace(settings, rho_cells=max(settings.rho_cells, needed))
     if settings.max_rho < reach:

@@ -74,6 +74,140 @@ def lines(options: argparse.Namespace) -> None:
     _say(tally.summary())
 
 
+def map(options: argparse.Namespace) -> None:
+    """``jaxsonar map``."""
+    import numpy as np
+
+    from .candidates import settings_for
+    from .files import refuse_folder, shown
+    from .hardware.errors import SonarError
+    from .local import local_models
+    from .logs import load_log
+    from .mapfile import save_map
+    from .mapping import CONFIRMED, assemble, gather_evidence, require_poses
+    from .ringfile import load_ring
+    from .settings import load_settings, save_settings
+
+    _refuse_overwriting(options.output, options.log, options.ring)
+    for path in (options.figure, options.grid, options.dxf):
+        if path:
+            refuse_folder(path)  # complain before the work, not after it
+            _refuse_overwriting(path, options.log, options.ring)
+    if options.laser and not options.figure:
+        raise SonarError("--laser came alone; allowed is --laser with --figure, to which it belongs")
+    if options.dxf:
+        from .dxf import load_ezdxf
+
+        load_ezdxf(options.dxf)
+    ring, log = load_ring(options.ring), load_log(options.log)
+    given = load_settings(options.settings) if options.settings else None
+    settings = settings_for(ring, given, window=options.window)
+    points = None
+    if options.laser:
+        from .hardware.lasers import read_corridor8_laser
+        from .reference import laser_points
+
+        points = laser_points(read_corridor8_laser(options.laser), every=4)
+
+    def left_out(count: int) -> None:
+        _say(f"left out {count} echoes of pairs of sensors that {ring.name!r} does not listen to")
+
+    try:
+        require_poses(log)
+        models = local_models(
+            ring, log, method=options.method, settings=settings, window=options.window, on_left_out=left_out
+        )
+    except SonarError as error:
+        raise SonarError(f"{shown(options.log)}: {error}") from None
+    models = list(_progress(models, len(log), "scans"))
+    evidence = gather_evidence(ring, log, models)
+    world = assemble(evidence, merging=options.merging, confirmed=1 if options.window else CONFIRMED)
+    save_map(world, options.output)
+    if beside := _settings_file(options.output):
+        save_settings(settings, beside)
+    if options.grid:
+        from .gridmap import occupancy, save_nav2
+
+        save_nav2(occupancy(ring, log, walls=world.segments), options.grid)
+    if options.dxf:
+        from .dxf import save_dxf
+
+        save_dxf(world, options.dxf)
+    if options.figure:
+        from . import figures, figures_map
+
+        placed = log.pose[np.all(np.isfinite(log.pose), axis=1)]
+        figure = figures_map.map_figure(
+            world, aggregated=evidence.pieces.segments, poses=placed, laser_points=points, title=shown(options.log, 60)
+        )
+        figures.save(figure, options.figure)
+    homeless = int((~np.all(np.isfinite(log.pose), axis=1)).sum())
+    without = f"; {homeless} scans without a pose left out" if homeless else ""
+    _say(
+        f"{len(log)} scans, {len(models)} local models, {len(evidence.pieces)} segments, "
+        f"{len(world)} walls, {world.length.sum():.1f} m{without}"
+    )
+
+
+def reference(options: argparse.Namespace) -> None:
+    """``jaxsonar reference``."""
+    import numpy as np
+
+    from .files import refuse_folder, shown
+    from .hardware.errors import SonarError
+    from .hardware.lasers import read_corridor8_laser
+    from .polygonal import polygonal_model, unit
+    from .reference import laser_points, reference_map, save_reference
+
+    if options.figure:
+        refuse_folder(options.figure)
+    laser = read_corridor8_laser(options.recording)
+    if options.scan is not None and options.scan >= len(laser.stamp):
+        held = f"0 to {len(laser.stamp) - 1}" if len(laser.stamp) else "none"
+        raise SonarError(f"--scan {options.scan}: no such scan in {shown(options.recording)}; it holds {held}")
+    if options.scan is None:
+        walls, points = reference_map(laser, reach=options.reach), laser_points(laser, every=4)
+        save_reference(walls, options.output)
+        _say(f"{len(laser.stamp)} scans, {len(walls)} walls, {np.hypot(*(walls[:, 1] - walls[:, 0]).T).sum():.1f} m")
+    else:
+        ranges = laser.ranges[options.scan]
+        walls = polygonal_model(laser.bearing, ranges)
+        points = (ranges[:, None] * unit(laser.bearing))[np.isfinite(ranges)]
+        save_reference(walls, options.output)
+        _say(f"{len(walls.segments)} segments, {len(walls.pseudo)} pseudo segments, {len(walls.intersections)} corners")
+    if options.figure:
+        from . import figures, figures_map
+
+        figures.save(figures_map.reference_figure(walls, points), options.figure)
+
+
+def evaluate(options: argparse.Namespace) -> None:
+    """``jaxsonar evaluate``."""
+    import json
+
+    import numpy as np
+
+    from .evaluation import evaluate as evaluate_map
+    from .files import open_output
+    from .mapfile import load_walls
+    from .tables_evaluation import evaluation_table
+
+    if options.json:
+        _refuse_overwriting(options.json, options.map, options.reference)
+    found = evaluate_map(
+        load_walls(options.map),
+        load_walls(options.reference),
+        gate_distance=options.gate,
+        gate_angle=float(np.radians(options.gate_deg)),
+    )
+    if options.json:
+        with open_output(options.json) as file:
+            json.dump(found.as_json(), file, allow_nan=False, indent=1)
+            file.write("\n")
+    if options.json != "-":
+        Console(width=None if sys.stdout.isatty() else 140).print(evaluation_table(found))
+
+
 def simulate(options: argparse.Namespace) -> None:
     """``jaxsonar simulate``."""
     from .files import write_toml

@@ -27,7 +27,7 @@ def save_dxf(world: GlobalMap, path: str | os.PathLike[str]) -> None:
     Raises:
         SonarError: the place cannot be written, or the extra is missing.
     """
-    ezdxf = _ezdxf(path)
+    ezdxf = load_ezdxf(path)
     with _fixed_dates(ezdxf), atomic_write(path) as file:
         drawing = ezdxf.new("R2010", units=_METRES)
         drawing.layers.add(LAYER)
@@ -52,7 +52,8 @@ def _fixed_dates(ezdxf: Any) -> Iterator[None]:
         ezdxf.options.write_fixed_meta_data_for_testing = before
 
 
-def _ezdxf(path: str | os.PathLike[str]) -> Any:
+def load_ezdxf(path: str | os.PathLike[str]) -> Any:
+    """The library behind this file, or an error that says which extra it comes with."""
     try:
         import ezdxf
     except ImportError:

@@ -32,6 +32,7 @@ from .figures import (
 from .gridmap import FREE, OCCUPIED, UNKNOWN
 from .local import Line, LocalModel
 from .maps import GlobalMap
+from .polygonal import PolygonalModel
 from .poses import to_world
 from .ring import Ring
 from .rooms import Room
@@ -181,6 +182,35 @@ def map_figure(
         handles.append(Line2D([], [], color=WALL, marker=".", ls="", label="laser points"))
     if poses is not None:
         handles.append(_draw_path(axes, poses))
+    return finish(figure, axes, handles, width=8.4)
+
+
+def reference_figure(
+    walls: Float[np.ndarray, "walls 2 2"] | PolygonalModel, points: Float[np.ndarray, "points 2"]
+) -> Figure:
+    """Walls from a laser over its points: of a whole run, or the polygonal model of one scan (paper, figure 2).
+
+    Args:
+        walls: both ends of each, or the model with its pseudo segments and intersections, metres.
+        points: where the laser saw something, the same frame, metres.
+    """
+    model = walls if isinstance(walls, PolygonalModel) else PolygonalModel(walls)
+    figure, axes = plan(f"{len(model.segments)} line segments from a laser")
+    axes.add_collection(LineCollection(list(model.segments), colors=ROBOT, linewidths=1.6, zorder=3))
+    handles = [Line2D([], [], color=ROBOT, lw=1.6, label="line segment")]
+    if len(model.pseudo):
+        dashes = LineCollection(list(model.pseudo), colors=DIRECT, linewidths=0.9, linestyles=(0, (4, 3)), zorder=2)
+        axes.add_collection(dashes)
+        handles.append(Line2D([], [], color=DIRECT, lw=0.9, ls=(0, (4, 3)), label="pseudo line segment"))
+    if len(model.intersections):
+        axes.plot(*model.intersections.T, "o", color=LINE, ms=4, zorder=4)
+        handles.append(Line2D([], [], color=LINE, marker="o", ls="", ms=4, label="intersection"))
+    corners = np.concatenate([model.segments, model.pseudo]).reshape(-1, 2)
+    if len(corners):
+        low, high = corners.min(axis=0) - 1, corners.max(axis=0) + 1
+        points = points[((points > low) & (points < high)).all(axis=1)]
+    axes.plot(*points.T, ".", color=WALL, ms=1.5, mew=0, alpha=0.5, zorder=1, rasterized=True)
+    handles.append(Line2D([], [], color=WALL, marker=".", ls="", label="laser points"))
     return finish(figure, axes, handles, width=8.4)
 
 

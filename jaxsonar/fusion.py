@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .pieces import Pieces, add_up
 from .poses import wrap_angle
@@ -118,7 +118,7 @@ def _neighbors(pieces: Pieces, gap: float, *, nearest: int | None) -> Int[np.nda
     points = np.concatenate([place, direction], axis=-1)
     steepest = TURN_GATE * np.sqrt(2 / pieces.info_theta.min() + TURN_FLOOR**2)
     reach = float(np.hypot(1.6 * gap + OFFSET_GATE, _LEVER * min(steepest, np.pi / 2)))
-    tree = cKDTree(points)
+    tree = KDTree(points)
     if nearest is None:
         pairs = tree.query_pairs(reach, output_type="ndarray")
     else:

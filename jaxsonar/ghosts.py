@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .pieces import Pieces
 from .poses import wrap_angle
@@ -37,7 +37,7 @@ def without_points(walls: Pieces) -> Pieces:
         return walls
     ghost = np.zeros(len(walls), dtype=bool)
     vertex, owners = _vertices(walls, long)
-    tree = cKDTree(walls.centre[short])
+    tree = KDTree(walls.centre[short])
     for near, place in zip(tree.query_ball_point(vertex, NEAR), range(len(vertex)), strict=True):
         candidates = short[near]
         turn = _turn(walls.theta[candidates][:, None], walls.theta[owners[place]][None])
@@ -52,7 +52,7 @@ def without_points(walls: Pieces) -> Pieces:
 
 
 def trim(pieces: Pieces, wall_of: Int[np.ndarray, " pieces"], seen: SeenThrough) -> Pieces:
-    """The pieces without those parts that at least three scans saw through after the last one that saw their wall there.
+    """The pieces without what at least three scans saw through after the last one that saw their wall there.
 
     Args:
         pieces: pieces of walls.
@@ -150,7 +150,7 @@ def _vertices(
     own = np.repeat(long, 2)
     if len(long) < 2:
         return ends, np.stack([own, own], axis=-1)
-    tree = cKDTree(walls.centre[long])
+    tree = KDTree(walls.centre[long])
     reach = 2 * REACH + float(walls.length[long].max())
     pairs = tree.query_pairs(reach, output_type="ndarray").reshape(-1, 2)
     a, b = segments[pairs[:, 0]], segments[pairs[:, 1]]

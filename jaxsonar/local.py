@@ -145,7 +145,7 @@ def models_of(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSet
     paths = ring.paths
     for extracted in extract(ring, windows.echoes, settings):
         step = extracted.step
-        walls = verified(ring, windows, extracted, settings) if windows.gap else extracted.of_scan
+        walls = verified(ring, extracted, settings, gap=windows.gap) if windows.gap else extracted.candidates
         for row, index in enumerate(windows.last[step.scans]):
             lines = tuple(
                 Line(
@@ -157,7 +157,7 @@ def models_of(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSet
                     paths=paths[np.unique(step.path[row, wall.echoes])],
                     scans=tuple(log.scan[np.unique(windows.scan[step.echo[row, wall.echoes]])].tolist()),
                 )
-                for wall in walls(row)
+                for wall in walls[row]
             )
             empty = ""
             if not lines:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
@@ -73,7 +73,7 @@ class Evidence:
         """
         if len(self.places) < 2:
             return MOST_GAP
-        nearest = cKDTree(self.places * _PLACE).query(self.places * _PLACE, k=2)[0][:, 1]
+        nearest = KDTree(self.places * _PLACE).query(self.places * _PLACE, k=2)[0][:, 1]
         return max(LEAST_GAP, 1.5 * float(np.median(nearest)))
 
     @property
@@ -125,13 +125,13 @@ def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> Evide
     row_of = {int(number): row for row, number in enumerate(log.scan)}
     rows = np.array([row_of[model.scan] for model in models], dtype=np.int64)
     poses = log.pose[rows]
-    known = np.isfinite(poses).all(axis=1)
+    known = np.all(np.isfinite(poses), axis=1)
     pieces = aggregate(models, poses)
     segment_model = np.repeat(np.flatnonzero(known), [len(models[k].lines) for k in np.flatnonzero(known)])
     shows = [pieces.segments[segment_model == k] for k in range(len(models))]
     flat, _ = FlatEchoes.from_log(ring, log)
     reach = np.asarray(ring.corrected(flat.reported, *ring.paths[flat.path].T))
-    placed = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
+    placed = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1))
     placed = placed[placed <= rows.max(initial=-1)]
     when = np.where(np.isnan(log.stamp), log.scan, log.stamp)
     seen = SeenThrough()

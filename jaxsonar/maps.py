@@ -28,5 +28,16 @@ class GlobalMap:
     scans: tuple[tuple[int, ...], ...]
     """Numbers of the scans that the segment was seen in, ascending."""
 
+    def __post_init__(self):
+        for name in ("segments", "rho", "theta", "sigma_rho", "sigma_theta", "echoes"):
+            view = getattr(self, name).view()
+            view.flags.writeable = False  # of our view only: the caller's own array stays as it was
+            object.__setattr__(self, name, view)
+
     def __len__(self) -> int:
         return len(self.segments)
+
+    @property
+    def length(self) -> Float[np.ndarray, " segments"]:
+        """How long the segments are, metres."""
+        return np.linalg.norm(self.segments[:, 1] - self.segments[:, 0], axis=-1)

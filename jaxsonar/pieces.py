@@ -92,7 +92,7 @@ def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]
         models: local models, robot frame.
         poses: world_from_robot of each, x, y (m), theta (rad), NaN where there is none.
     """
-    known = np.isfinite(poses).all(axis=1)
+    known = np.all(np.isfinite(poses), axis=1)
     lines = [(k, line) for k, model in enumerate(models) if known[k] for line in model.lines]
     model = np.array([k for k, _ in lines], dtype=np.int64)
     theta = np.array([line.theta for _, line in lines]) + poses[model, 2]

@@ -1,6 +1,7 @@
 """The reference of a whole run: walls from all laser scans along a robot's path, to hold its map against."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -23,7 +24,7 @@ _SIDE = 4  # cells on each side of a step that tell its height, and of a cell th
 def reference_map(
     laser: LaserRecording,
     *,
-    reach: float = 3.0,
+    reach: float = 3.5,
     max_deviation: float = 0.04,
     max_gap: float = 0.4,
     min_length: float = 0.3,
@@ -58,6 +59,18 @@ def reference_map(
     found = _once(found[np.argsort(-lengths(found), kind="stable")])
     before, after = np.indices((len(found), len(found))).reshape(2, -1)
     return joined(found, before, after)[0]
+
+
+def laser_points(laser: LaserRecording, *, reach: float = 8.0, every: int = 1) -> Float[np.ndarray, "points 2"]:
+    """Where the laser saw something, world frame of the odometry, metres.
+
+    Args:
+        laser: scans with poses.
+        reach: returns farther than this from the robot are left out, metres.
+        every: take one scan in so many.
+    """
+    some = slice(None, None, every)
+    return _near_returns(replace(laser, pose=laser.pose[some], ranges=laser.ranges[some]), reach)[0]
 
 
 def save_reference(walls: Float[np.ndarray, "walls 2 2"] | PolygonalModel, path: str | os.PathLike[str]) -> None:

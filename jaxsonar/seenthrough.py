@@ -25,6 +25,8 @@ SURE = 0.85
 """Share of the cone's width and of the maximum range within which a wall is heard for certain."""
 HIDDEN = 1.0
 """Metres that a wall is taken to go on beyond its ends, hiding what is behind."""
+FACING = float(np.radians(15.0))
+"""Radians; a ray within this of a wall's normal faces the wall."""
 _TILE = 32
 _RAYS = 9
 
@@ -163,7 +165,9 @@ def _hidden_from(
     toward = np.einsum("srk,wk->srw", ray, normal)
     way = (offset * normal).sum(-1)[:, None] / np.where(np.abs(toward) > 1e-9, toward, np.nan)
     where = way * np.einsum("srk,wk->srw", ray, tangent) - (offset * tangent).sum(-1)[:, None]
-    meets = (way > 0) & (where > -HIDDEN) & (where < length + HIDDEN)
+    # Where it is only guessed to go on, it would have been heard by whoever faces it, and hides nothing from them.
+    further = np.where(np.abs(toward) < np.cos(FACING), HIDDEN, 0.0)
+    meets = (way > 0) & (where > -further) & (where < length + further)
     return np.where(meets, way, np.inf).min(axis=-1)
 
 
@@ -177,4 +181,4 @@ def _coded(
     """One whole number for each row, the smallest value of each column, and how many values each may have."""
     low = rows.min(axis=1, initial=0)
     size = tuple((rows.max(axis=1, initial=0) - low + 1).tolist())
-    return np.ravel_multi_index(tuple(rows - low[:, None]), size), low, size
+    return np.asarray(np.ravel_multi_index(tuple(rows - low[:, None]), size)), low, size

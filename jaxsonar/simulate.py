@@ -360,7 +360,7 @@ def _check(poses, stamps, sigma, drift, drift_time, dropout, clutter, seed, max_
     if poses.ndim != 2 or poses.shape[1] != 3:
         raise SonarError(f"simulate: poses of shape {poses.shape}; allowed is (scans, 3): x, y, theta")
     if not np.isfinite(poses).all():
-        row = int(np.argmin(np.isfinite(poses).all(axis=1)))
+        row = int(np.argmin(np.all(np.isfinite(poses), axis=1)))
         raise SonarError(f"simulate: pose {row} is {poses[row].tolist()}; allowed are finite x, y (m) and theta (rad)")
     if stamps.shape != (len(poses),):
         raise SonarError(f"simulate: stamps of shape {stamps.shape}; allowed is one for each of the {len(poses)} poses")

@@ -4,7 +4,7 @@ Where few sensors look around, a post or a corner answers from every pose of the
 place; the Hough step takes the tangent there for a line. The fit of both models to the ranges decides.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,6 @@ from jaxsonar import kernels
 from .candidates import Candidate, Extracted, arcs_of
 from .echoes import room_for
 from .ring import Ring
-from .windows import Windows
 
 TOLERANCE = 0.03
 """Metres; how far a range may be from what a reflector explains: steps of 10 mm, readings 0.2 s late, odometry."""
@@ -27,41 +26,35 @@ MIN_EXTENT = 0.2
 """Metres along the wall that they must cover: less determines no direction."""
 
 
-def verified(
-    ring: Ring, windows: Windows, extracted: Extracted, settings: kernels.HoughSettings
-) -> Callable[[int], Iterator[Candidate]]:
-    """The walls of each window of a step, as ``Extracted.of_scan`` gives candidates.
+def verified(ring: Ring, extracted: Extracted, settings: kernels.HoughSettings, *, gap: float) -> list[list[Candidate]]:
+    """The walls of each window of a step.
 
-    Candidates are taken in the order of how much a plane explains; every echo is explained once. A wall that was not
-    heard over more than ``windows.gap`` of its length (a door) is two.
+    Candidates are taken in the order of how much a plane explains; every echo is explained once.
+
+    Args:
+        ring: the sensors.
+        extracted: candidates.
+        settings: that they were found with.
+        gap: a wall that was not heard over more than this much of its length is two, metres.
     """
     step, lines = extracted.step, extracted.lines
-    size = room_for(lines.rho.shape[1], least=16)
-    shape = (len(step.path), size)
-    rho, theta = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
     rows, columns = lines.rho.shape
-    rho[:rows, :columns], theta[:rows, :columns] = lines.rho, lines.theta
-    fits = kernels.fit_candidates(
-        arcs_of(ring, settings), step.packed, jnp.asarray(rho), jnp.asarray(theta), tolerance=TOLERANCE
-    )
+    candidates = np.full((2, len(step.path), room_for(columns, least=16)), np.nan, np.float32)
+    candidates[:, :rows, :columns] = lines.rho, lines.theta
+    rho, theta = (jnp.asarray(values) for values in candidates)
+    fits = kernels.fit_candidates(arcs_of(ring, settings), step.packed, rho, theta, tolerance=TOLERANCE)
     plane, point = np.asarray(fits.plane_score), np.asarray(fits.point_score)
     rho, theta, foot = (np.asarray(values) for values in (fits.rho, fits.theta, fits.foot))
     good = np.asarray(fits.explained) & (plane > BETTER * point)[..., None]  # False where there is no candidate
-
-    def walls(row: int) -> Iterator[Candidate]:
-        free = np.ones(good.shape[2], dtype=bool)
+    walls: list[list[Candidate]] = [[] for _ in range(rows)]
+    free = np.ones((rows, good.shape[2]), dtype=bool)
+    for row in range(rows):
         for k in np.argsort(-plane[row, :columns], kind="stable"):
-            for echoes in _stretches(good[row, k] & free, foot[row, k], windows.gap):
-                free[echoes] = False
+            for echoes in _stretches(good[row, k] & free[row], foot[row, k], gap):
+                free[row, echoes] = False
                 ends = foot[row, k, echoes[[0, -1]]]
-                yield Candidate(
-                    rho=float(rho[row, k]),
-                    theta=float(theta[row, k]),
-                    segment=_segment(float(rho[row, k]), float(theta[row, k]), ends),
-                    votes=int(lines.votes[row, k]),
-                    echoes=np.sort(echoes),
-                )
-
+                line = float(rho[row, k]), float(theta[row, k])
+                walls[row].append(Candidate(*line, _segment(*line, ends), int(lines.votes[row, k]), np.sort(echoes)))
     return walls
 
 

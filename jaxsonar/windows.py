@@ -149,7 +149,7 @@ def moved(pose: Float[np.ndarray, "scans 3"]) -> Bool[np.ndarray, " scans"]:
 
     A robot that waits hears the same echoes again and again; that must not weigh more than what it heard on its way.
     """
-    known = np.isfinite(pose).all(axis=1)
+    known = np.all(np.isfinite(pose), axis=1)
     step = np.zeros(len(pose))
     both = known[1:] & known[:-1]
     difference = np.where(both[:, None], np.diff(pose, axis=0), 0.0)
@@ -178,7 +178,7 @@ def _stretches(
     pose: Float[np.ndarray, "scans 3"], length: float
 ) -> tuple[Int[np.ndarray, " windows"], Int[np.ndarray, " windows"]]:
     """First and last scan of every window: each reaches back by ``length`` from its last pose."""
-    known = np.isfinite(pose).all(axis=1)
+    known = np.all(np.isfinite(pose), axis=1)
     begins, lasts = [], []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]])))
     for start, stop in edges.reshape(-1, 2):  # runs of scans with poses

@@ -16,6 +16,8 @@ from .extraction import lines_of_scan as lines_of_scan
 from .extraction import occupied_cells as occupied_cells
 from .extraction import points_of_widest_arc as points_of_widest_arc
 from .extraction import ring_arcs as ring_arcs
+from .fitting import Fits as Fits
+from .fitting import fit_candidates as fit_candidates
 from .geometry import edge_range as edge_range
 from .geometry import fold_line as fold_line
 from .geometry import normal as normal
@@ -30,10 +32,8 @@ from .hough import full_wall_votes as full_wall_votes
 from .hough import lowpass as lowpass
 from .hough import soft_accumulate as soft_accumulate
 from .hough import theta_row as theta_row
+from .merging import merged_lines as merged_lines
+from .merging import occupied_by_lines as occupied_by_lines
 from .paths import EchoPaths as EchoPaths
 from .paths import Sensors as Sensors
 from .paths import echo_paths as echo_paths
-from .fitting import Fits as Fits
-from .fitting import fit_candidates as fit_candidates
-from .merging import merged_lines as merged_lines
-from .merging import occupied_by_lines as occupied_by_lines

