@@ -21,14 +21,14 @@ Item = TypeVar("Item")
 def demo(options: argparse.Namespace) -> None:
     """``jaxsonar demo``."""
     from .demo import PAPER, RANDOM_ROOMS, run_demo, summary
-    from .tables import deviation_table
+    from .tables import deviation_table, map_table
 
     with _bar("rooms", RANDOM_ROOMS) as show:
-        rows = run_demo(Path(options.output), seed=options.seed, on_step=_say, on_room=show)
-    Console(width=None if sys.stdout.isatty() else 140).print(
-        deviation_table([(name, summary(row)) for name, row in rows], paper=PAPER)
-    )
-    _say(f"map of segments: {options.output}/6-segments.svg; lines: {options.output}/lines.jsonl")
+        rows, maps = run_demo(Path(options.output), seed=options.seed, on_step=_say, on_room=show)
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    console.print(deviation_table([(name, summary(row)) for name, row in rows], paper=PAPER))
+    console.print(map_table(maps))
+    _say(f"all of it: {options.output}/index.html; the map: {options.output}/map.geojson")
 
 
 def lines(options: argparse.Namespace) -> None:
@@ -178,7 +178,7 @@ def reference(options: argparse.Namespace) -> None:
     if options.figure:
         from . import figures, figures_map
 
-        figures.save(figures_map.reference_figure(walls, points), options.figure)
+        figures.save(figures_map.laser_figure(walls, points), options.figure)
 
 
 def evaluate(options: argparse.Namespace) -> None:

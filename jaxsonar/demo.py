@@ -1,4 +1,4 @@
-"""The demo: the embedded office and 200 random poses, high-resolution ring against a conventional one."""
+"""The demo: the embedded office and its map, and 200 random poses, high-resolution ring against a conventional one."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -7,15 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
-from . import figures, figures_map, figures_scan
-from .deviations import Deviations, compare, pooled
+from . import figures
+from .demo_page import draw, write_page
+from .deviations import CLEAR_ECHOES, GATE_RHO, GATE_THETA, Deviations, compare, pooled
+from .evaluation import Evaluation, evaluate, largest, rms
 from .files import atomic_write, make_folder
+from .gridmap import occupancy, save_nav2
 from .local import LocalModel, local_models, settings_for
-from .logs import Log, save_log
+from .logs import save_log
+from .mapfile import save_map
+from .mapping import assemble, gather_evidence
 from .modelfile import save_models
 from .office import Office, load_office
 from .randomrooms import random_pose, random_room
+from .reflections import Kind
 from .ring import Ring
 from .ringfile import save_ring
 from .roomfile import save_room
@@ -38,8 +45,8 @@ def conventional_ring(ring: Ring) -> Ring:
 
 def run_demo(
     output: Path, *, seed: int, on_step: Callable[[str], None], on_room: Callable[[int], None] = lambda done: None
-) -> list[tuple[str, Deviations]]:
-    """Simulate, extract, compare, draw; everything is written to a folder.
+) -> tuple[list[tuple[str, Deviations]], list[dict[str, Any]]]:
+    """Simulate, extract, map, compare, draw; everything is written to a folder.
 
     Args:
         output: the folder; made if it does not exist.
@@ -48,7 +55,7 @@ def run_demo(
         on_room: told how many random rooms are done.
 
     Returns:
-        Rows of the table: what was looked at, and the deviations.
+        Lines of scans: what was looked at, and the deviations. And the rows of the table of maps (``map_summary``).
     """
     make_folder(output)
     office = load_office()
@@ -59,6 +66,22 @@ def run_demo(
     usual = conventional_ring(office.ring)
     usual_simulation = simulate(usual, office.room, office.poses, sigma=SIGMA, seed=seed, max_echoes=1)
     usual_models = list(local_models(usual, usual_simulation.as_log(usual, office.poses)))
+
+    on_step("the map of the office")
+    evidence = gather_evidence(office.ring, log, models)
+    world = assemble(evidence)
+    by_paper = assemble(evidence, merging="paper")
+    grid = occupancy(office.ring, log, walls=world.segments)
+    in_reach = walls_in_reach(simulation, office.room, len(office.poses))
+    maps = [
+        {"what": name}
+        | map_summary(evaluate(segments, office.room.walls, gate_distance=GATE_RHO, gate_angle=GATE_THETA), in_reach)
+        for name, segments in (
+            ("aggregated, of 17 scans", evidence.pieces.segments),
+            ("merged as in the paper", by_paper.segments),
+            ("the map", world.segments),
+        )
+    ]
 
     on_step(f"{RANDOM_ROOMS * POSES_PER_ROOM} random poses in {RANDOM_ROOMS} random rooms")
     rows = [
@@ -75,12 +98,49 @@ def run_demo(
     save_log(log, output / "office.csv")
     save_models(models, output / "lines.jsonl")
     save_settings(settings_for(office.ring, None), output / "lines.settings.toml")
-    with atomic_write(output / "table.json") as file:
-        json.dump([{"what": name, **summary(row)} for name, row in rows], file, indent=1)
-    for name, figure in _figures(office, log, models):
+    save_map(world, output / "map.geojson")
+    save_nav2(grid, output / "map.yaml")
+    line_rows = [{"what": name, **summary(row)} for name, row in rows]
+    for name, table in (("table", line_rows), ("map-table", maps)):
+        with atomic_write(output / f"{name}.json") as file:
+            json.dump(table, file, indent=1)
+    drawn = draw(office, log, models, world, grid)
+    for name, figure in drawn.items():
         figures.save(figure, output / f"{name}.svg")
         figures.save(figure, output / f"{name}.png")
-    return rows
+    write_page(output / "index.html", drawn, line_rows, maps, paper=PAPER)
+    return rows, maps
+
+
+def walls_in_reach(simulation: Simulation, room: Room, scans: int) -> Bool[np.ndarray, " walls"]:
+    """Walls with so many echoes in one of the scans that it should show them."""
+    plane = simulation.kind == Kind.PLANE
+    heard = np.zeros((scans, len(room.walls)), dtype=np.int64)
+    np.add.at(heard, (simulation.scan[plane], simulation.reflector[plane]), 1)
+    return np.any(heard >= CLEAR_ECHOES, axis=0)
+
+
+def map_summary(row: Evaluation, in_reach: Bool[np.ndarray, " walls"]) -> dict[str, Any]:
+    """The numbers of one row of the table of maps; None where there is nothing to measure.
+
+    Args:
+        row: segments against walls.
+        in_reach: which of the walls can be in a map.
+    """
+    matched = row.segment_matched >= row.segment_length / 2
+    some = len(row.distance) > 0
+    return {
+        "sigma_mm": SIGMA * 1e3,
+        "segments": len(matched),
+        "false": int((~matched).sum()),
+        "length_m": float(row.segment_length.sum()),
+        "walls": int(in_reach.sum()),
+        "walls_found": int(in_reach[np.unique(row.reference)].sum()),
+        "rho_max_mm": largest(row.distance) * 1e3 if some else None,
+        "rho_rms_mm": rms(row.distance) * 1e3 if some else None,
+        "theta_max_deg": float(np.degrees(largest(row.angle))) if some else None,
+        "theta_rms_deg": float(np.degrees(rms(row.angle))) if some else None,
+    }
 
 
 def summary(row: Deviations) -> dict[str, Any]:
@@ -136,14 +196,3 @@ def _random_rows(
     what = f"{RANDOM_ROOMS * POSES_PER_ROOM} random poses"
     yield what, pooled(full)
     yield f"{what}, conventional ring", pooled(conventional)
-
-
-def _figures(office: Office, log: Log, models: list[LocalModel]) -> Iterator[tuple[str, Any]]:
-    """The paper's figures 1 to 4, the accumulator, and the segments of all scans (figure 6)."""
-    ring, room, pose = office.ring, office.room, office.poses[0]
-    yield "1-ring", figures_scan.ring_figure(ring)
-    yield "2-reference", figures_scan.reference_figure(room, pose, ring=ring)
-    yield "3-arcs", figures_scan.arcs_figure(ring, log[0], room=room, pose=pose)
-    yield "4-lines", figures_scan.lines_figure(ring, log[0], models[0], room=room, pose=pose)
-    yield "5-accumulator", figures_scan.accumulator_figure(ring, log[0], models[0])
-    yield "6-segments", figures_map.aggregate_figure(ring, models, office.poses, room=room)

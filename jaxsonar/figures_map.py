@@ -185,7 +185,7 @@ def map_figure(
     return finish(figure, axes, handles, width=8.4)
 
 
-def reference_figure(
+def laser_figure(
     walls: Float[np.ndarray, "walls 2 2"] | PolygonalModel, points: Float[np.ndarray, "points 2"]
 ) -> Figure:
     """Walls from a laser over its points: of a whole run, or the polygonal model of one scan (paper, figure 2).

@@ -79,14 +79,6 @@ def ring_figure(ring: Ring, *, transmitter: int = 0, reach: float | None = None)
     return finish(figure, axes, handles)
 
 
-def reference_figure(room: Room, pose: Float[np.ndarray, "3"], *, ring: Ring) -> Figure:
-    """The true walls around the robot (paper, figure 2, from the room instead of a laser)."""
-    figure, axes = plan("Reference: the true walls")
-    draw_walls(axes, room)
-    draw_robot(axes, ring, pose)
-    return finish(figure, axes, [wall_handle(), *pole_handles(room), robot_handle()])
-
-
 def arcs_figure(
     ring: Ring, scan: Scan, *, room: Room | None = None, pose: Float[np.ndarray, "3"] | None = None
 ) -> Figure:

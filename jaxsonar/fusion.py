@@ -123,9 +123,9 @@ def _neighbors(pieces: Pieces, gap: float, *, nearest: int | None) -> Int[np.nda
         pairs = tree.query_pairs(reach, output_type="ndarray")
     else:
         _, other = tree.query(points, k=min(nearest, len(points)), distance_upper_bound=reach)
-        one = np.repeat(np.arange(len(points)), other.shape[1])
-        found = other.ravel() < len(points)
-        pairs = np.stack([one[found], other.ravel()[found]], axis=-1)
+        other = np.asarray(other).reshape(len(points), -1)
+        one, rank = np.nonzero(other < len(points))
+        pairs = np.stack([one, other[one, rank]], axis=-1)
     pairs = np.sort(piece[pairs], axis=1)
     pairs = pairs[pairs[:, 0] < pairs[:, 1]]
     flat = np.unique(pairs[:, 0] * len(pieces) + pairs[:, 1])

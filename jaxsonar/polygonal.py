@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.hardware.errors import SonarError
 
+from .poses import to_world
 from .rooms import cross, crossings
 
 JOIN = 0.2
@@ -26,6 +27,12 @@ class PolygonalModel:
     """From the end of a segment to the start of the next one where they do not meet: the border of what was visible."""
     intersections: Float[np.ndarray, "intersections 2"] = field(default_factory=lambda: np.zeros((0, 2)))
     """Where neighboring segments meet, metres."""
+
+    def moved(self, pose: Float[np.ndarray, "3"]) -> "PolygonalModel":
+        """The same model in the frame in which its own has this pose: x, y (metres), theta (radians)."""
+        return PolygonalModel(
+            to_world(pose, self.segments), to_world(pose, self.pseudo), to_world(pose, self.intersections)
+        )
 
 
 def polygonal_model(

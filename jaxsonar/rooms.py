@@ -137,6 +137,25 @@ def lines_in(
     return np.abs(rho), wrap_angle(theta)
 
 
+def ranges_in(
+    room: Room, pose: Float[np.ndarray, " 3"], bearing: Float[np.ndarray, " beams"]
+) -> Float[np.ndarray, " beams"]:
+    """How far a laser at a pose sees along each beam, metres; NaN where it meets no wall.
+
+    Args:
+        room: walls in the world frame.
+        pose: world_from_laser: x, y (metres), theta (radians).
+        bearing: directions of the beams in the laser's frame, radians.
+    """
+    angle = pose[2] + bearing
+    beam = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    rays = np.stack([np.broadcast_to(pose[:2], beam.shape), pose[:2] + beam], axis=1)
+    way, share = crossings(rays, room.walls)
+    meets = (way > 0) & (share >= 0) & (share <= 1)  # False for NaN, a parallel wall
+    nearest = np.where(meets, way, np.inf).min(axis=1, initial=np.inf)
+    return np.where(np.isfinite(nearest), nearest, np.nan)
+
+
 def cross(u: Float[np.ndarray, "*#batch 2"], v: Float[np.ndarray, "*#batch 2"]) -> Float[np.ndarray, "..."]:
     """Cross product of vectors in the plane: positive where v is counter-clockwise from u."""
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]

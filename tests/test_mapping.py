@@ -336,7 +336,7 @@ def test_the_papers_merging_finds_the_offices_walls_too(office, office_logs):
         hits = on_walls(
             build_map(office.ring, log, merging="paper"), office.room.walls, across=0.1, angle=0.15, beyond=0.3
         )
-        assert hits[:, well_heard(sim, office.room, 17)].any(axis=0).mean() > 0.8
+        assert hits[:, well_heard(sim, office.room, 17)].any(axis=0).mean() > 0.6
 
 
 SHELL = [[[-2.5, -2.2], [2.5, -2.2]], [[2.5, -2.2], [2.5, 2.2]], [[2.5, 2.2], [-2.5, 2.2]], [[-2.5, 2.2], [-2.5, -2.2]]]
@@ -354,20 +354,22 @@ def heard(walls, poses, *, seed, ring=RING):
     return simulate(ring, room, poses, sigma=SIGMA, seed=seed).as_log(ring, poses)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("count", "rounds"), [(28, 2), (112, 1)])
 @pytest.mark.parametrize("thing", [BOX, CHAIR], ids=["box", "chair"])
-def test_what_is_gone_leaves_the_map_and_what_is_new_enters_it(thing, seed):
-    """The same way twice: the thing is there only the first time, only the second time, always."""
-    poses = around()
-    full = [heard([*SHELL, *thing], poses, seed=2 * seed), heard([*SHELL, *thing], poses, seed=2 * seed + 1)]
-    free = [heard(SHELL, poses, seed=2 * seed), heard(SHELL, poses, seed=2 * seed + 1)]
+def test_what_is_gone_leaves_the_map_and_what_is_new_enters_it(thing, count, rounds):
+    """The same way twice: the thing is there only in the first half of the scans, only in the second, always."""
+    poses = np.concatenate([around(count)] * rounds)
+    full = [heard([*SHELL, *thing], poses, seed=seed) for seed in (0, 1)]
+    free = [heard(SHELL, poses, seed=seed) for seed in (0, 1)]
     shell, sides = np.array(SHELL), np.array(thing)
-    for first, second, there in [(full[0], free[1], False), (free[0], full[1], True), (full[0], full[1], True)]:
+    for first, second, there in [(free[0], full[1], True), (full[0], full[1], True), (full[0], free[1], False)]:
         world = build_map(RING, one_after_another(first, second))
         hits = on_walls(world, sides, across=0.1, angle=0.3, beyond=0.3)
-        assert hits.any(axis=0).all() == there
-        assert there or not hits.any(), world.segments[hits.any(axis=1)].round(2).tolist()
         assert (on_walls(world, shell).sum(axis=0) == 1).all()
+        if there:
+            assert hits.any(axis=0).all()
+        else:
+            assert not hits.any(), world.segments[hits.any(axis=1)].round(2).tolist()
 
 
 DRIVE = np.column_stack([np.arange(-2.0, 2.01, 0.25), np.full(17, -1.0), np.zeros(17)])
