@@ -25,29 +25,42 @@ REACH = 1.5
 """Metres that a wall may go on unseen to the corner that it ends in."""
 
 
-def without_points(walls: Pieces) -> Pieces:
-    """The walls without the lines that corners, edges and poles leave.
+def without_corners(pieces: Pieces, walls: Pieces) -> Pieces:
+    """The pieces without the lines that corners and edges of the walls leave.
 
-    A point answers to every pose, and its line is always square to the line of sight: short lines with different
-    directions at one place are a point. So is a short line where two walls meet, or one ends, in neither's direction.
+    A corner answers like a wall that stands square to the line of sight, and its line passes through it: short lines
+    where two walls meet, or one ends, in neither's direction.
     """
-    long = np.flatnonzero(walls.length >= LONG)
-    short = np.flatnonzero(walls.length < LONG)
-    if not len(short):
-        return walls
-    ghost = np.zeros(len(walls), dtype=bool)
+    long, short = np.flatnonzero(walls.length >= LONG), np.flatnonzero(pieces.length < LONG)
     vertex, owners = _vertices(walls, long)
-    tree = KDTree(walls.centre[short])
-    for near, place in zip(tree.query_ball_point(vertex, NEAR), range(len(vertex)), strict=True):
-        candidates = short[near]
-        turn = _turn(walls.theta[candidates][:, None], walls.theta[owners[place]][None])
-        free_end = owners[place, 0] == owners[place, 1]
-        square = free_end & (np.abs(turn - np.pi / 2) < SQUARE)
-        ghost[candidates[((turn > TURNED) & ~square).all(axis=1)]] = True
-    pairs = tree.query_pairs(NEAR, output_type="ndarray")
-    a, b = short[pairs.reshape(-1, 2).T]
-    crossed = _turn(walls.theta[a], walls.theta[b]) > TURNED
-    ghost[a[crossed]] = ghost[b[crossed]] = True
+    ghost = np.zeros(len(pieces), dtype=bool)
+    if not len(vertex) or not len(short):
+        return pieces
+    near = KDTree(vertex).query_ball_point(pieces.centre[short], NEAR)
+    piece = short[np.repeat(np.arange(len(short)), [len(found) for found in near])]
+    place = np.array([k for found in near for k in found], dtype=np.int64)
+    turn = _turn(pieces.theta[piece][:, None], walls.theta[owners[place]])
+    free_end = owners[place, 0] == owners[place, 1]
+    square = free_end & (np.abs(turn[:, 0] - np.pi / 2) < SQUARE)
+    other = np.all(turn > TURNED, axis=1) & ~square
+    ghost[piece[other]] = True
+    along = ~np.all(turn > TURNED, axis=1) & ~free_end
+    ghost[piece[along]] = False  # in the direction of a wall that meets another here
+    return pieces.take(~ghost)
+
+
+def without_points(walls: Pieces) -> Pieces:
+    """The walls without the lines that poles leave: short ones with different directions at one place.
+
+    A point answers to every pose, and its line is always square to the line of sight.
+    """
+    short = np.flatnonzero(walls.length < LONG)
+    ghost = np.zeros(len(walls), dtype=bool)
+    if len(short) > 1:
+        pairs = KDTree(walls.centre[short]).query_pairs(NEAR, output_type="ndarray")
+        a, b = short[pairs.reshape(-1, 2).T]
+        crossed = _turn(walls.theta[a], walls.theta[b]) > TURNED
+        ghost[a[crossed]] = ghost[b[crossed]] = True
     return walls.take(~ghost)
 
 

@@ -18,7 +18,7 @@ from .echoes import FlatEchoes
 from .logs import Log, Scan
 from .ring import Ring
 from .verification import verified
-from .windows import Windows, gather
+from .windows import Windows, check_window, gather
 
 METHODS = ("hough",)
 """How lines are found; hough is the paper's way."""
@@ -129,6 +129,7 @@ def local_models(
         SonarError: a sensor number that the ring does not have, an unknown method, a window that is not positive.
     """
     check_method(method)
+    check_window(window)
     settings = settings_for(ring, settings, window=window)
     if window is None:
         echoes, left_out = FlatEchoes.from_log(ring, log)

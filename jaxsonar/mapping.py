@@ -12,7 +12,7 @@ from jaxsonar.hardware.errors import SonarError
 
 from .echoes import FlatEchoes
 from .fusion import fuse
-from .ghosts import openings, trim, without_points
+from .ghosts import openings, trim, without_corners, without_points
 from .local import LocalModel, local_models
 from .logs import Log
 from .maps import GlobalMap
@@ -166,7 +166,8 @@ def assemble(evidence: Evidence, *, merging: str = "fused", confirmed: int = CON
     pieces = trim(pieces, wall_of, seen)
     walls, _ = fuse(pieces, gap=evidence.gap)
     # Corners and poles answer like walls, from every pose in another direction.
-    walls = without_points(walls)
+    pieces = without_corners(pieces, walls)
+    walls = without_points(fuse(pieces, gap=evidence.gap)[0])
     walls = walls.take(walls.count >= confirmed)
     # A wall goes on behind what hides it, but not across an opening that something was seen through.
     walls, _ = fuse(walls, gap=BRIDGE, opening=lambda gaps, theta: openings(gaps, theta, pieces, seen))

@@ -19,6 +19,8 @@ OVERLAP = 2
 """Every echo enters this many windows: a wall that one window cuts off lies in the middle of the next."""
 RENEWAL = 2
 """A reading that stays the same is taken to be renewed with every second scan."""
+LENGTHS = (0.01, 100.0)
+"""Metres; the shortest and the longest window."""
 SAME_PLACE, SAME_HEADING = 0.01, float(np.radians(1.0))
 """Metres and radians; scans within one such step of the path are taken in one place."""
 LEAST_GAP = 0.4
@@ -140,8 +142,9 @@ def _windows(
 
 def check_window(length: float | None) -> None:
     """Raise a SonarError for a window that is no length."""
-    if length is not None and not 0 < length < np.inf:
-        raise SonarError(f"window = {length:g} m; allowed is a length above 0")
+    low, high = LENGTHS
+    if length is not None and not low <= length <= high:  # False for NaN
+        raise SonarError(f"window = {length:g} m; allowed is {low:g} to {high:g} m")
 
 
 def moved(pose: Float[np.ndarray, "scans 3"]) -> Bool[np.ndarray, " scans"]:
@@ -166,11 +169,11 @@ def renewed(flat: FlatEchoes) -> Bool[np.ndarray, " echoes"]:
     """
     order = np.lexsort((flat.scan, flat.reported, flat.path))
     path, reported, scan = flat.path[order], flat.reported[order], flat.scan[order]
-    repeats = (path[1:] == path[:-1]) & (reported[1:] == reported[:-1]) & (scan[1:] == scan[:-1] + 1)
-    row = np.arange(len(order))
-    run = np.maximum.accumulate(np.where(np.append(False, repeats), 0, row)) if len(order) else row
+    same = (path[1:] == path[:-1]) & (reported[1:] == reported[:-1])
+    begins = np.append(True, ~(same & (np.diff(scan) <= 1)))[: len(order)]  # 0: it came twice in one scan
+    first = np.maximum.accumulate(np.where(begins, np.arange(len(order)), 0)) if len(order) else order
     fresh = np.ones(len(order), bool)
-    fresh[order] = (row - run) % RENEWAL == 0
+    fresh[order] = (scan - scan[first]) % RENEWAL == 0
     return fresh
 
 
@@ -183,8 +186,8 @@ def _stretches(
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]])))
     for start, stop in edges.reshape(-1, 2):  # runs of scans with poses
         way = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[start:stop, :2], axis=0).T)))
-        goals = np.arange(1, int(way[-1] // (length / OVERLAP)) + 1) * (length / OVERLAP)
-        last = np.unique(np.append(np.searchsorted(way, goals), stop - start - 1))
+        last = np.append(np.flatnonzero(np.diff(way // (length / OVERLAP)) > 0) + 1, stop - start - 1)
+        last = np.unique(last)
         begins.append(start + np.searchsorted(way, way[last] - length))
         lasts.append(start + last)
     nothing = np.zeros(0, np.int64)

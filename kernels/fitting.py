@@ -123,8 +123,9 @@ def fit(
 
 
 def plane(line: Float[Array, "2"], echo: Heard) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Range of a wall (rho, theta), and the direction it is heard from."""
-    return plane_range(line[0], line[1], echo.tx, echo.rx), line[1]
+    """Range of a wall (rho, theta), and the direction it is heard from: a robot that has passed it hears its back."""
+    ahead = line[0] - (echo.tx + echo.rx) / 2 @ normal(line[1])
+    return plane_range(line[0], line[1], echo.tx, echo.rx), jnp.where(ahead >= 0, line[1], line[1] + jnp.pi)
 
 
 def corner(place: Float[Array, "2"], echo: Heard) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -1,5 +1,6 @@
 """Corners, poles and what is no longer there leave the map; walls and openings stay. Pieces are built by hand."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -49,10 +50,8 @@ def answer_of(point, pose, *, half=0.15, **about):
 
 
 def moved(pieces, turn, shift):
-    columns = {name: getattr(pieces, name) for name in pieces.__dataclass_fields__}
-    columns["centre"] = pieces.centre @ rotation(turn).T + shift
-    columns["theta"] = oracles.wrap(pieces.theta + turn)
-    return Pieces(**columns)
+    theta = oracles.wrap(pieces.theta + turn)
+    return dataclasses.replace(pieces, centre=pieces.centre @ rotation(turn).T + shift, theta=theta)
 
 
 def echoes_of(pieces):
@@ -62,8 +61,7 @@ def echoes_of(pieces):
 
 def numbered(parts):
     joined = join(parts)
-    columns = {name: getattr(joined, name) for name in joined.__dataclass_fields__}
-    return Pieces(**(columns | {"echoes": np.arange(len(joined)) + 100}))
+    return dataclasses.replace(joined, echoes=np.arange(len(joined)) + 100)
 
 
 ROOM_CORNER = [
@@ -95,7 +93,7 @@ def test_the_lines_of_a_pole_go(seed):
     pole = rng.uniform(-3, 3, 2)
     poses = pole + np.stack([np.cos(angle), np.sin(angle)], axis=-1) * rng.uniform(0.6, 1.8, (len(angle), 1))
     lines = [answer_of(pole + rng.normal(0, 0.01, 2), pose) for pose in poses]
-    far = piece(pole + (1.0, 1.0), pole + (1.0, 2.5))
+    far = piece(pole + 1.0, pole + np.array([1.0, 2.5]))
     walls = numbered([far, *lines])
     walls = moved(walls.take(rng.permutation(len(walls))), rng.uniform(-4, 4), rng.uniform(-5, 5, 2))
     assert echoes_of(without_points(walls)) == [100]
@@ -151,11 +149,12 @@ def test_a_corner_beyond_the_seen_end_of_its_wall_goes():
     beside = piece((2.945, 1.91), (3.392, 1.939), seen_from=(3.1, 0.7))
     corner = piece((2.826, 2.066), (3.036, 1.976), seen_from=(2.4, 0.6))  # true corner: (2.916, 2.028)
     walls = numbered([door, beside, corner])
-    moved_on = Pieces(**{name: getattr(walls, name) for name in walls.__dataclass_fields__} | {
-        # The centre of a sum is where its line is known best, not the middle between its ends.
-        "centre": walls.centre + np.array([[0, 0], [0, 0], [0.016, -0.007]]),
-        "ends": walls.ends + np.array([[0], [0], [0.0175]]),
-    })  # fmt: skip
+    # The centre of a sum is where its line is known best, not the middle between its ends.
+    moved_on = dataclasses.replace(
+        walls,
+        centre=walls.centre + np.array([[0, 0], [0, 0], [0.016, -0.007]]),
+        ends=walls.ends + np.array([[0], [0], [0.0175]]),
+    )
     assert echoes_of(without_points(walls)) == [100, 101]
     assert echoes_of(without_points(moved_on)) == [100, 101]
 

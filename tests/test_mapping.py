@@ -16,7 +16,7 @@ from jaxsonar.poses import rotation
 from jaxsonar.simulate import Kind
 
 SIGMA = 0.003
-SEEDS = range(6)
+SEEDS = range(5)
 ON_WALL, ON_ANGLE, BEYOND = 0.06, math.radians(6.0), 0.12
 """Metres across, radians, and metres beyond its ends by which a segment may be off the wall that it is."""
 RING = Ring.circular()
@@ -112,14 +112,14 @@ def well_heard(sim, room, scans, *, least=8):
     return np.flatnonzero((counts >= least).sum(axis=0) >= CONFIRMED)
 
 
-def covered(world, line, *, within=0.08, angle=math.radians(15)):
+def covered(world, line, *, within=0.08):
     """How much of a line from point to point has a segment of the map along it, metres."""
     near = shapely.LineString(line).buffer(within, cap_style="flat")
     direction = math.atan2(*(np.subtract(line[1], line[0]))[::-1])
     total = 0.0
     for segment in world.segments:
         turn = math.atan2(*(segment[1] - segment[0])[::-1]) - direction
-        if abs(oracles.wrap(2 * turn)) / 2 < angle:
+        if abs(oracles.wrap(2 * turn)) / 2 < math.radians(15):
             total += shapely.LineString(segment).intersection(near).length
     return total
 
@@ -375,7 +375,7 @@ def test_what_is_gone_leaves_the_map_and_what_is_new_enters_it(thing, count, rou
 DRIVE = np.column_stack([np.arange(-2.0, 2.01, 0.25), np.full(17, -1.0), np.zeros(17)])
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("behind", [None, 0.3, 0.8])
 def test_an_open_door_stays_open(behind, seed):
     """A wall with a gap of 0.9 m; behind it nothing within range, or a wall that is seen through the gap."""

@@ -96,7 +96,7 @@ def test_what_was_never_seen_through_is_not_told(rng):
     assert seen.look(np.zeros((0, 2)), np.zeros(0)).shape == (0, LATEST)
 
 
-@settings(max_examples=30)
+@settings(max_examples=8)
 @given(st.integers(0, 10_000), st.lists(st.integers(0, 120), min_size=3, max_size=3))
 def test_joining_is_a_sum(seed, counts):
     """Commutative, associative, neutral with nothing, and the same as including all at once."""
