@@ -1,4 +1,9 @@
+from .evaluation import Evaluation as Evaluation
+from .evaluation import evaluate as evaluate
 from .hardware.errors import SonarError as SonarError
+from .incremental import Mapper as Mapper
+from .incremental import MapState as MapState
+from .incremental import StepInfo as StepInfo
 from .kernels.hough import HoughSettings as HoughSettings
 from .local import Line as Line
 from .local import Lines as Lines
@@ -10,6 +15,10 @@ from .logs import Log as Log
 from .logs import Scan as Scan
 from .logs import load_log as load_log
 from .logs import save_log as save_log
+from .mapfile import load_map as load_map
+from .mapfile import save_map as save_map
+from .mapping import build_map as build_map
+from .maps import GlobalMap as GlobalMap
 from .randomrooms import random_pose as random_pose
 from .randomrooms import random_room as random_room
 from .ring import Ring as Ring

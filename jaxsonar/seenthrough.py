@@ -89,7 +89,7 @@ def silence(
     scan: Int[np.ndarray, " echoes"],
     path: Int[np.ndarray, " echoes"],
     reach: Float[np.ndarray, " echoes"],
-    walls: Sequence[Float[np.ndarray, "walls 2 2"]],
+    walls: Sequence[Float[np.ndarray, "_ 2 2"]],
 ) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, " cells"]]:
     """Where each scan would have heard a wall and did not: (cell x, cell y, direction), and whose scan it was.
 

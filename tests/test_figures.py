@@ -27,6 +27,7 @@ from jaxsonar import (
 from jaxsonar.gridmap import FREE, OCCUPIED, UNKNOWN
 from jaxsonar.maps import GlobalMap
 from jaxsonar.office import load_office
+from jaxsonar.polygonal import PolygonalModel
 
 BUMPER = Ring(
     [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
@@ -114,7 +115,6 @@ CASES = {
 DRAW = {
     "ring": lambda case: figures_scan.ring_figure(case.ring),
     "last sensor fires": lambda case: figures_scan.ring_figure(case.ring, transmitter=case.ring.count - 1, reach=0.9),
-    "reference": lambda case: figures_scan.reference_figure(case.room, case.pose, ring=case.ring),
     "arcs": lambda case: figures_scan.arcs_figure(case.ring, case.scan),
     "arcs in the room": lambda case: figures_scan.arcs_figure(case.ring, case.scan, room=case.room, pose=case.pose),
     "lines": lambda case: figures_scan.lines_figure(case.ring, case.scan, case.model),
@@ -145,6 +145,10 @@ DRAW = {
         reference=case.room.walls + 0.1,
         laser_points=case.room.walls.reshape(-1, 2),
         title="All",
+    ),
+    "laser": lambda case: figures_map.laser_figure(case.room.walls, case.room.walls.reshape(-1, 2)),
+    "laser scan": lambda case: figures_map.laser_figure(
+        PolygonalModel(case.room.walls, case.room.walls + 0.2, case.room.walls[:, 0]), case.room.walls[:, 1]
     ),
     "grid": lambda case: figures_map.grid_figure(GRID, resolution=0.1, origin=(-1.0, 2.0)),
     "grid and map": lambda case: figures_map.grid_figure(GRID, resolution=0.1, origin=(-1.0, 2.0), world=a_map(case)),

@@ -63,9 +63,7 @@ def size_of(state):
     return sum(array.nbytes for array in arrays_of(state))
 
 
-@pytest.mark.parametrize(
-    ("order", "merging"), [("driven", "fused"), ("reversed", "fused"), ("shuffled", "fused"), ("shuffled", "paper")]
-)
+@pytest.mark.parametrize(("order", "merging"), [("driven", "fused"), ("shuffled", "fused"), ("shuffled", "paper")])
 def test_scan_by_scan_is_all_at_once(office, order, merging):
     log = office_log(office)
     rows = {
@@ -87,7 +85,7 @@ def test_every_map_on_the_way_is_that_of_the_scans_so_far(office):
     for scan in log:
         states.append(mapper.step(states[-1], scan)[0])
     bytes_before = [[array.tobytes() for array in arrays_of(state)] for state in states]
-    for k in (0, 1, 2, 5, 11, 17):
+    for k in (0, 1, 5, 17):
         assert_same_map(mapper.map(states[k]), build_map(RING, log[:k]))
     assert [[array.tobytes() for array in arrays_of(state)] for state in states] == bytes_before
 
@@ -165,14 +163,14 @@ CORRIDOR = Room(
 
 
 def corridor_log(seed=0):
-    x = np.arange(0, 7.0, 0.06)
+    x = np.arange(0, 5.0, 0.1)
     poses = np.column_stack([x, 0.05 * np.sin(x), 0.05 * np.cos(x)])
-    poses[60:70] = poses[60]  # it waits
+    poses[30:36] = poses[30]  # it waits
     ring = load_ring("corridor8")
     return ring, simulate(ring, CORRIDOR, poses, sigma=0.005, seed=seed).as_log(ring, poses)
 
 
-@pytest.mark.parametrize("lost", [(), (0, 30, 31, 80)])
+@pytest.mark.parametrize("lost", [(), (0, 20, 21, 44)])
 def test_windows_scan_by_scan_are_those_of_the_whole_log(lost):
     """Along the path, with a robot that waits, and with poses missing."""
     ring, log = corridor_log()
@@ -184,7 +182,7 @@ def test_windows_scan_by_scan_are_those_of_the_whole_log(lost):
     assert_same_map(came, dataclasses.replace(wanted, scans=came.scans))
     for few, all_ in zip(came.scans, wanted.scans, strict=True):
         assert set(few) <= set(all_)
-    assert sum(info.model is not None for info in infos) >= 5
+    assert sum(info.model is not None for info in infos) >= 3
     assert state.waiting == ()
     assert [k for k, info in enumerate(infos) if info.ignored] == list(lost)
 
@@ -192,7 +190,7 @@ def test_windows_scan_by_scan_are_those_of_the_whole_log(lost):
 def test_finishing_twice_or_with_nothing_changes_nothing():
     ring, log = corridor_log()
     mapper = Mapper(ring=ring, window=2.0)
-    state, _ = driven(mapper, list(log)[:40])
+    state, _ = driven(mapper, list(log)[:22])
     assert mapper.finish(state) is state
     assert len(mapper.map(mapper.finish(mapper.start()))) == 0
     assert mapper.finish(Mapper(ring=RING).start()).evidence.models == 0
@@ -204,12 +202,12 @@ def a_round(number):
         np.array([[[-2, -1.6], [2, -1.6]], [[2, -1.6], [2, 1.6]], [[2, 1.6], [-2, 1.6]], [[-2, 1.6], [-2, -1.6]]])
     )
     rng = np.random.default_rng(number)
-    angle = 2 * math.pi * np.arange(16) / 16
+    angle = 2 * math.pi * np.arange(10) / 10
     poses = np.column_stack([1.0 * np.cos(angle), 0.6 * np.sin(angle), angle + math.pi / 2])
     poses += rng.normal(0, [0.02, 0.02, 0.02], poses.shape)
     log = simulate(RING, room, poses, sigma=0.003, seed=number).as_log(RING, poses)
     return [
-        dataclasses.replace(scan, scan=16 * number + k, stamp=100.0 * number + scan.stamp) for k, scan in enumerate(log)
+        dataclasses.replace(scan, scan=10 * number + k, stamp=100.0 * number + scan.stamp) for k, scan in enumerate(log)
     ]
 
 
@@ -228,7 +226,7 @@ def test_driving_the_same_round_again_needs_no_more_memory():
     assert pieces[10] < 2.5 * pieces[3]
     assert size_of(state) - size_of(state.evidence.seen) < 1_000_000
     assert np.bincount(state.evidence.pieces.scans[0]).max() <= SCANS_KEPT
-    assert state.evidence.models == 160
+    assert state.evidence.models == 100
     world = mapper.map(state)
     assert isinstance(state, MapState)
     assert len(world) == 4

@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import oracles
 import pytest
+import shapely
 
 from jaxsonar import LocalModel, Ring, cli, demo, load_log, load_ring, load_room, local_models, simulate
 from jaxsonar.deviations import GATE_RHO, GATE_THETA, compare
+from jaxsonar.evaluation import evaluate
+from jaxsonar.mapfile import load_map
 from jaxsonar.office import load_office
 from jaxsonar.settings import load_settings
 
@@ -178,10 +181,13 @@ def test_segments_of_true_walls_lie_on_them(office, noisy):
 
 # The demo
 
-FIGURES = ("1-ring", "2-reference", "3-arcs", "4-lines", "5-accumulator", "6-segments")
+FIGURES = (
+    "1-ring", "2-reference", "3-arcs", "4-lines", "4-accumulator", "5-modeling", "6-segments", "7-map", "8-grid",
+)  # fmt: skip
 FILES = {
     *(f"{name}.{suffix}" for name in FIGURES for suffix in ("svg", "png")),
     *("office.csv", "path.csv", "office.geojson", "ring.toml", "lines.jsonl", "lines.settings.toml", "table.json"),
+    *("map.geojson", "map.yaml", "map.pgm", "map-table.json", "index.html"),
 }
 
 
@@ -192,8 +198,8 @@ def written(tmp_path_factory):
     said = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "RANDOM_ROOMS", 2)
-        rows = demo.run_demo(folder, seed=3, on_step=said.append)
-    return folder, rows, said
+        rows, maps = demo.run_demo(folder, seed=3, on_step=said.append)
+    return folder, (rows, maps), said
 
 
 def test_the_demo_writes_what_it_promises(written):
@@ -208,7 +214,7 @@ def test_the_table_holds_numbers(written):
     def refuse(constant):
         raise ValueError(f"{constant} is no JSON")
 
-    folder, rows, _ = written
+    folder, (rows, _), _ = written
     table = json.loads((folder / "table.json").read_text(), parse_constant=refuse)
     assert [row["what"] for row in table] == [name for name, _ in rows]
     assert [row["scans"] for row in table] == [1, 17, 17, 10, 10]
@@ -232,6 +238,37 @@ def test_the_table_holds_numbers(written):
         assert table[full]["walls"] == table[usual]["walls"]
         assert table[full]["recall"] > table[usual]["recall"]
         assert table[full]["echoes_per_scan"] > table[usual]["echoes_per_scan"]
+
+
+def test_the_map_has_one_segment_for_every_wall_in_reach(written, office):
+    """The chair back-rest included, and nothing else; nearer to the truth than the segments it is made of."""
+    folder, (_, maps), _ = written
+    assert json.loads((folder / "map-table.json").read_text()) == maps
+    aggregated, paper, world = maps
+    assert (world["false"], world["segments"], world["walls"], world["walls_found"]) == (0, 8, 8, 8)
+    assert world["rho_rms_mm"] < aggregated["rho_rms_mm"] < paper["rho_rms_mm"]
+    assert world["theta_rms_deg"] < aggregated["theta_rms_deg"]
+    segments = load_map(folder / "map.geojson").segments
+    chair = shapely.LineString(office.room.walls[office.room.wall_names.index(CHAIR)])
+    assert any(shapely.LineString(segment).hausdorff_distance(chair) < 0.1 for segment in segments)
+
+
+def test_the_demos_files_give_its_map_again(written, tmp_path, capsys):
+    folder, _, _ = written
+    again = tmp_path / "again.geojson"
+    call = ["map", str(folder / "office.csv"), "--ring", str(folder / "ring.toml"), "-o", str(again)]
+    assert cli.main([*call, "--grid", str(tmp_path / "map.yaml")]) == 0
+    for mine, name in ((again, "map.geojson"), (tmp_path / "map.pgm", "map.pgm"), (tmp_path / "map.yaml", "map.yaml")):
+        assert mine.read_bytes() == (folder / name).read_bytes()
+    capsys.readouterr()
+
+
+def test_the_page_shows_everything(written):
+    folder, _, _ = written
+    page = (folder / "index.html").read_text()
+    assert page.count("<img") == len(FIGURES)
+    assert page.count("<table") == 2
+    assert "http" not in page.replace("http-equiv", "")
 
 
 def test_the_demos_files_give_its_lines_again(written, tmp_path, capsys):
@@ -276,12 +313,14 @@ def test_the_conventional_ring_hears_itself_only(office):
 
 
 def test_the_demo_command_prints_the_table(tmp_path, capsys, monkeypatch):
-    """With the work itself left out: rows in, table to standard output, the rest to standard error."""
+    """With the work itself left out: rows in, tables to standard output, the rest to standard error."""
     rows = []
+    some = np.array([[[0.0, 0.0], [1.0, 0.0]]])
+    nothing = demo.map_summary(evaluate(np.zeros((0, 2, 2)), some), np.ones(1, dtype=bool))
 
     def quick(output, *, seed, on_step, on_room):
         on_step(f"seed {seed}")
-        return rows
+        return rows, [{"what": "no map at all", **nothing}]
 
     empty = load_office()
     heard = simulate(empty.ring, empty.room, empty.poses[:1], sigma=SIGMA)
@@ -295,6 +334,7 @@ def test_the_demo_command_prints_the_table(tmp_path, capsys, monkeypatch):
     assert cli.main(["demo", "-o", str(tmp_path / "d"), "--seed", "7"]) == 0
     came = capsys.readouterr()
     assert "no line at all" in came.out
+    assert "no map at all" in came.out
     assert "32.3" in came.out
     assert "7.41" in came.out
     assert "nan" not in came.out

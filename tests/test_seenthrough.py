@@ -13,7 +13,7 @@ from jaxsonar import Log, Ring, load_ring, local_models, random_pose, random_roo
 from jaxsonar.mapping import gather_evidence
 from jaxsonar.office import load_office
 from jaxsonar.poses import to_world
-from jaxsonar.seenthrough import CELL, DIRECTIONS, HIDDEN, LATEST, MARGIN, SURE, SeenThrough, silence
+from jaxsonar.seenthrough import CELL, DIRECTIONS, FACING, HIDDEN, LATEST, MARGIN, SURE, SeenThrough, silence
 
 STEP = 2 * math.pi / DIRECTIONS
 RAYS = 9
@@ -136,7 +136,8 @@ def slow_silence(ring, pose, echoes, walls):
     hides = []
     for start, end in walls:
         beyond = HIDDEN * (end - start) / np.linalg.norm(end - start)
-        hides.append(shapely.LineString([start - beyond, end + beyond]))
+        normal = math.atan2(beyond[0], -beyond[1])
+        hides.append((normal, shapely.LineString([start, end]), shapely.LineString([start - beyond, end + beyond])))
     votes = {}
     for path, (tx, rx) in enumerate(ring.paths):
         if tx != rx:
@@ -149,10 +150,11 @@ def slow_silence(ring, pose, echoes, walls):
             theta = pose[2] + first + width * (0.5 + SURE * (k / (RAYS - 1) - 0.5))
             ray = np.array([math.cos(theta), math.sin(theta)])
             sight = shapely.LineString([sensor, sensor + 100 * ray])
-            hidden = min(
-                (shapely.Point(sensor).distance(sight.intersection(wall)) for wall in hides if sight.intersects(wall)),
-                default=math.inf,
-            )
+            # A wall may go on beyond its ends, but whoever faces it there would have heard it.
+            facing = [abs(oracles.wrap(2 * (theta - normal))) / 2 <= FACING for normal, _, _ in hides]
+            met = [seen if faces else guessed for faces, (_, seen, guessed) in zip(facing, hides, strict=True)]
+            met = [sight.intersection(wall) for wall in met if sight.intersects(wall)]
+            hidden = min((shapely.Point(sensor).distance(place) for place in met), default=math.inf)
             distance = CELL / 2
             while distance < SURE * ring.max_range:
                 if distance < min(nearest, hidden) - MARGIN:
@@ -214,9 +216,9 @@ def test_no_echo_at_all_rules_out_the_cones(faw_ring):
     claimed = []
     for _ in range(2000):
         sensor, distance = int(rng.integers(24)), rng.uniform(0.2, 1.2)
-        theta = faw_ring.heading[sensor] + rng.uniform(-0.1, 0.1)
-        point = faw_ring.position[sensor] + distance * np.array([math.cos(theta), math.sin(theta)])
-        claimed.append((sensor, place_of(point, theta) in cells))
+        turn = faw_ring.heading[sensor] + rng.uniform(-0.1, 0.1)
+        point = faw_ring.position[sensor] + distance * np.array([math.cos(turn), math.sin(turn)])
+        claimed.append((sensor, place_of(point, turn) in cells))
     share = [np.mean([hit for which, hit in claimed if which == sensor]) for sensor in range(24)]
     assert np.mean(share) > 0.7
     assert min(share) > 0.4

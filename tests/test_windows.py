@@ -305,7 +305,7 @@ def test_scan_by_scan_windows_of_decimal_steps_end_where_those_of_the_log_do(ste
 
 def test_a_short_window_on_a_long_path_is_as_many_windows_as_scans():
     log = log_of([[(0, 0, 1.0)], [(0, 0, 1.1)], [(0, 0, 1.2)]], straight([10.0, 10.0]))
-    windows, _ = gather(FOUR, log, length=1e-13)
+    windows, _ = gather(FOUR, log, length=0.01)
     assert windows.last.tolist() == [1, 2]
 
 
@@ -400,9 +400,9 @@ def test_hardly_anything_to_gather(readings, poses, last):
 @pytest.mark.parametrize("length", [0.0, -1.0, math.nan, math.inf, -math.inf])
 def test_windows_that_are_no_length_are_refused(length):
     log = a_log(1)
-    with pytest.raises(SonarError, match=r"window = .* m; allowed is a length above 0"):
+    with pytest.raises(SonarError, match=r"window = .* m; allowed is 0.01 to 100 m"):
         gather(FOUR, log, length=length)
-    with pytest.raises(SonarError, match=r"window = .* m; allowed is a length above 0"):
+    with pytest.raises(SonarError, match=r"window = .* m; allowed is 0.01 to 100 m"):
         local_models(FOUR, log, window=length)
 
 
