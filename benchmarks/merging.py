@@ -167,7 +167,7 @@ def main() -> None:
     table = Table(
         title=f"Segments of rooms of {ROOM[0]:g} m x {ROOM[1]:g} m, {options.thick:g} m apart; {EACH} a wall, "
         f"{CLUTTER:.0%} clutter; gap {GAP} m, cut {CUT} m",
-        caption="memory: growth of the process's largest resident set (ru_maxrss); growth: p of n^p from the row above, in "
+        caption="memory: growth of the largest resident set (ru_maxrss); growth: p of n^p from the row above, in "
         f"brackets that of n log n; of > 4: walls made of more than 4 segments. numpy {np.__version__}, "
         f"jax {jax.__version__} on {jax.devices()[0].device_kind}, {os.cpu_count()} cores, "
         f"Python {platform.python_version()}",

@@ -16,10 +16,14 @@ TURNED = float(np.radians(12.0))
 """Radians; lines that differ by more than this have different directions."""
 SQUARE = float(np.radians(10.0))
 """Radians; how far from a right angle a short wall may stand on another."""
-OPENING = 0.15
+OPENING = 0.12
 """Metres of a gap in a wall that must have been seen through for an opening."""
 BEHIND = 0.06
 """Metres behind a wall's line that what is seen through an opening stands."""
+CRUMB = 0.15
+"""Metres; what is left of a piece that was seen through must be longer."""
+BEYOND = 0.15
+"""Metres that a wall may end behind its last foot."""
 _SAMPLES = 16
 REACH = 1.5
 """Metres that a wall may go on unseen to the corner that it ends in."""
@@ -79,7 +83,7 @@ def trim(pieces: Pieces, wall_of: Int[np.ndarray, " pieces"], seen: SeenThrough)
     number = np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts)
     along = pieces.ends[piece, 0] + (number + 0.5) * (pieces.length / parts)[piece]
     place = pieces.centre[piece] + along[:, None] * pieces.tangent[piece]
-    times = seen.look(place, pieces.theta[piece])
+    times = seen.look_around(place, pieces.theta[piece])
     gone = times[:, -1] > pieces.latest[piece]
     suspects = np.flatnonzero(gone)
     if not len(suspects):
@@ -101,7 +105,9 @@ def trim(pieces: Pieces, wall_of: Int[np.ndarray, " pieces"], seen: SeenThrough)
     begin, end = begin[left], end[left]
     width = (pieces.length / parts)[piece[begin]]
     ends = np.column_stack([along[begin] - width / 2, along[end] + width / 2])
-    return _with_ends(pieces, piece[begin], ends)
+    whole = end - begin + 1 == parts[piece[begin]]
+    worth = whole | (ends[:, 1] - ends[:, 0] > CRUMB)
+    return _with_ends(pieces, piece[begin][worth], ends[worth])
 
 
 def openings(
@@ -159,8 +165,9 @@ def _vertices(
 ) -> tuple[Float[np.ndarray, "vertices 2"], Int[np.ndarray, "vertices 2"]]:
     """Where two walls meet or one ends, and which; a wall that ends there is named twice."""
     segments = walls.segments[long]
-    ends = segments.reshape(-1, 2)
-    own = np.repeat(long, 2)
+    outward = BEYOND * walls.tangent[long]
+    ends = np.stack([segments[:, 0], segments[:, 1], segments[:, 0] - outward, segments[:, 1] + outward], axis=1)
+    ends, own = ends.reshape(-1, 2), np.repeat(long, 4)
     if len(long) < 2:
         return ends, np.stack([own, own], axis=-1)
     tree = KDTree(walls.centre[long])

@@ -19,7 +19,7 @@ DIRECTIONS = 24
 """Directions of the normal that are told apart around the full turn."""
 LATEST = 3
 """So many of the latest scans are remembered: what no fewer later ones see through is gone."""
-MARGIN = 0.15
+MARGIN = 0.10
 """Metres that a wall must be nearer than the first echo, to have been missed for certain."""
 SURE = 0.85
 """Share of the cone's width and of the maximum range within which a wall is heard for certain."""
@@ -28,7 +28,7 @@ HIDDEN = 1.0
 FACING = float(np.radians(15.0))
 """Radians; a ray within this of a wall's normal faces the wall."""
 _TILE = 32
-_RAYS = 9
+_RAYS, _POINTS = 17, 33  # of a cone, and on an arc
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +50,25 @@ class SeenThrough:
             found[here] = self.tiles[key][inside[here, 0], inside[here, 1], direction[here]]
         return found
 
+    def look_around(
+        self, points: Float[np.ndarray, "points 2"], theta: Float[np.ndarray, " points"]
+    ) -> Float[np.ndarray, "points latest"]:
+        """As ``look``, but scans that saw through the wall a cell's width further along it count as well.
+
+        The rays of a scan are not as dense as the cells. Where none went through the very place, no neighbor counts.
+        """
+        beside = CELL * np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
+        times = np.concatenate([self.look(points + k * beside, theta) for k in (0, -1, 1)], axis=-1)
+        here = np.isfinite(times[:, :1])
+        times = -np.sort(-np.where(here, np.minimum(times, times[:, :1]), -np.inf), axis=-1)
+        again = np.zeros(times.shape, dtype=bool)
+        again[:, 1:] = times[:, 1:] == times[:, :-1]
+        return -np.sort(-np.where(again, -np.inf, times), axis=-1)[:, :LATEST]
+
     def including(self, cells: Int[np.ndarray, "cells 3"], when: Float[np.ndarray, " cells"]) -> "SeenThrough":
         """With further scans: (cell x, cell y, direction) that each saw through, and when. Order does not matter."""
+        if not len(cells):
+            return self
         tiles = dict(self.tiles)
         tile, inside = np.divmod(cells[:, :2], _TILE)
         order = np.lexsort((-when, cells[:, 2], cells[:, 1], cells[:, 0], tile[:, 1], tile[:, 0]))
@@ -59,9 +76,9 @@ class SeenThrough:
         new = np.ones(len(cells), dtype=bool)
         new[1:] = (np.diff(cells, axis=0) != 0).any(axis=1)
         row = np.arange(len(cells))
-        rank = row - np.maximum.accumulate(np.where(new, row, 0)) if len(row) else row
+        rank = row - np.maximum.accumulate(np.where(new, row, 0))
         late = rank < LATEST
-        edges = np.flatnonzero(np.append(True, (np.diff(tile, axis=0) != 0).any(axis=1))) if len(tile) else []
+        edges = np.flatnonzero(np.append(True, (np.diff(tile, axis=0) != 0).any(axis=1)))
         for first, last in zip(edges, [*edges[1:], len(tile)], strict=True):
             key = (int(tile[first, 0]), int(tile[first, 1]))
             part = np.arange(first, last)[late[first:last]]
@@ -94,7 +111,7 @@ def silence(
     """Where each scan would have heard a wall and did not: (cell x, cell y, direction), and whose scan it was.
 
     Only direct echoes speak: of the places before its first echo that a sensor faces, at least two must agree where two
-    sensors face the same way, and no echo of another path may come from there. What stands behind a wall that the
+    sensors face the same way (within 20 cm), and no echo of another path may come from there. What stands behind a wall that the
     scan itself shows is not judged.
 
     Args:
@@ -126,15 +143,19 @@ def silence(
     claimed = ahead < free[..., None]
     who, sensor_row, ray_row, step = np.nonzero(claimed)
     point = sensor[who, sensor_row] + ahead[step, None] * ray[who, sensor_row, ray_row]
+    # A cell is nearer than the echo only if its middle is.
+    middle = (np.floor(point / CELL) + 0.5) * CELL
+    near = np.linalg.norm(middle - sensor[who, sensor_row], axis=-1) < free[who, sensor_row, ray_row]
+    who, sensor_row, ray_row, point = who[near], sensor_row[near], ray_row[near], point[near]
     claims = (who, *np.floor(point / CELL).astype(np.int64).T, _direction(theta[who, sensor_row, ray_row]))
     # An echo of any path speaks against it, wherever its arc passes.
-    turn = start[path, None] + width[path, None] * np.linspace(0, 1, _RAYS)
+    turn = start[path, None] + width[path, None] * np.linspace(0, 1, _POINTS)
     theta = pose[scan, 2][:, None] + turn
     c, s = np.cos(pose[scan, 2]), np.sin(pose[scan, 2])
     x, y = midpoint[path, 0], midpoint[path, 1]
     origin = pose[scan, :2] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
     ray = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-    distance = reach[:, None] + np.array([-CELL, 0.0, CELL])
+    distance = reach[:, None] + np.array([-CELL / 2, 0.0, CELL / 2])
     point = origin[:, None, None] + distance[:, None, :, None] * ray[:, :, None]
     own = np.broadcast_to(scan[:, None, None], point.shape[:3]).ravel()
     facing = np.broadcast_to(_direction(theta)[..., None], point.shape[:3]).ravel()
@@ -142,11 +163,14 @@ def silence(
 
     code, low, size = _coded(np.concatenate([claims, heard], axis=1))
     count = len(who)
-    seen = np.unique(code[:count] * len(direct) + sensor_row)
-    cells, sensors = np.unique(seen // len(direct), return_counts=True)
-    overlap = width[direct].sum() / (2 * np.pi)
-    cells = cells[sensors >= (2 if overlap >= 2 else 1)]
-    cells = cells[~np.isin(cells, code[count:])]
+    cells = code[:count]
+    if width[direct].sum() >= 2 * 2 * np.pi:  # two sensors face every way; they stand apart, and so do their places
+        x, y = (np.asarray(values) // 2 for values in claims[1:3])
+        around, _, _ = _coded(np.stack([claims[0], x, y, claims[3]]))
+        sensors = np.unique(around * len(direct) + sensor_row) // len(direct)
+        place, agree = np.unique(sensors, return_counts=True)
+        cells = cells[np.isin(around, place[agree >= 2])]
+    cells = np.setdiff1d(cells, code[count:])
     scan_of, x, y, facing = (value + first for value, first in zip(np.unravel_index(cells, size), low, strict=True))
     return np.column_stack([x, y, facing]), scan_of
 

@@ -15,7 +15,7 @@ from jaxsonar.poses import wrap_angle
 
 GAP = 0.5
 SEEDS = st.integers(0, 2**32 - 1)
-SOME = settings(max_examples=20, phases=[Phase.generate])
+SOME = settings(max_examples=10, phases=[Phase.generate])
 """A smaller seed is no simpler one."""
 DOOR, THICK = 0.9, 0.12
 HOUSE = np.array(

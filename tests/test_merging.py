@@ -72,7 +72,7 @@ SETS = [
 
 
 @pytest.mark.parametrize("points", SETS, ids=lambda points: points.__name__)
-@settings(max_examples=40, phases=[Phase.generate])
+@settings(max_examples=25, phases=[Phase.generate])
 @given(seed=SEEDS, n=st.integers(2, 50), cut=st.sampled_from([0.05, 0.4, 2.0]))
 def test_single_linkage_is_that_of_scipy(points, seed, n, cut):
     found = points(np.random.default_rng(seed), n)
@@ -152,7 +152,7 @@ def office(rng, count):
     return pieces_at(centre, turn, length=rng.uniform(0.3, 0.6, count))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_merging_is_the_recipe_of_the_paper(seed):
     rng = np.random.default_rng(seed)
     pieces = office(rng, int(rng.integers(20, 50)))
@@ -167,7 +167,7 @@ def test_merging_is_the_recipe_of_the_paper(seed):
         assert merged.echoes[k] == pieces.echoes[members].sum()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_every_segment_is_in_one_wall(seed):
     pieces = office(np.random.default_rng(seed), 60)
     merged = merge_as_paper(pieces, cut=CUT)
@@ -196,8 +196,7 @@ def test_merging_again_changes_nothing_where_walls_are_well_apart(seed):
     assert same(again, merged.take(np.array(order)))
 
 
-@pytest.mark.parametrize("cells", [0, 1, 13, 50, 77])
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (12.3, -4.5), (1e4, 1e4)])
+@pytest.mark.parametrize(("cells", "shift"), [(0, (12.3, -4.5)), (1, (0.0, 0.0)), (50, (-7.0, 3.0)), (77, (1e4, 1e4))])
 def test_moving_the_world_moves_the_walls_and_nothing_else(cells, shift):
     """Turns by whole cells of theta, which the accumulator cannot tell apart; any shift."""
     pieces = office(np.random.default_rng(4), 40)

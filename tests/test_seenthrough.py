@@ -16,7 +16,7 @@ from jaxsonar.poses import to_world
 from jaxsonar.seenthrough import CELL, DIRECTIONS, FACING, HIDDEN, LATEST, MARGIN, SURE, SeenThrough, silence
 
 STEP = 2 * math.pi / DIRECTIONS
-RAYS = 9
+RAYS, POINTS = 17, 33
 """Rays of a cone, as the code has them; the oracle shares the samples, not the arithmetic."""
 BUMPER = Ring(
     [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
@@ -157,21 +157,26 @@ def slow_silence(ring, pose, echoes, walls):
             hidden = min((shapely.Point(sensor).distance(place) for place in met), default=math.inf)
             distance = CELL / 2
             while distance < SURE * ring.max_range:
-                if distance < min(nearest, hidden) - MARGIN:
-                    votes.setdefault(place_of(sensor + distance * ray, theta), set()).add(path)
+                cell = place_of(sensor + distance * ray, theta)
+                middle = (np.array(cell[:2]) + 0.5) * CELL
+                if max(distance, np.linalg.norm(middle - sensor)) < min(nearest, hidden) - MARGIN:
+                    votes.setdefault(cell, set()).add(path)
                 distance += CELL * 0.7
     against = set()
     for path, reach in echoes:
         middle, first, width = path_geometry(ring, path)
         sensor = to_world(pose, middle)
-        for k in range(RAYS):
-            theta = pose[2] + first + width * k / (RAYS - 1)
-            for distance in (reach - CELL, reach, reach + CELL):
+        for k in range(POINTS):
+            theta = pose[2] + first + width * k / (POINTS - 1)
+            for distance in (reach - CELL / 2, reach, reach + CELL / 2):
                 point = sensor + distance * np.array([math.cos(theta), math.sin(theta)])
                 against.add(place_of(point, theta))
     together = sum(path_geometry(ring, k)[2] for k, (tx, rx) in enumerate(ring.paths) if tx == rx) / (2 * math.pi)
+    around = {}
+    for (x, y, facing), sensors in votes.items():
+        around.setdefault((x // 2, y // 2, facing), set()).update(sensors)
     enough = 2 if together >= 2 else 1
-    return {cell for cell, sensors in votes.items() if len(sensors) >= enough} - against
+    return {(x, y, facing) for x, y, facing in votes if len(around[x // 2, y // 2, facing]) >= enough} - against
 
 
 def quick_silence(ring, poses, echoes, walls):
