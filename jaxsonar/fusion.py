@@ -1,6 +1,7 @@
 """From pieces of walls to walls: pieces that continue or cover one another and agree add up, until none do."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -8,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from .pieces import Pieces, add_up
+from .pieces import Pieces, add_up, unique_pairs
 from .poses import wrap_angle
 
 OFFSET_GATE = 0.06
@@ -42,28 +43,44 @@ def fuse(pieces: Pieces, *, gap: float, opening: Opening | None = None) -> tuple
     Returns:
         The walls, and which of them each piece belongs to.
     """
-    thorough = False
     wall_of = np.arange(len(pieces))
+    seen, pieces = pieces.scans, replace(pieces, scans=(wall_of[:0], wall_of[:0]))  # added up once, at the end
+    pairs, cost = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+    changed, thorough = np.ones(len(pieces), dtype=bool), False
     while len(pieces) > 1:
-        pairs = _neighbors(pieces, gap, nearest=None if thorough else _NEAREST)
-        cost = mismatch(pieces, pairs, gap=gap)
-        pairs, cost = pairs[cost <= 1], cost[cost <= 1]
-        if opening is not None and len(pairs):
-            shut = ~opening(*gaps(pieces, pairs))
-            pairs, cost = pairs[shut], cost[shut]
+        # Only pieces that changed can match anew; first with the nearest, at last with all of them.
+        new = _neighbors(pieces, changed, gap, nearest=None if thorough else _NEAREST)
+        badness, between = _compared(pieces, new, gap)
+        new, badness, between = new[badness <= 1], badness[badness <= 1], between[badness <= 1]
+        if opening is not None and (between > 0).any():
+            apart = np.flatnonzero(between > 0)
+            shut = np.delete(np.arange(len(new)), apart[opening(*gaps(pieces, new[apart]))])
+            new, badness = new[shut], badness[shut]
+        pairs, once = np.unique(np.concatenate([pairs, new]), axis=0, return_index=True)
+        cost = np.concatenate([cost, badness])[once]
         if len(pairs):
             group = _mutual(pairs, cost, len(pieces))
             pieces, wall_of = add_up(pieces, group), group[wall_of]
-            thorough = False
-        elif thorough or len(pieces) <= _NEAREST:
+            changed = np.bincount(group) > 1
+            pairs = group[pairs]
+            kept = ~changed[pairs].any(axis=1)
+            pairs, cost = np.sort(pairs[kept], axis=1), cost[kept]
+        elif thorough:
             break
         else:
-            thorough = True  # none among the nearest ones: look at all of them before saying so
-    return pieces, wall_of
+            changed, thorough = np.ones(len(pieces), dtype=bool), True
+    return replace(pieces, scans=unique_pairs(wall_of[seen[0]], seen[1])), wall_of
 
 
 def mismatch(pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"], *, gap: float) -> Float[np.ndarray, " pairs"]:
     """How badly the pieces of each pair agree: 0 for the same piece twice, 1 at the first gate, more beyond it."""
+    return _compared(pieces, pairs, gap)[0]
+
+
+def _compared(
+    pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"], gap: float
+) -> tuple[Float[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]:
+    """The mismatch of each pair, and how much of their line lies between them, metres."""
     a, b = pairs.T
     turn = wrap_angle(pieces.theta[b] - pieces.theta[a])
     opposite = np.abs(turn) > np.pi / 2
@@ -89,10 +106,11 @@ def mismatch(pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"], *, gap: float) -
     between = np.maximum(between, 0)
     # How far either must be turned to lie on the common line, in standard deviations.
     turns = np.abs(np.stack([share * turn + bend, (share - 1) * turn + bend]))
-    turns = (turns / np.sqrt(variance[[a, b]] + TURN_FLOOR**2)).max(axis=0) / TURN_GATE
+    turns = (turns / np.sqrt(variance[[a, b]] + TURN_FLOOR**2)).max(axis=0)
+    turns = np.maximum(turns, np.abs(turn) / np.sqrt(variance[a] + variance[b] + 2 * TURN_FLOOR**2)) / TURN_GATE
     spread = np.sqrt(1 / info_a + 1 / info_b + OFFSET_FLOOR**2)
     offset_gate = np.where(opposite, BOTH_SIDES, np.minimum(OFFSET_GATE, TURN_GATE * spread))
-    return np.maximum.reduce([apart / offset_gate, turns, between / gap])
+    return np.maximum.reduce([apart / offset_gate, turns, between / gap]), between
 
 
 def gaps(
@@ -106,8 +124,10 @@ def gaps(
     return np.stack([ends[a, nearest // 2], ends[b, nearest % 2]], axis=1), pieces.theta[a]
 
 
-def _neighbors(pieces: Pieces, gap: float, *, nearest: int | None) -> Int[np.ndarray, "pairs 2"]:
-    """Pairs of pieces that may match: samples along them that are near in place and direction."""
+def _neighbors(
+    pieces: Pieces, changed: Bool[np.ndarray, " pieces"], gap: float, *, nearest: int | None
+) -> Int[np.ndarray, "pairs 2"]:
+    """Pairs that may match, one of them changed: pieces with samples near each other in place and direction."""
     parts = np.maximum(np.ceil(pieces.length / gap).astype(np.int64), 1) + 1
     piece = np.repeat(np.arange(len(pieces)), parts)
     share = (np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts)) / (parts[piece] - 1)
@@ -116,19 +136,21 @@ def _neighbors(pieces: Pieces, gap: float, *, nearest: int | None) -> Int[np.nda
     double = 2 * pieces.theta[piece]  # both sides of a wall have one direction
     direction = 0.5 * _LEVER * np.stack([np.cos(double), np.sin(double)], axis=-1)
     points = np.concatenate([place, direction], axis=-1)
-    steepest = TURN_GATE * np.sqrt(2 / pieces.info_theta.min() + TURN_FLOOR**2)
+    steepest = TURN_GATE * np.sqrt(2 / pieces.info_theta.min() + 2 * TURN_FLOOR**2)
     reach = float(np.hypot(1.6 * gap + OFFSET_GATE, _LEVER * min(steepest, np.pi / 2)))
-    tree = KDTree(points)
-    if nearest is None:
-        pairs = tree.query_pairs(reach, output_type="ndarray")
+    tree, asking = KDTree(points), np.flatnonzero(changed[piece])
+    if nearest is None and len(asking) == len(points):
+        one, other = tree.query_pairs(reach, output_type="ndarray").reshape(-1, 2).T
+    elif nearest is None:
+        found = tree.query_ball_point(points[asking], reach)
+        one = np.repeat(asking, [len(near) for near in found])
+        other = np.array([k for near in found for k in near], dtype=np.int64)
     else:
-        _, other = tree.query(points, k=min(nearest, len(points)), distance_upper_bound=reach)
-        other = np.asarray(other).reshape(len(points), -1)
-        one, rank = np.nonzero(other < len(points))
-        pairs = np.stack([one, other[one, rank]], axis=-1)
-    pairs = np.sort(piece[pairs], axis=1)
-    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
-    flat = np.unique(pairs[:, 0] * len(pieces) + pairs[:, 1])
+        near = np.asarray(tree.query(points[asking], k=min(nearest, len(points)), distance_upper_bound=reach)[1])
+        row, rank = np.nonzero(near < len(points))
+        one, other = asking[row], near[row, rank]
+    one, other = np.sort([piece[one], piece[other]], axis=0)
+    flat = np.unique((one * len(pieces) + other)[one < other])
     return np.stack([flat // len(pieces), flat % len(pieces)], axis=-1)
 
 

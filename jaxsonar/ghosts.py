@@ -1,5 +1,7 @@
 """What answers like a wall and is none: corners, edges and poles, and walls that are no longer there."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
@@ -107,7 +109,7 @@ def trim(pieces: Pieces, wall_of: Int[np.ndarray, " pieces"], seen: SeenThrough)
     ends = np.column_stack([along[begin] - width / 2, along[end] + width / 2])
     whole = end - begin + 1 == parts[piece[begin]]
     worth = whole | (ends[:, 1] - ends[:, 0] > CRUMB)
-    return _with_ends(pieces, piece[begin][worth], ends[worth])
+    return replace(pieces.take(piece[begin][worth]), ends=ends[worth])
 
 
 def openings(
@@ -144,20 +146,6 @@ def _crosses(
         place = start + (before / (before - after))[:, None] * (end - start)
     share = (place - gap[0]) @ along / max(float(along @ along), 1e-18)
     return bool((goes & (share > 0) & (share < 1)).any())
-
-
-def _with_ends(pieces: Pieces, rows: Int[np.ndarray, " some"], ends: Float[np.ndarray, "some 2"]) -> Pieces:
-    """Rows of pieces, a row perhaps more than once, with other ends."""
-    columns = {
-        name: getattr(pieces, name)[rows]
-        for name in (
-            "centre", "theta", "info_offset", "info_theta", "misfit", "count", "echoes", "distance", "latest",
-        )
-    }  # fmt: skip
-    lists = pieces.scan_lists()
-    row = np.repeat(np.arange(len(rows)), [len(lists[k]) for k in rows])
-    number = np.array([scan for k in rows for scan in lists[k]], dtype=np.int64)
-    return Pieces(**columns, ends=ends, scans=(row, number))
 
 
 def _vertices(

@@ -15,12 +15,13 @@ from jaxsonar import kernels
 from .components import label_components
 from .echoes import room_for
 from .pieces import Pieces, add_up, overwrite
+from .poses import wrap_angle
 
 RHO_CELL = 0.10
 """Metres; the paper's cell for merging, with 0.0628 rad in theta."""
 THRESHOLD = 0.1
 """Lines; a single one leaves a quarter of itself in its cell after the low pass, and none is to be lost."""
-_CELLS_AT_ONCE = 2_000_000
+_CELLS_AT_ONCE, _MOST_CELLS = 2_000_000, 8192
 
 
 def merge_as_paper(pieces: Pieces, *, cut: float) -> Pieces:
@@ -38,9 +39,10 @@ def merge_as_paper(pieces: Pieces, *, cut: float) -> Pieces:
     size = np.bincount(cluster)
     origin = np.stack([np.bincount(cluster, midpoint[:, k]) for k in (0, 1)], axis=-1) / size[:, None]
     rho = (pieces.normal * (pieces.centre - origin[cluster])).sum(-1)
-    part, line = np.zeros(len(pieces), dtype=np.int64), np.zeros((len(pieces), 2))
+    part, line = np.zeros(len(pieces), dtype=np.int64), np.stack([rho, pieces.theta], axis=-1)
     for settings, rows, column, row in _batches(cluster, size, rho):
-        lines = np.full((2, row[-1] + 1, room_for(int(column.max()) + 1, least=16)), np.nan, np.float32)
+        shape = room_for(int(row[-1]) + 1, least=2), room_for(int(column.max()) + 1, least=16)
+        lines = np.full((2, *shape), np.nan, np.float32)
         lines[:, row, column] = rho[rows], pieces.theta[rows]
         # Hough transform the infinite lines; low pass, threshold, components, centres of gravity.
         packed = tuple(jnp.asarray(values) for values in lines)
@@ -64,16 +66,29 @@ def single_linkage(points: Float[np.ndarray, "points 2"], cut: float) -> Int[np.
     edges = np.zeros((0, 2), dtype=np.int64)
     if len(places) > 1:
         # Three far points make any set a plane one; no shortest edge between the others goes through them.
-        low, high = places.min(axis=0), places.max(axis=0)
-        far = 4 * float((high - low).max()) + cut
-        corners = (low + high) / 2 + far * np.array([[-2.0, -1.0], [2.0, -1.0], [0.0, 2.0]])
-        mesh = Delaunay(np.concatenate([places, corners]) - low)
+        near = np.stack([_without_deserts(places[:, k], cut) for k in (0, 1)], axis=-1)
+        high = near.max(axis=0)
+        far = 4 * float(high.max()) + cut
+        corners = high / 2 + far * np.array([[-2.0, -1.0], [2.0, -1.0], [0.0, 2.0]])
+        mesh = Delaunay(np.concatenate([near, corners]))
         sides = mesh.simplices[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         edges = np.concatenate([sides, mesh.coplanar[:, [0, 2]]])  # points too near to another to be corners
         edges = edges[(edges < len(places)).all(axis=1)]
         edges = edges[np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=-1) <= cut]
     graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(len(places), len(places)))
     return connected_components(graph, directed=False)[1][place_of.ravel()].astype(np.int64)
+
+
+def _without_deserts(x: Float[np.ndarray, " points"], cut: float) -> Float[np.ndarray, " points"]:
+    """Coordinates from 0 on, every empty stretch wider than twice the cut made that wide: no link changes.
+
+    A triangulation of points whose extent is a million times their distance loses edges to rounding.
+    """
+    order = np.argsort(x)
+    steps = np.minimum(np.diff(x[order]), 2 * cut)
+    near = np.empty_like(x)
+    near[order] = np.append(0.0, np.cumsum(steps))
+    return near
 
 
 def _batches(
@@ -84,13 +99,19 @@ def _batches(
     """Clusters of like size and extent together: settings, rows of the lines, their columns, and their cluster."""
     farthest = np.zeros(len(size))
     np.maximum.at(farthest, cluster, np.abs(rho))
-    cells = np.array([room_for(int(n) + 2, least=100) for n in farthest / RHO_CELL])
+    # Clusters of a kilometre get coarser cells.
+    coarse = 2 ** np.maximum(np.ceil(np.log2((farthest + 1) / (_MOST_CELLS * RHO_CELL))), 0).astype(np.int64)
+    cells = np.array([room_for(int(n) + 2, least=100) for n in farthest / (coarse * RHO_CELL)])
+    cells = np.minimum(cells, _MOST_CELLS)
     lines = np.array([room_for(int(n), least=16) for n in size])
+    shapes = np.stack([cells, lines, coarse])
     order = np.argsort(cluster, kind="stable")
     start = np.cumsum(size) - size
-    for shape in np.unique(np.stack([cells, lines]), axis=1).T.tolist():
-        settings = kernels.HoughSettings(rho_cells=shape[0], rho_cell=RHO_CELL, threshold=THRESHOLD, min_echoes=1)
-        alike = np.flatnonzero((cells == shape[0]) & (lines == shape[1]))
+    for shape in np.unique(shapes[:, size > 1], axis=1).T:  # a line alone is its own centre of gravity
+        settings = kernels.HoughSettings(
+            rho_cells=int(shape[0]), rho_cell=RHO_CELL * int(shape[2]), threshold=THRESHOLD, min_echoes=1
+        )
+        alike = np.flatnonzero((shapes == shape[:, None]).all(axis=0) & (size > 1))
         at_once = max(1, _CELLS_AT_ONCE // settings.cells)
         for first in range(0, len(alike), at_once):
             some = alike[first : first + at_once]
@@ -107,9 +128,9 @@ def _on_lines(
 ) -> Pieces:
     """One piece a group, on the given line (rho, theta from the origin); its outermost projected ends bound it."""
     summed = add_up(pieces, group)
-    theta = line[:, 1]
-    normal, tangent = np.stack([np.cos(theta), np.sin(theta)], -1), np.stack([-np.sin(theta), np.cos(theta)], -1)
-    foot = origin + line[:, :1] * normal
+    theta = np.where(np.cos(line[:, 1] - summed.theta) < 0, wrap_angle(line[:, 1] + np.pi), line[:, 1])
+    tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
+    foot = origin + line[:, :1] * np.stack([np.cos(line[:, 1]), np.sin(line[:, 1])], axis=-1)
     way = ((pieces.segments - foot[group][:, None]) * tangent[group][:, None]).sum(-1)
     first, last = np.full(len(foot), np.inf), np.full(len(foot), -np.inf)
     np.minimum.at(first, group, way.min(axis=1))

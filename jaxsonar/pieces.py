@@ -69,14 +69,12 @@ class Pieces:
         return self.ends[:, 1] - self.ends[:, 0]
 
     def take(self, rows: Int[np.ndarray, " some"] | Bool[np.ndarray, " pieces"]) -> "Pieces":
-        """Some of the pieces, in the order asked for."""
+        """Some of the pieces, in the order asked for; a row may come more than once."""
         rows = np.arange(len(self))[rows]
-        place = np.full(len(self), -1)
-        place[rows] = np.arange(len(rows))
-        row, number = place[self.scans[0]], self.scans[1]
-        pairs = _unique(row[row >= 0], number[row >= 0])
+        begin, end = np.searchsorted(self.scans[0], [rows, rows + 1])
+        seen = np.repeat(begin - np.cumsum(end - begin) + end - begin, end - begin) + np.arange((end - begin).sum())
         columns: dict[str, Any] = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "scans"}
-        return Pieces(**columns, scans=pairs)
+        return Pieces(**columns, scans=(np.repeat(np.arange(len(rows)), end - begin), self.scans[1][seen]))
 
     def scan_lists(self) -> tuple[tuple[int, ...], ...]:
         """Numbers of the scans that each piece was seen in, ascending."""
@@ -115,7 +113,7 @@ def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]
         echoes=echoes,
         distance=np.array([line.rho for _, line in lines], dtype=np.float64),
         latest=when[model],
-        scans=_unique(*seen.reshape(-1, 2).T),
+        scans=unique_pairs(*seen.reshape(-1, 2).T),
     )
 
 
@@ -132,9 +130,14 @@ def join(parts: Sequence[Pieces]) -> Pieces:
 def add_up(pieces: Pieces, group: Int[np.ndarray, " pieces"]) -> Pieces:
     """One piece from all those of a group, for groups 0, 1, 2, ...: the line that fits all of them best.
 
-    Least squares on the offsets and directions of the pieces: those far apart along the wall tell its direction better
-    than any of them alone (the parallel-axis theorem). The sum of sums is the sum of all, in any order, to rounding.
-    A group of one piece stays what it is.
+    With d a piece's centre from the common one and t its tangent, a line with the normal n costs
+
+        sum of info_offset (d . n)^2 + info_theta (t . n)^2   =   n' M n,
+
+    least for the eigenvector of M with the smaller eigenvalue: pieces far apart along the wall tell its direction
+    better than any of them alone. What a line turned by b from there costs more is (difference of the eigenvalues) sin(b)^2,
+    which is what a piece keeps; so the sum of sums is the sum of all, in any order, to rounding (of the ends to 3 mm,
+    because they are projected each time). A group of one piece stays what it is.
     """
     groups = int(group.max(initial=-1)) + 1
     members = np.bincount(group, minlength=groups)
@@ -144,49 +147,49 @@ def add_up(pieces: Pieces, group: Int[np.ndarray, " pieces"]) -> Pieces:
     def total(values: np.ndarray) -> np.ndarray:
         return np.bincount(group, values, groups)
 
-    # Deviations are small and measured from the member that knows its direction best.
-    order = np.lexsort((pieces.centre[:, 1], pieces.centre[:, 0], -pieces.info_theta, group))
-    leader = order[np.searchsorted(group[order], np.arange(groups))]
-    theta = pieces.theta[leader]
-    normal, tangent = pieces.normal[leader], pieces.tangent[leader]
-    offset = pieces.centre - pieces.centre[leader][group]
-    along, across = (offset * tangent[group]).sum(-1), (offset * normal[group]).sum(-1)
-    turn = wrap_angle(pieces.theta - theta[group])
-    turn = np.where(np.abs(turn) > np.pi / 2, wrap_angle(turn + np.pi), turn)  # seen from the other side
-    info = total(pieces.info_offset)
-    middle, level = total(pieces.info_offset * along) / info, total(pieces.info_offset * across) / info
-    along, across = along - middle[group], across - level[group]
-    info_theta = total(pieces.info_theta + pieces.info_offset * along**2)
-    # A line turned by b has fallen by b times the way along its tangent.
-    bend = total(pieces.info_theta * turn - pieces.info_offset * along * across) / info_theta
-    deviation = pieces.info_offset * (across + bend[group] * along) ** 2
-    deviation += pieces.info_theta * (turn - bend[group]) ** 2
+    first = np.zeros(groups, dtype=np.int64)
+    first[group] = np.arange(len(group))  # any member will do, to measure from nearby
+    origin = pieces.centre[first]
+    d, t, w, v = pieces.centre - origin[group], pieces.tangent, pieces.info_offset, pieces.info_theta
+    info = total(w)
+    middle = np.stack([total(w * d[:, 0]), total(w * d[:, 1])], axis=-1) / info[:, None]
+    d = d - middle[group]
+    xx = total(w * d[:, 0] ** 2 + v * t[:, 0] ** 2)
+    yy = total(w * d[:, 1] ** 2 + v * t[:, 1] ** 2)
+    xy = total(w * d[:, 0] * d[:, 1] + v * t[:, 0] * t[:, 1])
+    info_theta = np.hypot(xx - yy, 2 * xy)
+    least = 2 * np.maximum(xx * yy - xy * xy, 0) / (xx + yy + info_theta)
+    theta = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2
+    normal = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    order = np.lexsort((pieces.count, v, group))  # which way it faces is said by the member that knows best
+    leader = order[np.searchsorted(group[order], np.arange(groups), side="right") - 1]
+    facing = (pieces.normal[leader] * normal).sum(-1)
+    theta = wrap_angle(theta + np.where(facing < 0, np.pi, 0.0))
 
-    centre = pieces.centre[leader] + middle[:, None] * tangent + level[:, None] * normal
-    theta = wrap_angle(theta + bend)
+    centre = origin + middle
     tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
     ends = ((pieces.segments - centre[group][:, None]) * tangent[group][:, None]).sum(-1)
-    first, last = np.full(groups, np.inf), np.full(groups, -np.inf)
-    np.minimum.at(first, group, ends.min(axis=1))
-    np.maximum.at(last, group, ends.max(axis=1))
+    low, high = np.full(groups, np.inf), np.full(groups, -np.inf)
+    np.minimum.at(low, group, ends.min(axis=1))
+    np.maximum.at(high, group, ends.max(axis=1))
     latest = np.full(groups, -np.inf)
     np.maximum.at(latest, group, pieces.latest)
     count = total(pieces.count)
     summed = Pieces(
         centre=centre,
         theta=theta,
-        ends=np.stack([first, last], axis=-1),
+        ends=np.stack([low, high], axis=-1),
         info_offset=info,
         info_theta=info_theta,
-        misfit=total(pieces.misfit + deviation),
+        misfit=total(pieces.misfit) + least,
         count=np.rint(count).astype(np.int64),
         echoes=np.rint(total(pieces.echoes)).astype(np.int64),
         distance=total(pieces.distance * pieces.count) / count,
         latest=latest,
-        scans=_unique(group[pieces.scans[0]], pieces.scans[1]),
+        scans=unique_pairs(group[pieces.scans[0]], pieces.scans[1]),
     )
     alone = members == 1
-    return overwrite(summed, alone, pieces.take(leader[alone]))
+    return overwrite(summed, alone, pieces.take(first[alone]))
 
 
 def overwrite(pieces: Pieces, rows: Bool[np.ndarray, " pieces"], by: Pieces) -> Pieces:
@@ -200,7 +203,7 @@ def overwrite(pieces: Pieces, rows: Bool[np.ndarray, " pieces"], by: Pieces) -> 
     return replace(pieces, **columns)
 
 
-def _unique(row: np.ndarray, number: np.ndarray) -> tuple[Int[np.ndarray, " seen"], Int[np.ndarray, " seen"]]:
+def unique_pairs(row: np.ndarray, number: np.ndarray) -> tuple[Int[np.ndarray, " seen"], Int[np.ndarray, " seen"]]:
     """Pairs of row and scan number, ascending, each once."""
     order = np.lexsort((number, row))
     row, number = row[order], number[order]

@@ -15,7 +15,7 @@ from .ring import Ring
 
 CELL = 0.1
 """Side of a cell of the floor, metres."""
-DIRECTIONS = 24
+DIRECTIONS = 36
 """Directions of the normal that are told apart around the full turn."""
 LATEST = 3
 """So many of the latest scans are remembered: what no fewer later ones see through is gone."""
@@ -28,6 +28,7 @@ HIDDEN = 1.0
 FACING = float(np.radians(15.0))
 """Radians; a ray within this of a wall's normal faces the wall."""
 _TILE = 32
+_SECTOR = 2 * np.pi / DIRECTIONS
 _RAYS, _POINTS = 17, 33  # of a cone, and on an arc
 
 
@@ -111,8 +112,8 @@ def silence(
     """Where each scan would have heard a wall and did not: (cell x, cell y, direction), and whose scan it was.
 
     Only direct echoes speak: of the places before its first echo that a sensor faces, at least two must agree where two
-    sensors face the same way (within 20 cm), and no echo of another path may come from there. What stands behind a wall that the
-    scan itself shows is not judged.
+    sensors face the same way (within 20 cm), and no echo of another path may come from there. What stands behind a wall
+    that the scan itself shows is not judged.
 
     Args:
         ring: the sensors.
@@ -146,6 +147,9 @@ def silence(
     # A cell is nearer than the echo only if its middle is.
     middle = (np.floor(point / CELL) + 0.5) * CELL
     near = np.linalg.norm(middle - sensor[who, sensor_row], axis=-1) < free[who, sensor_row, ray_row]
+    # And it is faced in a direction only if all walls with normals in that sector would be heard.
+    begin = _direction(theta[who, sensor_row, ray_row]) * _SECTOR - pose[who, 2] - start[direct][sensor_row]
+    near &= np.mod(begin, 2 * np.pi) <= width[direct][sensor_row] - _SECTOR
     who, sensor_row, ray_row, point = who[near], sensor_row[near], ray_row[near], point[near]
     claims = (who, *np.floor(point / CELL).astype(np.int64).T, _direction(theta[who, sensor_row, ray_row]))
     # An echo of any path speaks against it, wherever its arc passes.
@@ -196,7 +200,7 @@ def _hidden_from(
 
 
 def _direction(theta: Float[np.ndarray, "*any"]) -> Int[np.ndarray, "*any"]:
-    return np.floor(np.mod(theta, 2 * np.pi) * (DIRECTIONS / (2 * np.pi))).astype(np.int64) % DIRECTIONS
+    return np.floor(np.mod(theta, 2 * np.pi) / _SECTOR).astype(np.int64) % DIRECTIONS
 
 
 def _coded(

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jaxsonar.ghosts import LONG, NEAR, openings, trim, without_corners, without_points
 from jaxsonar.pieces import Pieces, join
 from jaxsonar.poses import rotation
-from jaxsonar.seenthrough import CELL, DIRECTIONS, SeenThrough
+from jaxsonar.seenthrough import CELL, DIRECTIONS, LATEST, SeenThrough
 
 LEFT_EXACT = 1e-9
 
@@ -243,7 +243,7 @@ def test_a_place_where_the_same_wall_was_seen_since_is_not_cut():
 def seen_through(times, part, latest):
     """Three later scans went through a part or its neighbors, none of them later than the last through itself."""
     own = max(times[part], default=-1)
-    beside = {min(int(t), int(own)) for row in times[max(part - 1, 0) : part + 2] for t in row}
+    beside = {min(int(t), int(own)) for row in times[max(part - 1, 0) : part + 2] for t in sorted(row)[-LATEST:]}
     return sum(t > latest for t in beside) >= 3
 
 

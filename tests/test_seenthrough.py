@@ -159,7 +159,9 @@ def slow_silence(ring, pose, echoes, walls):
             while distance < SURE * ring.max_range:
                 cell = place_of(sensor + distance * ray, theta)
                 middle = (np.array(cell[:2]) + 0.5) * CELL
-                if max(distance, np.linalg.norm(middle - sensor)) < min(nearest, hidden) - MARGIN:
+                sector = 2 * math.pi / DIRECTIONS
+                faced = (cell[2] * sector - pose[2] - first) % (2 * math.pi) <= width - sector
+                if faced and max(distance, np.linalg.norm(middle - sensor)) < min(nearest, hidden) - MARGIN:
                     votes.setdefault(cell, set()).add(path)
                 distance += CELL * 0.7
     against = set()
