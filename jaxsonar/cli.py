@@ -46,6 +46,12 @@ def _finite(least: float | int, most: float | int = 1e9):
     return _number(float, least, most)
 
 
+def _file(text: str) -> str:
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(f"{text!r} came; allowed is the name of a file")
+    return text
+
+
 def _ending_in(*suffixes: str):
     """A name with one of these suffixes: a wrong one is refused before the work, not after it."""
 
@@ -87,29 +93,35 @@ def parser() -> argparse.ArgumentParser:
     lines.add_argument("--scan", type=_number(int, -(2**62), 2**62), metavar="N", help="scan to draw (default: first)")
 
     map_ = command("map", "The walls of the world, from a log of scans with poses.")
-    map_.add_argument("log", metavar="LOG", help="scan log with poses, .csv or .parquet")
-    map_.add_argument("--ring", required=True, help=RING_HELP)
+    map_.add_argument("log", type=_file, metavar="LOG", help="scan log with poses, .csv or .parquet")
+    map_.add_argument("--ring", type=_file, required=True, help=RING_HELP)
     map_.add_argument("--method", choices=("hough",), default="hough", help="default: hough, the paper's")
-    map_.add_argument("--settings", metavar="TOML", help="accumulator, low pass and threshold, instead of the paper's")
+    map_.add_argument(
+        "--settings", type=_file, metavar="TOML", help="accumulator, low pass and threshold, instead of the paper's"
+    )
     map_.add_argument(
         "--window",
-        type=_finite(1e-3, 1000),
+        type=_finite(0.01, 100),
         metavar="METRES",
         help="gather the echoes of this much path into one local model, for rings of few sensors (try 1.5)",
     )
     map_.add_argument(
         "--merging", choices=("fused", "paper"), default="fused", help="how segments become walls (default: fused)"
     )
-    map_.add_argument("-o", "--output", metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout")
+    map_.add_argument(
+        "-o", "--output", type=_file, metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout"
+    )
     map_.add_argument("--figure", type=_figure, metavar="FIG", help="draw the map, .svg, .png or .pdf")
     map_.add_argument(
         "--grid", type=_ending_in(".yaml", ".yml"), metavar="YAML", help="occupancy grid for Nav2, with a .pgm beside"
     )
     map_.add_argument("--dxf", type=_ending_in(".dxf"), metavar="DXF", help="the walls for CAD (extra cad)")
-    map_.add_argument("--laser", metavar="RECORDING", help="draw the laser points of a corridor8 recording below")
+    map_.add_argument(
+        "--laser", type=_file, metavar="RECORDING", help="draw the laser points of a corridor8 recording below"
+    )
 
     reference = command("reference", "Reference walls of a run, from the laser of the same robot.")
-    reference.add_argument("recording", metavar="RECORDING", help="folder with laser.txt and poses.txt")
+    reference.add_argument("recording", type=_file, metavar="RECORDING", help="folder with laser.txt and poses.txt")
     reference.add_argument("--from", dest="from_", choices=("corridor8",), default="corridor8", help="its format")
     reference.add_argument(
         "--reach", type=_finite(0.1, 100), default=3.5, metavar="M", help="of what came this near (default: 3.5 m)"
@@ -117,15 +129,21 @@ def parser() -> argparse.ArgumentParser:
     reference.add_argument(
         "--scan", type=_number(int, 0, 2**62), metavar="N", help="the polygonal model of this scan alone, laser frame"
     )
-    reference.add_argument("-o", "--output", metavar="REF", required=True, help="GeoJSON, metres; - = stdout")
+    reference.add_argument(
+        "-o", "--output", type=_file, metavar="REF", required=True, help="GeoJSON, metres; - = stdout"
+    )
     reference.add_argument("--figure", type=_figure, metavar="FIG", help="draw it, .svg, .png or .pdf")
 
     evaluate = command("evaluate", "How well a map agrees with a reference: deviations, precision, recall.")
-    evaluate.add_argument("map", metavar="MAP", help="GeoJSON, world metres")
-    evaluate.add_argument("reference", metavar="REFERENCE", help="GeoJSON of the same world: a reference or a room")
+    evaluate.add_argument("map", type=_file, metavar="MAP", help="GeoJSON, world metres")
+    evaluate.add_argument(
+        "reference", type=_file, metavar="REFERENCE", help="GeoJSON of the same world: a reference or a room"
+    )
     evaluate.add_argument("--gate", type=_finite(1e-6, 100), default=0.15, metavar="M", help="default: 0.15 m")
     evaluate.add_argument("--gate-deg", type=_finite(1e-3, 90), default=10.0, metavar="DEG", help="default: 10 deg")
-    evaluate.add_argument("--json", metavar="FILE", help="the same figures as JSON; - = stdout instead of the table")
+    evaluate.add_argument(
+        "--json", type=_file, metavar="FILE", help="the same figures as JSON; - = stdout instead of the table"
+    )
 
     simulate = command("simulate", "The echoes that a ring hears along a path through a room.")
     simulate.add_argument("room", metavar="ROOM", help="room GeoJSON: walls, polygons, points of kind pole; metres")
@@ -150,6 +168,9 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit code: 0 done, 2 the input or the call was wrong, 1 anything else."""
     options = parser().parse_args(arguments)
+    if sys.stdout is None:  # closed by whoever called
+        with open(os.devnull, "w") as sys.stdout:
+            return main(arguments)
     try:
         getattr(import_module("jaxsonar.commands"), options.command)(options)
         sys.stdout.flush()
@@ -161,6 +182,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except BrokenPipeError:
         # The reader of our output has gone: what is left goes nowhere, or Python complains about it at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:  # a full disk behind standard output
+        print(f"jaxsonar {options.command}: {error.strerror or error}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return 0

@@ -13,6 +13,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from .kernels import HoughSettings
     from .local import LocalModel
 
 Item = TypeVar("Item")
@@ -79,73 +82,102 @@ def map(options: argparse.Namespace) -> None:
     import numpy as np
 
     from .candidates import settings_for
-    from .files import refuse_folder, shown
+    from .files import check_outputs, shown, write_toml
     from .hardware.errors import SonarError
     from .local import local_models
     from .logs import load_log
     from .mapfile import save_map
-    from .mapping import CONFIRMED, assemble, gather_evidence, require_poses
+    from .mapping import CONFIRMED, assemble, check_poses, gather_evidence
     from .ringfile import load_ring
-    from .settings import load_settings, save_settings
+    from .settings import load_settings
+    from .windows import check_window
 
-    _refuse_overwriting(options.output, options.log, options.ring)
-    for path in (options.figure, options.grid, options.dxf):
-        if path:
-            refuse_folder(path)  # complain before the work, not after it
-            _refuse_overwriting(path, options.log, options.ring)
-    if options.laser and not options.figure:
+    beside = _settings_beside(options.output)
+    if beside is not None and options.settings is not None and Path(options.settings).resolve() == beside.resolve():
+        beside = None  # the settings that were given are there already
+    check_outputs(
+        {
+            "-o": options.output,
+            "settings beside the map:": beside,
+            "--figure": options.figure,
+            "--grid": options.grid,
+            "--grid's image": options.grid and Path(options.grid).with_suffix(".pgm"),
+            "--dxf": options.dxf,
+        },
+        [options.log, options.ring, options.settings, *_laser_files(options.laser)],
+    )
+    if options.laser is not None and not options.figure:
         raise SonarError("--laser came alone; allowed is --laser with --figure, to which it belongs")
     if options.dxf:
         from .dxf import load_ezdxf
 
         load_ezdxf(options.dxf)
+    check_window(options.window)
     ring, log = load_ring(options.ring), load_log(options.log)
-    given = load_settings(options.settings) if options.settings else None
+    given = None if options.settings is None else load_settings(options.settings)
     settings = settings_for(ring, given, window=options.window)
-    points = None
-    if options.laser:
-        from .hardware.lasers import read_corridor8_laser
-        from .reference import laser_points
-
-        points = laser_points(read_corridor8_laser(options.laser), every=4)
-
-    def left_out(count: int) -> None:
-        _say(f"left out {count} echoes of pairs of sensors that {ring.name!r} does not listen to")
-
+    left_out: list[int] = []
     try:
-        require_poses(log)
+        check_poses(log)
         models = local_models(
-            ring, log, method=options.method, settings=settings, window=options.window, on_left_out=left_out
+            ring,
+            log,
+            method=options.method,
+            settings=settings,
+            window=options.window,
+            on_left_out=left_out.append,
         )
     except SonarError as error:
         raise SonarError(f"{shown(options.log)}: {error}") from None
-    models = list(_progress(models, len(log), "scans"))
+    points = None if options.laser is None else _laser_points(options.laser)
+    models = list(_progress(models, len(log) if options.window is None else None, "local models"))
     evidence = gather_evidence(ring, log, models)
     world = assemble(evidence, merging=options.merging, confirmed=1 if options.window else CONFIRMED)
-    save_map(world, options.output)
-    if beside := _settings_file(options.output):
-        save_settings(settings, beside)
-    if options.grid:
-        from .gridmap import occupancy, save_nav2
 
-        save_nav2(occupancy(ring, log, walls=world.segments), options.grid)
+    # Everything is made before anything is written.
+    grid = figure = None
+    if options.grid:
+        from .gridfile import check_grid
+        from .gridmap import occupancy
+
+        try:
+            grid = occupancy(ring, log, walls=world.segments)
+            check_grid(grid)
+        except SonarError as error:
+            raise SonarError(f"--grid {shown(options.grid)}: {error}") from None
+    if options.figure:
+        from . import figures_map
+
+        placed = log.pose[np.all(np.isfinite(log.pose), axis=1)]
+        figure = figures_map.map_figure(
+            world,
+            aggregated=evidence.pieces.segments,
+            poses=placed,
+            laser_points=points,
+            title=f"{_count(len(world), 'wall')} from {_plain(options.log)}",
+        )
+    save_map(world, options.output)
+    if beside is not None and Path(options.output).is_file():
+        write_toml(_said(settings, window=options.window, merging=options.merging), beside)
+    if grid is not None:
+        from .gridfile import save_nav2
+
+        save_nav2(grid, options.grid)
     if options.dxf:
         from .dxf import save_dxf
 
         save_dxf(world, options.dxf)
-    if options.figure:
-        from . import figures, figures_map
+    if figure is not None:
+        from . import figures
 
-        placed = log.pose[np.all(np.isfinite(log.pose), axis=1)]
-        figure = figures_map.map_figure(
-            world, aggregated=evidence.pieces.segments, poses=placed, laser_points=points, title=shown(options.log, 60)
-        )
         figures.save(figure, options.figure)
+    if left_out:
+        _say(f"left out {left_out[0]} echoes of pairs of sensors that {ring.name!r} does not listen to")
     homeless = int((~np.all(np.isfinite(log.pose), axis=1)).sum())
-    without = f"; {homeless} scans without a pose left out" if homeless else ""
+    without = f"; {_count(homeless, 'scan')} without a pose left out" if homeless else ""
     _say(
-        f"{len(log)} scans, {len(models)} local models, {len(evidence.pieces)} segments, "
-        f"{len(world)} walls, {world.length.sum():.1f} m{without}"
+        f"{_count(len(log), 'scan')}, {_count(len(models), 'local model')}, "
+        f"{_count(len(evidence.pieces), 'segment')}, {_count(len(world), 'wall')}, {world.length.sum():.1f} m{without}"
     )
 
 
@@ -153,32 +185,38 @@ def reference(options: argparse.Namespace) -> None:
     """``jaxsonar reference``."""
     import numpy as np
 
-    from .files import refuse_folder, shown
+    from . import figures, figures_map
+    from .files import check_outputs, shown
     from .hardware.errors import SonarError
     from .hardware.lasers import read_corridor8_laser
     from .polygonal import polygonal_model, unit
     from .reference import laser_points, reference_map, save_reference
 
-    if options.figure:
-        refuse_folder(options.figure)
+    check_outputs({"-o": options.output, "--figure": options.figure}, _laser_files(options.recording))
     laser = read_corridor8_laser(options.recording)
     if options.scan is not None and options.scan >= len(laser.stamp):
         held = f"0 to {len(laser.stamp) - 1}" if len(laser.stamp) else "none"
         raise SonarError(f"--scan {options.scan}: no such scan in {shown(options.recording)}; it holds {held}")
     if options.scan is None:
-        walls, points = reference_map(laser, reach=options.reach), laser_points(laser, every=4)
-        save_reference(walls, options.output)
-        _say(f"{len(laser.stamp)} scans, {len(walls)} walls, {np.hypot(*(walls[:, 1] - walls[:, 0]).T).sum():.1f} m")
+        try:
+            walls, points = reference_map(laser, reach=options.reach), laser_points(laser, every=4)
+        except SonarError as error:
+            raise SonarError(f"{shown(options.recording)}: {error}") from None
+        length = np.hypot(*(walls[:, 1] - walls[:, 0]).T).sum()
+        what = f"{_count(len(laser.stamp), 'scan')}, {_count(len(walls), 'wall')}, {length:.1f} m"
     else:
         ranges = laser.ranges[options.scan]
         walls = polygonal_model(laser.bearing, ranges)
         points = (ranges[:, None] * unit(laser.bearing))[np.isfinite(ranges)]
-        save_reference(walls, options.output)
-        _say(f"{len(walls.segments)} segments, {len(walls.pseudo)} pseudo segments, {len(walls.intersections)} corners")
-    if options.figure:
-        from . import figures, figures_map
-
-        figures.save(figures_map.laser_figure(walls, points), options.figure)
+        what = (
+            f"{_count(len(walls.segments), 'segment')}, {_count(len(walls.pseudo), 'pseudo segment')}, "
+            f"{_count(len(walls.intersections), 'intersection')}"
+        )
+    figure = figures_map.laser_figure(walls, points) if options.figure else None
+    save_reference(walls, options.output)
+    if figure is not None:
+        figures.save(figure, options.figure)
+    _say(what)
 
 
 def evaluate(options: argparse.Namespace) -> None:
@@ -188,12 +226,11 @@ def evaluate(options: argparse.Namespace) -> None:
     import numpy as np
 
     from .evaluation import evaluate as evaluate_map
-    from .files import open_output
+    from .files import check_outputs, open_output
     from .mapfile import load_walls
     from .tables_evaluation import evaluation_table
 
-    if options.json:
-        _refuse_overwriting(options.json, options.map, options.reference)
+    check_outputs({"--json": options.json}, [options.map, options.reference])
     found = evaluate_map(
         load_walls(options.map),
         load_walls(options.reference),
@@ -256,6 +293,45 @@ def convert(options: argparse.Namespace) -> None:
     _say(f"{len(log)} scans, {len(log.range)} echoes")
 
 
+def _laser_files(recording: str | None) -> list[Path]:
+    """The files that a corridor8 recording with a laser is read from; a folder, or its laser.txt."""
+    if recording is None:
+        return []
+    laser = Path(recording) / "laser.txt" if Path(recording).is_dir() else Path(recording)
+    return [laser, laser.with_name("poses.txt")]
+
+
+def _laser_points(recording: str) -> "np.ndarray":
+    from .hardware.lasers import read_corridor8_laser
+    from .reference import laser_points
+
+    return laser_points(read_corridor8_laser(recording), reach=5.0, every=4)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _plain(path: str) -> str:
+    """A file's name as a figure's font can show it."""
+    return Path(path).name.encode("ascii", "replace").decode()
+
+
+def _said(settings: "HoughSettings", **choices: object) -> dict[str, object]:
+    """Settings and what else a result was made with, as a table for TOML."""
+    from dataclasses import asdict
+
+    said: dict[str, object] = asdict(settings)
+    said["command"] = {key: value for key, value in choices.items() if value is not None}
+    return said
+
+
+def _settings_beside(output: str) -> Path | None:
+    """Where the settings of a result go; none beside standard output, a device or a pipe."""
+    path = Path(output)
+    return None if output == "-" or (path.exists() and not path.is_file()) else path.with_suffix(".settings.toml")
+
+
 def _refuse_overwriting(output: str, *inputs: str) -> None:
     from .files import shown
     from .hardware.errors import SonarError
@@ -301,7 +377,7 @@ def _say(text: str) -> None:
 
 
 @contextmanager
-def _bar(unit: str, total: int) -> Iterator[Callable[[int], None]]:
+def _bar(unit: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """A progress bar on standard error, with rate and time left; the function given is told how many are done."""
     columns = (
         TextColumn("{task.description}"),
@@ -322,7 +398,7 @@ def _bar(unit: str, total: int) -> Iterator[Callable[[int], None]]:
         yield show
 
 
-def _progress(items: Iterable[Item], total: int, unit: str) -> Iterator[Item]:
+def _progress(items: Iterable[Item], total: int | None, unit: str) -> Iterator[Item]:
     with _bar(unit, total) as show:
         for done, item in enumerate(items, start=1):
             yield item

@@ -14,7 +14,8 @@ from .demo_page import draw, write_page
 from .deviations import CLEAR_ECHOES, GATE_RHO, GATE_THETA, Deviations, compare, pooled
 from .evaluation import Evaluation, evaluate, largest, rms
 from .files import atomic_write, make_folder
-from .gridmap import occupancy, save_nav2
+from .gridfile import save_nav2
+from .gridmap import occupancy
 from .local import LocalModel, local_models, settings_for
 from .logs import save_log
 from .mapfile import save_map

@@ -74,7 +74,7 @@ def plan(title: str) -> tuple[Figure, Axes]:
     with styled():
         figure = Figure(layout="constrained")
         axes = figure.add_subplot()
-        axes.set_title(title)
+        axes.set_title(title, parse_math=False)  # names of files may hold dollars
     axes.set_aspect("equal")
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")

@@ -6,7 +6,7 @@ import secrets
 import stat
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -147,6 +147,49 @@ def refuse_folder(path: str | os.PathLike[str]) -> None:
     """
     if not Path(path).absolute().parent.is_dir():
         raise SonarError(f"{shown(path)}: no such folder; allowed is a path in an existing folder")
+
+
+def check_outputs(
+    outputs: Mapping[str, str | os.PathLike[str] | None], inputs: Iterable[str | os.PathLike[str] | None]
+) -> None:
+    """Complain before the work about places that results cannot go to.
+
+    Args:
+        outputs: what each place is called in the call ("--figure"), and the place; None where it was not asked for.
+        inputs: files that are read, None for none; what is no file (the name of a shipped ring) does not matter.
+
+    Raises:
+        SonarError: a place that cannot be written to, that is an input, or that two results would go to.
+    """
+    read = [path for path in inputs if path is not None and os.path.exists(path)]
+    taken: dict[str, str] = {}
+    for name, path in outputs.items():
+        if path is None or os.fspath(path) == "-":
+            continue
+        refuse_folder(path)
+        place = f"{name} {shown(path)}"
+        if os.path.exists(path) and any(os.path.samefile(path, given) for given in read):
+            raise SonarError(f"{place}: this is an input; allowed is another file")
+        real = os.path.realpath(path)
+        if real in taken:
+            raise SonarError(f"{place}: {taken[real]} goes there, too; allowed are different files")
+        taken[real] = name
+        try:
+            _probe(Path(real))
+        except OSError as failure:
+            raise SonarError(f"{place}: cannot write: {reason(failure)}; allowed is a file you may write") from None
+
+
+def _probe(target: Path) -> None:
+    """Raise what writing would raise: make a file beside the target, and take it away again."""
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    with suppress(FileNotFoundError):
+        if not stat.S_ISREG(target.stat().st_mode):
+            return  # a device or a pipe
+    temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
+    os.close(_create(temporary, target))
+    temporary.unlink()
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:

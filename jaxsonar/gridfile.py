@@ -23,6 +23,13 @@ def grid_image_path(path: str | os.PathLike[str]) -> Path:
     return Path(path).with_suffix(".pgm")
 
 
+def check_grid(grid: OccupancyGrid) -> None:
+    """Raise a SonarError for a grid without cells, which is no map."""
+    if not grid.classify().size:
+        why = f"{grid.skipped} scans without a pose" if grid.skipped else "no scan"
+        raise SonarError(f"{why} came, the grid is empty; needed is a scan with a pose")
+
+
 def save_nav2(grid: OccupancyGrid, path: str | os.PathLike[str]) -> None:
     """Write the grid as Nav2's map_server loads it: MAP.yaml, and the image MAP.pgm beside it.
 
@@ -37,10 +44,11 @@ def save_nav2(grid: OccupancyGrid, path: str | os.PathLike[str]) -> None:
         SonarError: another suffix, a grid without cells, or a place that cannot be written.
     """
     image_path = grid_image_path(path)
+    try:
+        check_grid(grid)
+    except SonarError as error:
+        raise SonarError(f"{shown(path)}: {error}") from None
     image = grid.classify()
-    if not image.size:
-        why = f"{grid.skipped} scans without a pose" if grid.skipped else "no scan"
-        raise SonarError(f"{shown(path)}: {why} came, the grid is empty; needed is a scan with a pose")
     rows, columns = image.shape
     x, y = grid.origin
     with atomic_write(image_path, binary=True) as file:

@@ -7,24 +7,18 @@ says nothing: walls bound every look. And an echo says "somewhere on this arc": 
 nothing, as the wall says it better; of the others, cells count as obstacles where arcs from several places meet.
 """
 
-import json
-import os
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8, UInt16
-from scipy.spatial import ConvexHull, QhullError
+from scipy import ndimage
 
 from jaxsonar.hardware.errors import SonarError
 
-from .files import atomic_write, shown
+from .knownwalls import KnownWalls
 from .logs import Log, Scan
-from .poses import rotation, to_world, wrap_angle
+from .looks import Eyes, evidence, first_echoes
 from .ring import Ring
-from .rooms import crossings, point_to_walls
 
 OCCUPIED, UNKNOWN, FREE = 0, 205, 254
 """Grey values of map_server's trinary images."""
@@ -54,8 +48,8 @@ class OccupancyGrid:
     """Side of a cell, metres."""
     corner: tuple[int, int]
     """Which cell of the world (column, row) the arrays start with: x from column * resolution."""
-    counts: Int[np.ndarray, "4 rows columns"]
-    """``free``, ``hidden``, ``arcs``, ``walls``, one on the other."""
+    counts: Int[np.ndarray, "5 rows columns"]
+    """``free``, ``hidden``, ``arcs``, ``walls``, ``driven``, one on the other."""
     places: UInt16[np.ndarray, "rows columns"]
     """One bit for each kind of place that an arc through the cell was heard from."""
     scans: int = 0
@@ -72,7 +66,7 @@ class OccupancyGrid:
         """
         if not 1e-3 <= resolution <= 10:
             raise SonarError(f"grid: resolution {resolution:g} m; allowed is 0.001 to 10 m")
-        return cls(resolution, (0, 0), np.zeros((4, 0, 0), np.int32), np.zeros((0, 0), np.uint16))
+        return cls(resolution, (0, 0), np.zeros((5, 0, 0), np.int32), np.zeros((0, 0), np.uint16))
 
     @property
     def origin(self) -> tuple[float, float]:
@@ -81,7 +75,7 @@ class OccupancyGrid:
 
     @property
     def free(self) -> Int[np.ndarray, "rows columns"]:
-        """Looks that went through the cell; the robot's own body is worth 20."""
+        """Looks that went through the cell."""
         return self.counts[0]
 
     @property
@@ -98,6 +92,11 @@ class OccupancyGrid:
     def walls(self) -> Int[np.ndarray, "rows columns"]:
         """Scans that had a wall in the cell within reach."""
         return self.counts[3]
+
+    @property
+    def driven(self) -> Int[np.ndarray, "rows columns"]:
+        """Scans in which the robot itself stood on the cell."""
+        return self.counts[4]
 
     def add(self, ring: Ring, scan: Scan, *, walls: Float[np.ndarray, "walls 2 2"] = NO_WALLS) -> "OccupancyGrid":
         """This grid and one scan more, for maps that grow while the robot drives; see ``occupancy``."""
@@ -142,11 +141,14 @@ class OccupancyGrid:
             min_looks: looks that must go through a free cell, arcs that must meet at an obstacle.
             min_places: an obstacle that is no wall was heard from so many places, 0.2 m apart.
         """
+        through = self.free + BODY * self.driven
         agreed = (self.arcs >= min_looks) & (np.bitwise_count(self.places) >= min_places)
-        obstacle = agreed & (self.arcs >= arc_share * (self.arcs + self.free))
-        occupied = obstacle | (self.walls > 0) & (self.walls >= self.free)
-        looks = self.free + self.hidden + self.arcs
-        free = (self.free >= min_looks) & (self.free >= free_share * looks)
+        obstacle = agreed & (self.arcs >= arc_share * (self.arcs + through))
+        occupied = obstacle | (self.walls > 0) & (self.walls >= through)
+        free = (through >= min_looks) & (through >= free_share * (through + self.hidden + self.arcs)) & ~occupied
+        # Specks that the robot cannot reach from where it drove are chance, or lie behind a wall that no map knows.
+        island, _ = ndimage.label(free)
+        free &= np.isin(island, island[free & (self.driven > 0)])
         image = np.where(occupied, OCCUPIED, np.where(free, FREE, UNKNOWN)).astype(np.uint8)
         return image[::-1]
 
@@ -195,7 +197,7 @@ def occupancy(
     for cell, scan in zip(at, posed, strict=True):
         pose, corner = log.pose[scan], cell - size
         near = known.near(pose[:2], eyes.reach)
-        seen = evidence(eyes, pose, first[scan], listening[scan], near, corner, 2 * size + 1, resolution)
+        seen = evidence(eyes, pose, first[scan], listening[scan], near, corner, 2 * size + 1)
         here = _window(corner - low, seen.shape[1:])
         counts[:, *here] += seen
         column, row = np.floor(pose[:2] / PLACE).astype(int) % 4
@@ -225,7 +227,7 @@ def _room_for(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray
     columns, rows = (int(k) for k in high - low)
     if columns * rows > MOST_CELLS:
         raise SonarError(f"grid: {columns} x {rows} cells; allowed are {MOST_CELLS} at most")
-    return np.zeros((4, rows, columns), np.int32), np.zeros((rows, columns), np.uint16)
+    return np.zeros((5, rows, columns), np.int32), np.zeros((rows, columns), np.uint16)
 
 
 def _trimmed(

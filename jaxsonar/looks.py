@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jaxsonar.hardware.errors import SonarError
 
-from .knownwalls import KnownWalls
+from .knownwalls import KnownWalls, beyond_ends, explained, sight
 from .logs import Log
 from .poses import rotation, to_world, wrap_angle
 from .ring import Ring
@@ -36,6 +36,7 @@ class Eyes(NamedTuple):
 
     @classmethod
     def of(cls, ring: Ring) -> "Eyes":
+        """Those of a ring."""
         position, half = np.asarray(ring.position), np.minimum(np.asarray(ring.beam) / 2, np.pi / 2)
         try:
             body = ConvexHull(position).equations
@@ -67,24 +68,28 @@ def evidence(
     walls: KnownWalls,
     corner: Int[np.ndarray, " 2"],
     size: int,
-    resolution: float,
-) -> Int[np.ndarray, "4 size size"]:
-    """What one scan says about the square of cells around the robot that starts with cell ``corner``."""
+) -> Int[np.ndarray, "5 size size"]:
+    """What one scan says about the square of cells around the robot that starts with cell ``corner``.
+
+    Free, hidden, arcs, walls, driven: the layers of ``OccupancyGrid.counts``.
+    """
+    resolution = walls.resolution
     position, heading = to_world(pose, eyes.position[listening]), eyes.heading[listening] + pose[2]
     half, first = eyes.half[listening], first[listening]
-    explained = _explained(position, heading, half, first, walls) | (first <= 0)
+    known = explained(position, heading, half, first, walls) | (first <= 0)
 
     # An echo that a wall explains says nothing about what is behind it, so that those looks end there.
-    limit = np.where(explained, np.minimum(first, eyes.max_range), eyes.max_range)
+    limit = np.where(known, np.minimum(first, eyes.max_range), eyes.max_range)
     disc, place = _disc(eyes.max_range, resolution, size), position / resolution - corner
     look, cell, distance, off_axis = _cells_in_cones(disc, place, heading, half + SHADE, limit, size)
-    sight = _sight(position, heading, half + SHADE, eyes.max_range, walls, resolution)
-    rays = sight.shape[1]
+    beyond = beyond_ends(position, heading, SURE * half, np.minimum(first, eyes.max_range), walls)
+    open_until = sight(position, heading, half + SHADE, eyes.max_range, walls, beyond)
+    rays = open_until.shape[1]
     half, first, seen = half[look], first[look], np.ones(len(look), bool)
     if rays:
         ray = ((off_axis / (half + SHADE) + 1) * (rays / 2)).astype(int)
-        seen = distance < sight[look, np.minimum(ray, rays - 1)]
-    off_axis, unexplained = np.abs(off_axis), seen & ~explained[look]
+        seen = distance < open_until[look, np.minimum(ray, rays - 1)]
+    off_axis, unexplained = np.abs(off_axis), seen & ~known[look]
     thick = resolution / np.sqrt(2)  # a circle through a cell is no farther from its centre than its corners are
     # Cells that the inner cone touches, so that no ring of unknown cells stays around a robot that stands.
     touched = distance * np.sin(np.maximum(off_axis - SURE * half, 0)) <= thick
@@ -92,14 +97,14 @@ def evidence(
     arcs = unexplained & (off_axis <= half) & (np.abs(distance - first) <= thick)
     # Beyond the tangent of any point of the arc; outside the cone that is the tangent at the arc's end.
     hidden = unexplained & (distance * np.cos(np.maximum(off_axis - half, 0)) > first + thick)
-    said = [np.bincount(cell[what], minlength=size**2) for what in (free, hidden, arcs)]
-    counts = np.stack([*said, np.zeros(size**2, int)]).reshape(4, size, size)
-
+    counts = np.zeros((5, size, size), int)
+    for layer, what in enumerate((free, hidden, arcs)):
+        counts[layer].flat = np.bincount(cell[what], minlength=size**2)
     column, row = (walls.cells - corner).T
     counts[0, row, column] = 0
     counts[3, row, column] = 1
-    column, row = (_under(eyes, pose, corner, size, resolution)).T
-    counts[0, row, column] += BODY
+    column, row = _under(eyes, pose, corner, size, resolution).T
+    counts[4, row, column] = 1
     return counts
 
 
@@ -159,10 +164,12 @@ def _cells_in_cones(
 
 
 def _under(eyes: Eyes, pose: np.ndarray, corner: np.ndarray, size: int, resolution: float) -> np.ndarray:
-    """Cells that the robot itself stands on, counted from ``corner``: inside the outline of its sensors."""
-    if not len(eyes.body):
-        return np.zeros((0, 2), int)
-    wide = int(np.ceil(np.linalg.norm(eyes.position, axis=-1).max() / resolution)) + 1
-    cells = np.stack(np.meshgrid(*[np.arange(size // 2 - wide, size // 2 + wide + 1)] * 2), axis=-1).reshape(-1, 2)
-    inside = ((cells + corner + 0.5) * resolution - pose[:2]) @ rotation(pose[2])
-    return cells[(inside @ eyes.body[:, :2].T + eyes.body[:, 2] <= 0).all(axis=1)]
+    """Cells that the robot itself stands on, counted from ``corner``: inside the outline of its sensors, or theirs."""
+    if len(eyes.body):
+        wide = int(np.ceil(np.linalg.norm(eyes.position, axis=-1).max() / resolution)) + 1
+        cells = np.stack(np.meshgrid(*[np.arange(size // 2 - wide, size // 2 + wide + 1)] * 2), axis=-1).reshape(-1, 2)
+        inside = ((cells + corner + 0.5) * resolution - pose[:2]) @ rotation(pose[2])
+        cells = cells[(inside @ eyes.body[:, :2].T + eyes.body[:, 2] <= 0).all(axis=1)]
+        if len(cells):
+            return cells
+    return np.floor(to_world(pose, eyes.position) / resolution).astype(int) - corner

@@ -29,6 +29,8 @@ BRIDGE = 1.0
 """Metres of a wall that may be hidden behind something; a gap that was seen through stays open however small."""
 LEAST_GAP, MOST_GAP = 0.4, 0.7
 """Metres; less than a door, more than what two neighboring scans leave of a wall between them."""
+FARTHEST = 1e8
+"""Metres from the origin of the world; up to there the cells of the floor are numbers."""
 SCANS_KEPT = 32
 """Scans whose numbers a piece keeps when maps are built scan by scan, the latest ones."""
 _PLACE, _TURN = 0.05, float(np.radians(6.0))  # m, rad: pieces this near are kept as their sum
@@ -107,7 +109,7 @@ def build_map(
         SonarError: as ``local_models``, an unknown way of merging, or no scan with a pose.
     """
     check_merging(merging)
-    require_poses(log)
+    check_poses(log)
     models = list(local_models(ring, log, method=method, settings=settings, window=window, on_left_out=on_left_out))
     evidence = gather_evidence(ring, log, models)
     return assemble(evidence, merging=merging, confirmed=1 if window else CONFIRMED)
@@ -200,10 +202,15 @@ def check_merging(merging: str) -> None:
         raise SonarError(f"merging {merging!r}; allowed is {' or '.join(MERGINGS)}")
 
 
-def require_poses(log: Log) -> None:
-    """Raise a SonarError for a log with scans but without a single pose."""
+def check_poses(log: Log) -> None:
+    """Raise a SonarError for a log with scans but without a single pose, or with one that is out of this world."""
     if len(log) and not np.isfinite(log.pose).any():
         raise SonarError(f"none of the {len(log)} scans has a pose; allowed is a log with x, y, theta for a map")
+    far = np.abs(log.pose[:, :2]).max(axis=1, initial=0) > FARTHEST  # False for NaN
+    if far.any():
+        k = int(far.argmax())
+        x, y, _ = log.pose[k]
+        raise SonarError(f"scan {log.scan[k]}: pose x {x:g}, y {y:g} m; allowed are {FARTHEST:g} m at most")
 
 
 def _as_map(walls: Pieces) -> GlobalMap:

@@ -135,7 +135,7 @@ def add_up(pieces: Pieces, group: Int[np.ndarray, " pieces"]) -> Pieces:
         sum of info_offset (d . n)^2 + info_theta (t . n)^2   =   n' M n,
 
     least for the eigenvector of M with the smaller eigenvalue: pieces far apart along the wall tell its direction
-    better than any of them alone. What a line turned by b from there costs more is (difference of the eigenvalues) sin(b)^2,
+    better than any of them alone. A line turned by b from there costs (difference of the eigenvalues) sin(b)^2 more,
     which is what a piece keeps; so the sum of sums is the sum of all, in any order, to rounding (of the ends to 3 mm,
     because they are projected each time). A group of one piece stays what it is.
     """

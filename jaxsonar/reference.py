@@ -18,6 +18,7 @@ from .rooms import cross
 
 _BIN = 0.05  # m; pitch of the cells that vote, and at which the profile of a wall is sampled
 _BAND = 0.15  # m; what is nearer than this to a line is looked at together: a wall with its recesses
+_FARTHEST = 1000.0  # m; the accumulator of one reference covers no more
 _SIDE = 4  # cells on each side of a step that tell its height, and of a cell that tell how many scans saw it
 
 
@@ -50,6 +51,15 @@ def reference_map(
         SonarError: scans that are none, or a scan without a pose.
     """
     points, facing, scan = _near_returns(laser, reach)
+    if not len(points):
+        return np.zeros((0, 2, 2))
+    origin = np.median(points, axis=0)  # of the lines that vote, however far the world's is
+    points = points - origin
+    extent = float(np.abs(points).max())
+    if extent > _FARTHEST or np.abs(origin).max() > 1e8:
+        x, y = origin
+        allowed = f"allowed are {_FARTHEST:g} m for one reference, not beyond 1e8 m"
+        raise SonarError(f"poses up to {extent:.3g} m from ({x:.3g}, {y:.3g}) came; {allowed}")
     walls: list[np.ndarray] = []
     while (line := _strongest(points, facing, min_length)) is not None:
         more, done = _walls_on(line, points, facing, scan, max_deviation, max_gap, min_length, min_scans)
@@ -58,7 +68,7 @@ def reference_map(
     found = np.array(walls).reshape(-1, 2, 2)
     found = _once(found[np.argsort(-lengths(found), kind="stable")])
     before, after = np.indices((len(found), len(found))).reshape(2, -1)
-    return joined(found, before, after)[0]
+    return joined(found, before, after)[0] + origin
 
 
 def laser_points(laser: LaserRecording, *, reach: float = 8.0, every: int = 1) -> Float[np.ndarray, "points 2"]:
@@ -70,7 +80,8 @@ def laser_points(laser: LaserRecording, *, reach: float = 8.0, every: int = 1) -
         every: take one scan in so many.
     """
     some = slice(None, None, every)
-    return _near_returns(replace(laser, pose=laser.pose[some], ranges=laser.ranges[some]), reach)[0]
+    thinned = replace(laser, stamp=laser.stamp[some], pose=laser.pose[some], ranges=laser.ranges[some])
+    return _near_returns(thinned, reach)[0]
 
 
 def save_reference(walls: Float[np.ndarray, "walls 2 2"] | PolygonalModel, path: str | os.PathLike[str]) -> None:

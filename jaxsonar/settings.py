@@ -24,6 +24,7 @@ def load_settings(path: Path | str) -> kernels.HoughSettings:
         SonarError: no such file, no TOML, an unknown key, a value of another type or out of range.
     """
     content = read_toml(path, what="settings")
+    content.pop("command", None)  # what else was chosen, for whoever reads it
     try:
         return kernels.HoughSettings(**msgspec.structs.asdict(msgspec.convert(content, _File)))
     except (ValueError, OverflowError) as failure:  # an unknown key, another type, out of range

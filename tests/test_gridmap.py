@@ -9,17 +9,11 @@ import pytest
 import shapely
 
 from jaxsonar import Log, Ring, random_pose, random_room, simulate
-from jaxsonar.gridmap import (
-    FREE,
-    NO_WALLS,
-    OCCUPIED,
-    UNKNOWN,
-    OccupancyGrid,
-    grid_image_path,
-    occupancy,
-    save_nav2,
-)
+from jaxsonar.gridfile import grid_image_path, save_nav2
+from jaxsonar.gridmap import FREE, NO_WALLS, OCCUPIED, UNKNOWN, OccupancyGrid, occupancy
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.knownwalls import HIDDEN, NO_WALL, KnownWalls, beyond_ends
+from jaxsonar.mapping import build_map
 from jaxsonar.office import load_office
 from jaxsonar.poses import rotation
 from jaxsonar.rooms import Room, point_to_walls
@@ -244,6 +238,75 @@ def test_a_wall_hides_what_a_sensor_that_misses_it_obliquely_looks_at(faw_ring):
     assert not len(behind[True])
     # By agreement: beside the robot's path there are always sensors that look straight at it and hear it.
     assert np.abs(behind[False][:, 0]).min() > 1.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_walls_of_a_map_that_end_too_early_let_nothing_out(faw_ring, seed):
+    rng = np.random.default_rng(1000 + seed)
+    room = random_room(rng)
+    poses = np.stack([random_pose(rng, room) for _ in range(40)])
+    log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed).as_log(faw_ring, poses)
+    grid = occupancy(faw_ring, log, walls=build_map(faw_ring, log).segments)
+    image, points = grid.classify(), centres(grid)
+    inside = truly_free(room, points)
+    assert inside[image == FREE].mean() >= 0.98
+    clear = point_to_walls(points.reshape(-1, 2), room.walls).min(axis=1).reshape(inside.shape) > 0.1
+    near = np.linalg.norm(points[:, :, None] - poses[:, :2], axis=-1).min(axis=2) < 1.0
+    assert (image == FREE)[inside & clear & near].mean() > 0.9
+
+
+def test_the_office_with_walls_of_its_map_is_free_inside_only(office, heard):
+    grid = occupancy(office.ring, heard, walls=build_map(office.ring, heard).segments)
+    image, points = grid.classify(), centres(grid)
+    inside = truly_free(office.room, points)
+    assert inside[image == FREE].mean() >= 0.98
+    assert np.mean(image[inside] == FREE) > 0.85
+
+
+def test_an_open_door_stays_open_for_who_looks_squarely_through_it(faw_ring):
+    walls = np.array([[[-3.0, 1.0], [-0.4, 1.0]], [[0.4, 1.0], [3.0, 1.0]]])
+    past = np.stack([np.linspace(-1, 1, 21), np.zeros(21), np.zeros(21)], axis=-1)
+    grid = occupancy(faw_ring, listen(faw_ring, walls, past), walls=walls)
+    points = centres(grid)
+    x, y = np.abs(points[..., 0]), points[..., 1]
+    assert (grid.classify()[(x < 0.3) & (y > 0.9) & (y < 1.6)] == FREE).all()
+    assert not (grid.classify()[(x > 0.6) & (y > 1.05)] == FREE).any()
+    # Those who only pass obliquely cannot know whether the wall goes on.
+    aside = past[past[:, 0] < -0.65]
+    grid = occupancy(faw_ring, listen(faw_ring, walls, aside), walls=walls)
+    assert not (grid.classify()[centres(grid)[..., 1] > 1.05] == FREE).any()
+
+
+def test_a_wall_goes_on_until_somebody_would_have_heard_it_or_it_meets_another():
+    walls = KnownWalls.of(np.array([[[0.0, 1.0], [2.0, 1.0]], [[2.0, 1.02], [2.0, -1.0]]]), 0.05)
+    position, sure = np.array([[-0.5, 0.0], [-0.8, 0.0]]), np.full(2, 0.2)
+    far, up = np.full(2, 2.0), np.full(2, QUARTER)
+
+    def beyond(heading=up, silent=far):
+        return beyond_ends(position, heading, sure, silent, walls)
+
+    np.testing.assert_allclose(beyond()[0], [0.5 - NO_WALL, 0.0])  # the nearer foot counts
+    np.testing.assert_allclose(beyond(heading=up + np.array([0.3, 0.1]))[0], [0.8 - NO_WALL, 0.0])
+    for unheard in (beyond(heading=-up), beyond(silent=far / 2)):
+        np.testing.assert_allclose(unheard, [[HIDDEN, 0.0], [0.0, HIDDEN]])
+
+
+def test_all_free_cells_can_be_reached_from_where_the_robot_drove(faw_ring):
+    poles = circle((0.0, 0.0), 1.5, 40)[:, :2]
+    poses = circle((0.0, 0.0), 0.6, 20)
+    grid = occupancy(faw_ring, listen(faw_ring, [], poses, poles=poles))
+    image = grid.classify()
+    reached = frontier = (grid.driven[::-1] > 0) & (image == FREE)
+    assert frontier.any()
+    while frontier.any():
+        wide = np.pad(reached, 1)
+        wide = wide[:-2, 1:-1] | wide[2:, 1:-1] | wide[1:-1, :-2] | wide[1:-1, 2:]
+        frontier = wide & (image == FREE) & ~reached
+        reached = reached | frontier
+    assert (reached == (image == FREE)).all()
+    through = grid.free[::-1]
+    agreed = (through >= 2) & (2 * through >= through + grid.hidden[::-1] + grid.arcs[::-1]) & (image == UNKNOWN)
+    assert agreed.any()  # some that looks agreed on were left out
 
 
 def test_the_part_of_the_ring_that_did_not_fire_says_nothing(faw_ring):

@@ -210,7 +210,7 @@ def test_a_scan_without_a_pose_is_as_none(here, capsys):
     assert Path("some.geojson").read_bytes() == Path("less.geojson").read_bytes()
     assert features("some.geojson")
     some, less = capsys.readouterr().err.splitlines()
-    assert "1 scans without a pose" in some
+    assert "1 scan without a pose" in some
     assert "without" not in less
 
 
