@@ -147,7 +147,8 @@ class OccupancyGrid:
         occupied = obstacle | (self.walls > 0) & (self.walls >= through)
         free = (through >= min_looks) & (through >= free_share * (through + self.hidden + self.arcs)) & ~occupied
         # Specks that the robot cannot reach from where it drove are chance, or lie behind a wall that no map knows.
-        island, _ = ndimage.label(free)
+        island = np.zeros(free.shape, np.int32)
+        ndimage.label(free, output=island)
         free &= np.isin(island, island[free & (self.driven > 0)])
         image = np.where(occupied, OCCUPIED, np.where(free, FREE, UNKNOWN)).astype(np.uint8)
         return image[::-1]

@@ -53,7 +53,7 @@ def reference_map(
     points, facing, scan = _near_returns(laser, reach)
     if not len(points):
         return np.zeros((0, 2, 2))
-    origin = np.median(points, axis=0)  # of the lines that vote, however far the world's is
+    origin = np.round(np.median(points, axis=0))  # of the lines that vote, however far the world's is
     points = points - origin
     extent = float(np.abs(points).max())
     if extent > _FARTHEST or np.abs(origin).max() > 1e8:

@@ -39,9 +39,10 @@ def test_the_python_example_runs(folder, capsys):
     (example,) = blocks("python", "import jaxsonar")
     with contextlib.chdir(folder):
         exec(compile(example, "README.md", "exec"), {})
-    walls = capsys.readouterr().out.splitlines()
+    *walls, world = capsys.readouterr().out.splitlines()
     assert len(walls) == 3
     assert all(wall.startswith("wall 1.") for wall in walls)
+    assert world == "8 walls, 8.7 m"
 
 
 def test_the_commands_run(folder, monkeypatch):
@@ -53,7 +54,7 @@ def test_the_commands_run(folder, monkeypatch):
             program, *arguments = shlex.split(command)
             assert program == "jaxsonar"
             assert main(arguments) == 0, command
-        assert {"scans.csv", "scans.parquet", "lines.jsonl", "scan.svg"} <= {file.name for file in folder.iterdir()}
+        assert {"scans.csv", "scans.parquet", "lines.jsonl", "scan.svg", "map.geojson", "map.pgm"} <= {file.name for file in folder.iterdir()}
 
 
 def test_the_table_shows_what_the_demo_measures(folder):
@@ -65,6 +66,14 @@ def test_the_table_shows_what_the_demo_measures(folder):
         keys = ("scans", "echoes_per_scan", "walls", "recall", "false_per_scan")
         keys += ("rho_rms_mm", "rho_rms_over_crb", "theta_rms_deg", "theta_rms_over_crb")
         assert shown == pytest.approx([rows[what][key] for key in keys], rel=0.1, abs=0.06), what
+
+
+def test_the_table_of_maps_shows_what_the_demo_measures(folder):
+    keys = ("segments", "false", "walls", "walls_found", "rho_max_mm", "rho_rms_mm", "theta_max_deg", "theta_rms_deg")
+    for row in json.loads((folder / "demo" / "map-table.json").read_text()):
+        line = next(line for line in README.splitlines() if line.startswith(f"| {row['what']} |"))
+        shown = [float(cell) for cell in line.split("|")[2:-1]]
+        assert shown == pytest.approx([row[key] for key in keys], rel=0.1, abs=0.06), row["what"]
 
 
 def test_pictures_and_pages_exist():
