@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 from rich.table import Table
 
-from jaxsonar import LocalModel, Log, figures, load_ring, local_models
+from jaxsonar import LocalModel, Log, figures, figures_scan, load_ring, local_models
 from jaxsonar.convert import read_scans
 from jaxsonar.poses import wrap_angle
 

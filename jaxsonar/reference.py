@@ -53,10 +53,10 @@ def reference_map(
     points, facing, scan = _near_returns(laser, reach)
     if not len(points):
         return np.zeros((0, 2, 2))
-    origin = np.round(np.median(points, axis=0))  # of the lines that vote, however far the world's is
+    origin = np.round(np.median(points, axis=0) / _FARTHEST) * _FARTHEST  # near enough, wherever the world's is
     points = points - origin
     extent = float(np.abs(points).max())
-    if extent > _FARTHEST or np.abs(origin).max() > 1e8:
+    if extent > 2 * _FARTHEST or np.abs(origin).max() > 1e8:
         x, y = origin
         allowed = f"allowed are {_FARTHEST:g} m for one reference, not beyond 1e8 m"
         raise SonarError(f"poses up to {extent:.3g} m from ({x:.3g}, {y:.3g}) came; {allowed}")

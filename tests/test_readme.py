@@ -54,7 +54,9 @@ def test_the_commands_run(folder, monkeypatch):
             program, *arguments = shlex.split(command)
             assert program == "jaxsonar"
             assert main(arguments) == 0, command
-        assert {"scans.csv", "scans.parquet", "lines.jsonl", "scan.svg", "map.geojson", "map.pgm"} <= {file.name for file in folder.iterdir()}
+        assert {"scans.csv", "scans.parquet", "lines.jsonl", "scan.svg", "map.geojson", "map.pgm"} <= {
+            file.name for file in folder.iterdir()
+        }
 
 
 def test_the_table_shows_what_the_demo_measures(folder):
