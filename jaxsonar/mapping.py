@@ -217,9 +217,8 @@ def _as_map(walls: Pieces) -> GlobalMap:
     walls = walls.take(np.lexsort((walls.centre[:, 1], walls.centre[:, 0], -walls.echoes)))
     normal, tangent = walls.normal, walls.tangent
     rho, lever = (normal * walls.centre).sum(-1), (tangent * walls.centre).sum(-1)
-    # The spread of the pieces around their wall tells how good they are; one alone tells nothing.
-    freedom = 2 * (walls.count - 1)
-    scale = np.where(freedom > 0, walls.misfit / np.maximum(freedom, 1), np.nan)
+    # The spread of the pieces around their wall tells how good they are; what is expected of them counts as one more.
+    scale = (walls.misfit + 2) / (2 * walls.count)
     sigma_theta = np.sqrt(scale / walls.info_theta)
     sigma_rho = np.sqrt(scale / walls.info_offset + (lever * sigma_theta) ** 2)
     theta = np.where(rho < 0, walls.theta + np.pi, walls.theta)

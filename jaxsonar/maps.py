@@ -20,7 +20,8 @@ class GlobalMap:
     theta: Float[np.ndarray, " segments"]
     """Direction of the line's normal, radians, in [-pi, pi)."""
     sigma_rho: Float[np.ndarray, " segments"]
-    """Standard deviation of rho, metres; NaN where it is not known."""
+    """Standard deviation of rho, metres: from how much the added lines differ, for one alone what is expected of it (10
+    mm, 3 deg); NaN where it is not known."""
     sigma_theta: Float[np.ndarray, " segments"]
     """Standard deviation of theta, radians; NaN where it is not known."""
     echoes: Int[np.ndarray, " segments"]

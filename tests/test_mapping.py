@@ -12,6 +12,7 @@ from jaxsonar import Log, Ring, Room, SonarError, load_log, local_models, random
 from jaxsonar.mapping import CONFIRMED, MERGINGS, assemble, build_map, gather_evidence
 from jaxsonar.maps import GlobalMap
 from jaxsonar.office import load_office
+from jaxsonar.pieces import SIGMA_THETA
 from jaxsonar.poses import rotation
 from jaxsonar.simulate import Kind
 
@@ -192,7 +193,8 @@ def test_one_scan_is_a_map(office_log, merging):
     world = build_map(RING, office_log[:1], merging=merging)
     (model,) = local_models(RING, office_log[:1])
     assert 1 <= len(world) <= len(model.lines)
-    assert np.isnan(world.sigma_rho).all() or len(world) < len(model.lines)
+    alone = len(world) == len(model.lines)
+    assert not alone or world.sigma_theta == pytest.approx(SIGMA_THETA, rel=1e-9)  # what is expected of one line
     assert set(world.scans) == {(0,)}
 
 
