@@ -1,7 +1,6 @@
 """What the commands do: read, call the library, write, and say in one line what came of it."""
 
 import argparse
-import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -36,7 +35,7 @@ def demo(options: argparse.Namespace) -> None:
 
 def lines(options: argparse.Namespace) -> None:
     """``jaxsonar lines``."""
-    from .files import refuse_folder, shown
+    from .files import check_outputs, shown
     from .hardware.errors import SonarError
     from .local import local_models, settings_for
     from .logs import load_log
@@ -44,9 +43,7 @@ def lines(options: argparse.Namespace) -> None:
     from .ringfile import load_ring
     from .settings import load_settings, save_settings
 
-    _refuse_overwriting(options.output, options.log, options.ring)
-    if options.figure:
-        refuse_folder(options.figure)  # complain before the work, not after it
+    check_outputs({"-o": options.output, "--figure": options.figure}, [options.log, options.ring, options.settings])
     if options.scan is not None and not options.figure:
         raise SonarError(f"--scan {options.scan} came alone; allowed is --scan with --figure, to which it belongs")
     ring, log = load_ring(options.ring), load_log(options.log)
@@ -247,7 +244,7 @@ def evaluate(options: argparse.Namespace) -> None:
 
 def simulate(options: argparse.Namespace) -> None:
     """``jaxsonar simulate``."""
-    from .files import write_toml
+    from .files import check_outputs, write_toml
     from .logs import log_format, save_log
     from .logs_csv import csv_lines
     from .ringfile import load_ring
@@ -255,7 +252,7 @@ def simulate(options: argparse.Namespace) -> None:
     from .roompaths import load_path
     from .simulate import simulate as simulate_scans
 
-    _refuse_overwriting(options.output, options.room, options.ring, options.path)
+    check_outputs({"-o": options.output}, [options.room, options.ring, options.path])
     if options.output != "-":
         log_format(options.output)  # complain before the work, not after it
     ring, room = load_ring(options.ring), load_room(options.room)
@@ -330,15 +327,6 @@ def _settings_beside(output: str) -> Path | None:
     """Where the settings of a result go; none beside standard output, a device or a pipe."""
     path = Path(output)
     return None if output == "-" or (path.exists() and not path.is_file()) else path.with_suffix(".settings.toml")
-
-
-def _refuse_overwriting(output: str, *inputs: str) -> None:
-    from .files import shown
-    from .hardware.errors import SonarError
-
-    for given in inputs:
-        if os.path.exists(given) and os.path.exists(output) and os.path.samefile(given, output):
-            raise SonarError(f"-o {shown(output)}: this is an input; allowed is another file")
 
 
 def _settings_file(output: str) -> Path | None:

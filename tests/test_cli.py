@@ -308,11 +308,11 @@ MISTAKES = {
     "scan without a figure": (f"{LINES} --scan 3", {}, ["--scan 3", "--figure"]),
     "figure of unknown suffix": (f"{LINES} --figure a.gif", {}, ["a.gif", ".svg", ".png", ".pdf"]),
     "figure without a suffix": (f"{LINES} --figure png", {}, ["png", ".svg", ".png", ".pdf"]),
-    "missing output folder": ("lines log.csv --ring faw -o no/out.jsonl", {}, ["no/out.jsonl", "cannot write"]),
+    "missing output folder": ("lines log.csv --ring faw -o no/out.jsonl", {}, ["no/out.jsonl", "no such folder"]),
     "output folder that is a file": (
         "lines log.csv --ring faw -o log.csv/out.jsonl",
         {},
-        ["log.csv/out.jsonl", "cannot"],
+        ["log.csv/out.jsonl", "no such folder"],
     ),
     "output that is a folder": ("lines log.csv --ring faw -o dir", {"dir": None}, ["dir", "directory"]),
     "missing settings": (f"{LINES} --settings no.toml", {}, ["no.toml", "No such file"]),
