@@ -169,7 +169,7 @@ def map_figure(
     handles = [_draw_map(axes, world)]
     if aggregated is not None:
         axes.add_collection(LineCollection(list(aggregated), colors=CROSS, linewidths=1, alpha=0.7, zorder=4))
-        handles.append(Line2D([], [], color=CROSS, lw=1, label="segment from one scan"))
+        handles.append(Line2D([], [], color=CROSS, lw=1, label="segment of a local model"))
     if room is not None:
         draw_walls(axes, room)
         handles += [wall_handle(), *pole_handles(room)]
