@@ -5,6 +5,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -52,16 +53,15 @@ def lines(options: argparse.Namespace) -> None:
         held = f"numbers from {log.scan.min()} to {log.scan.max()}" if len(log) else "none"
         raise SonarError(f"--scan {options.scan}: no such scan in {shown(options.log)}; it holds {len(log)}, {held}")
 
-    def left_out(count: int) -> None:
-        _say(f"left out {count} echoes of pairs of sensors that {ring.name!r} does not listen to")
-
     try:
-        models = local_models(ring, log, method=options.method, settings=settings, on_left_out=left_out)
+        models = local_models(
+            ring, log, method=options.method, settings=settings, on_left_out=partial(_say_left_out, ring.name)
+        )
     except SonarError as error:
         raise SonarError(f"{shown(options.log)}: {error}") from None
     tally = _Tally(options.scan)
     save_models(tally.watch(_progress(models, len(log), "scans")), options.output)
-    if beside := _settings_file(options.output):
+    if beside := _settings_beside(options.output):
         save_settings(settings, beside)
     model = tally.wanted
     if options.figure and model is None:
@@ -154,7 +154,7 @@ def map(options: argparse.Namespace) -> None:
             title=f"{_count(len(world), 'wall')} from {_plain(options.log)}",
         )
     save_map(world, options.output)
-    if beside is not None and Path(options.output).is_file():
+    if beside is not None:
         write_toml(_said(settings, window=options.window, merging=options.merging), beside)
     if grid is not None:
         from .gridfile import save_nav2
@@ -169,7 +169,7 @@ def map(options: argparse.Namespace) -> None:
 
         figures.save(figure, options.figure)
     if left_out:
-        _say(f"left out {left_out[0]} echoes of pairs of sensors that {ring.name!r} does not listen to")
+        _say_left_out(ring.name, left_out[0])
     homeless = int((~np.all(np.isfinite(log.pose), axis=1)).sum())
     without = f"; {_count(homeless, 'scan')} without a pose left out" if homeless else ""
     _say(
@@ -276,7 +276,7 @@ def simulate(options: argparse.Namespace) -> None:
         sys.stdout.writelines(csv_lines(log))
     else:
         save_log(log, options.output)
-    if beside := _settings_file(options.output):
+    if beside := _settings_beside(options.output):
         said = {key: value for key, value in vars(options).items() if key not in ("command", "output")}
         write_toml(said, beside)
     _say(f"{len(log)} scans, {len(log.range)} echoes")
@@ -329,11 +329,6 @@ def _settings_beside(output: str) -> Path | None:
     return None if output == "-" or (path.exists() and not path.is_file()) else path.with_suffix(".settings.toml")
 
 
-def _settings_file(output: str) -> Path | None:
-    """Where the settings go that a result was made with; beside a device, a pipe or standard output is no place."""
-    return Path(output).with_suffix(".settings.toml") if output != "-" and Path(output).is_file() else None
-
-
 class _Tally:
     """What a run over many scans came to, and the model that a figure is wanted of."""
 
@@ -362,6 +357,10 @@ class _Tally:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr)
+
+
+def _say_left_out(ring: str, count: int) -> None:
+    _say(f"left out {count} echoes of pairs of sensors that {ring!r} does not listen to")
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 from .pieces import Pieces
 from .poses import wrap_angle
+from .rooms import cross
 from .seenthrough import CELL, SeenThrough
 
 LONG = 0.6
@@ -48,10 +49,9 @@ def without_corners(pieces: Pieces, walls: Pieces) -> Pieces:
     turn = _turn(pieces.theta[piece][:, None], walls.theta[owners[place]])
     free_end = owners[place, 0] == owners[place, 1]
     square = free_end & (np.abs(turn[:, 0] - np.pi / 2) < SQUARE)
-    other = np.all(turn > TURNED, axis=1) & ~square
-    ghost[piece[other]] = True
-    along = ~np.all(turn > TURNED, axis=1) & ~free_end
-    ghost[piece[along]] = False  # in the direction of a wall that meets another here
+    turned = np.all(turn > TURNED, axis=1)
+    ghost[piece[turned & ~square]] = True
+    ghost[piece[~turned & ~free_end]] = False  # in the direction of a wall that meets another here
     return pieces.take(~ghost)
 
 
@@ -93,9 +93,9 @@ def trim(pieces: Pieces, wall_of: Int[np.ndarray, " pieces"], seen: SeenThrough)
     # Another piece of the same wall may have been seen there since.
     last = np.full(len(suspects), -np.inf)
     order = np.argsort(wall_of, kind="stable")
+    begins, stops = (np.searchsorted(wall_of[order], wall_of[piece[suspects]], side=side) for side in ("left", "right"))
     for k, sample in enumerate(suspects):
-        wall = wall_of[piece[sample]]
-        mates = order[np.searchsorted(wall_of[order], wall) : np.searchsorted(wall_of[order], wall, side="right")]
+        mates = order[begins[k] : stops[k]]
         way = ((place[sample] - pieces.centre[mates]) * pieces.tangent[mates]).sum(-1)
         covers = (way >= pieces.ends[mates, 0]) & (way <= pieces.ends[mates, 1])
         last[k] = pieces.latest[mates[covers]].max(initial=-np.inf)
@@ -163,12 +163,11 @@ def _vertices(
     pairs = tree.query_pairs(reach, output_type="ndarray").reshape(-1, 2)
     a, b = segments[pairs[:, 0]], segments[pairs[:, 1]]
     u, v, offset = a[:, 1] - a[:, 0], b[:, 1] - b[:, 0], b[:, 0] - a[:, 0]
-    turn = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    turn = cross(u, v)
     length_a, length_b = np.linalg.norm(u, axis=-1), np.linalg.norm(v, axis=-1)
     meets = np.abs(turn) > np.sin(2 * TURNED) * length_a * length_b
     turn = np.where(meets, turn, np.nan)
-    share_a = (offset[:, 0] * v[:, 1] - offset[:, 1] * v[:, 0]) / turn
-    share_b = (offset[:, 0] * u[:, 1] - offset[:, 1] * u[:, 0]) / turn
+    share_a, share_b = cross(offset, v) / turn, cross(offset, u) / turn
     beyond = [np.maximum(np.maximum(-s, s - 1), 0) * n for s, n in ((share_a, length_a), (share_b, length_b))]
     meets &= np.maximum(*beyond) <= REACH
     places = (a[:, 0] + share_a[:, None] * u)[meets]

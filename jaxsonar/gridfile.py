@@ -25,7 +25,7 @@ def grid_image_path(path: str | os.PathLike[str]) -> Path:
 
 def check_grid(grid: OccupancyGrid) -> None:
     """Raise a SonarError for a grid without cells, which is no map."""
-    if not grid.classify().size:
+    if not grid.free.size:
         why = f"{grid.skipped} scans without a pose" if grid.skipped else "no scan"
         raise SonarError(f"{why} came, the grid is empty; needed is a scan with a pose")
 

@@ -18,6 +18,7 @@ from .logs import Log
 from .maps import GlobalMap
 from .merging import merge_as_paper
 from .pieces import Pieces, add_up, aggregate, join
+from .poses import wrap_angle
 from .ring import Ring
 from .seenthrough import SeenThrough, silence
 
@@ -129,8 +130,8 @@ def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> Evide
     poses = log.pose[rows]
     known = np.all(np.isfinite(poses), axis=1)
     pieces = aggregate(models, poses)
-    segment_model = np.repeat(np.flatnonzero(known), [len(models[k].lines) for k in np.flatnonzero(known)])
-    shows = [pieces.segments[segment_model == k] for k in range(len(models))]
+    counts = [len(model.lines) if here else 0 for model, here in zip(models, known, strict=True)]
+    shows = np.split(pieces.segments, np.cumsum(counts)[:-1])  # the segments of each model
     flat, _ = FlatEchoes.from_log(ring, log)
     reach = np.asarray(ring.corrected(flat.reported, *ring.paths[flat.path].T))
     placed = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1))
@@ -139,12 +140,11 @@ def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> Evide
     seen = SeenThrough()
     for first in range(0, len(placed), _BLOCK):
         block = placed[first : first + _BLOCK]
-        place = np.full(len(log), -1)
-        place[block] = np.arange(len(block))
-        scan = place[flat.scan]
-        mine = (scan >= 0) & (reach > 0) & (reach < ring.max_range)
+        echo = np.arange(int(flat.start[block[0]]), int(flat.start[block[-1] + 1]))
+        echo = echo[(reach[echo] > 0) & (reach[echo] < ring.max_range) & np.isin(flat.scan[echo], block)]
+        scan = np.searchsorted(block, flat.scan[echo])
         walls = [shows[k] for k in np.searchsorted(rows, block)]
-        cells, who = silence(ring, log.pose[block], scan[mine], flat.path[mine], reach[mine], walls)
+        cells, who = silence(ring, log.pose[block], scan, flat.path[echo], reach[echo], walls)
         seen = seen.including(cells, when[block][who])
     places = np.unique(np.round(poses[known, :2] / _PLACE).astype(np.int64), axis=0)
     return Evidence(pieces, seen, places, int(known.sum()))
@@ -165,8 +165,10 @@ def assemble(evidence: Evidence, *, merging: str = "fused", confirmed: int = CON
     confirmed = min(confirmed, max(1, evidence.models - 1))
     # Pieces of one wall add up; what later scans look through goes, and the rest adds up again.
     walls, wall_of = fuse(pieces, gap=evidence.gap)
-    pieces = trim(pieces, wall_of, seen)
-    walls, _ = fuse(pieces, gap=evidence.gap)
+    trimmed = trim(pieces, wall_of, seen)
+    if trimmed is not pieces:
+        pieces = trimmed
+        walls, _ = fuse(pieces, gap=evidence.gap)
     # Corners and poles answer like walls, from every pose in another direction.
     pieces = without_corners(pieces, walls)
     walls = without_points(fuse(pieces, gap=evidence.gap)[0])
@@ -225,7 +227,7 @@ def _as_map(walls: Pieces) -> GlobalMap:
     return GlobalMap(
         segments=walls.segments,
         rho=np.abs(rho),
-        theta=(theta + np.pi) % (2 * np.pi) - np.pi,
+        theta=wrap_angle(theta),
         sigma_rho=sigma_rho,
         sigma_theta=sigma_theta,
         echoes=walls.echoes,

@@ -14,7 +14,7 @@ from jaxsonar import kernels
 
 from .components import label_components
 from .echoes import room_for
-from .pieces import Pieces, add_up, overwrite
+from .pieces import Pieces, add_up, outermost, overwrite
 from .poses import wrap_angle
 
 RHO_CELL = 0.10
@@ -131,10 +131,7 @@ def _on_lines(
     theta = np.where(np.cos(line[:, 1] - summed.theta) < 0, wrap_angle(line[:, 1] + np.pi), line[:, 1])
     tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
     foot = origin + line[:, :1] * np.stack([np.cos(line[:, 1]), np.sin(line[:, 1])], axis=-1)
-    way = ((pieces.segments - foot[group][:, None]) * tangent[group][:, None]).sum(-1)
-    first, last = np.full(len(foot), np.inf), np.full(len(foot), -np.inf)
-    np.minimum.at(first, group, way.min(axis=1))
-    np.maximum.at(last, group, way.max(axis=1))
+    first, last = outermost(pieces.segments, group, foot, tangent)
     middle = (first + last) / 2
     alone = np.bincount(group) == 1
     merged = replace(

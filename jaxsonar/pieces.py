@@ -168,10 +168,7 @@ def add_up(pieces: Pieces, group: Int[np.ndarray, " pieces"]) -> Pieces:
 
     centre = origin + middle
     tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
-    ends = ((pieces.segments - centre[group][:, None]) * tangent[group][:, None]).sum(-1)
-    low, high = np.full(groups, np.inf), np.full(groups, -np.inf)
-    np.minimum.at(low, group, ends.min(axis=1))
-    np.maximum.at(high, group, ends.max(axis=1))
+    low, high = outermost(pieces.segments, group, centre, tangent)
     latest = np.full(groups, -np.inf)
     np.maximum.at(latest, group, pieces.latest)
     count = total(pieces.count)
@@ -190,6 +187,20 @@ def add_up(pieces: Pieces, group: Int[np.ndarray, " pieces"]) -> Pieces:
     )
     alone = members == 1
     return overwrite(summed, alone, pieces.take(first[alone]))
+
+
+def outermost(
+    segments: Float[np.ndarray, "pieces 2 2"],
+    group: Int[np.ndarray, " pieces"],
+    foot: Float[np.ndarray, "groups 2"],
+    tangent: Float[np.ndarray, "groups 2"],
+) -> tuple[Float[np.ndarray, " groups"], Float[np.ndarray, " groups"]]:
+    """First and last of the endpoints of each group, projected onto its line, metres from the foot (section 5)."""
+    ends = ((segments - foot[group][:, None]) * tangent[group][:, None]).sum(-1)
+    low, high = np.full(len(foot), np.inf), np.full(len(foot), -np.inf)
+    np.minimum.at(low, group, ends.min(axis=1))
+    np.maximum.at(high, group, ends.max(axis=1))
+    return low, high
 
 
 def overwrite(pieces: Pieces, rows: Bool[np.ndarray, " pieces"], by: Pieces) -> Pieces:
