@@ -28,11 +28,13 @@ class Lines:
     theta: Float[np.ndarray, "scans lines"]
     """Direction of the normal, radians, in [-pi, pi)."""
     votes: Float[np.ndarray, "scans lines"]
-    """Number of arc points in the line's component."""
+    """How strong the line is. Method hough: number of arc points in its component; ml: nats of evidence."""
     echoes: Int[np.ndarray, "scans lines"]
-    """Number of echoes that have a point in the component."""
+    """Number of echoes that have a point in the component, or that the line explains."""
     segments: Float[np.ndarray, "scans lines 2 2"]
     """Endpoints (x, y), metres (paper, section 5)."""
+    cov: Float[np.ndarray, "scans lines 2 2"]
+    """Covariance of (rho, theta), square metres and radians; NaN where the method gives none (hough)."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,7 @@ def _sift(
         votes=np.where(kept, sifted(votes), np.nan),
         echoes=np.where(kept, sifted(echoes), 0),
         segments=np.where(kept[..., None, None], sifted(segments), np.nan),
+        cov=np.full((*kept.shape, 2, 2), np.nan, np.float32),
     )
     return lines, sifted(involved)
 

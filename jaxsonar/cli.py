@@ -15,6 +15,7 @@ from jaxsonar.hardware.errors import SonarError
 
 from .files import FIGURE_FORMATS as FIGURES
 
+SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for each scan)"
 RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
 
 
@@ -82,7 +83,8 @@ def parser() -> argparse.ArgumentParser:
     lines = command("lines", "Straight lines around the robot, from every scan of a log.")
     lines.add_argument("log", metavar="LOG", help="scan log, .csv or .parquet")
     lines.add_argument("--ring", required=True, help=RING_HELP)
-    lines.add_argument("--method", choices=("hough",), default="hough", help="default: hough, the paper's")
+    lines.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
+    lines.add_argument("--sigma", type=_finite(1e-6, 1), metavar="METRES", help=SIGMA_HELP)
     lines.add_argument("--settings", metavar="TOML", help="accumulator, low pass and threshold, instead of the paper's")
     lines.add_argument(
         "-o", "--output", metavar="LINES", required=True, help="JSON Lines, an object a scan; - = stdout"
@@ -95,7 +97,8 @@ def parser() -> argparse.ArgumentParser:
     map_ = command("map", "The walls of the world, from a log of scans with poses.")
     map_.add_argument("log", type=_file, metavar="LOG", help="scan log with poses, .csv or .parquet")
     map_.add_argument("--ring", type=_file, required=True, help=RING_HELP)
-    map_.add_argument("--method", choices=("hough",), default="hough", help="default: hough, the paper's")
+    map_.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
+    map_.add_argument("--sigma", type=_finite(1e-6, 1), metavar="METRES", help=SIGMA_HELP)
     map_.add_argument(
         "--settings", type=_file, metavar="TOML", help="accumulator, low pass and threshold, instead of the paper's"
     )

@@ -55,7 +55,12 @@ def lines(options: argparse.Namespace) -> None:
 
     try:
         models = local_models(
-            ring, log, method=options.method, settings=settings, on_left_out=partial(_say_left_out, ring.name)
+            ring,
+            log,
+            method=options.method,
+            settings=settings,
+            sigma=options.sigma,
+            on_left_out=partial(_say_left_out, ring.name),
         )
     except SonarError as error:
         raise SonarError(f"{shown(options.log)}: {error}") from None
@@ -121,6 +126,7 @@ def map(options: argparse.Namespace) -> None:
             log,
             method=options.method,
             settings=settings,
+            sigma=options.sigma,
             window=options.window,
             on_left_out=left_out.append,
         )

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from jaxsonar import kernels
 
 from .candidates import settings_for
+from .explained import check_sigma
 from .local import LocalModel, check_method, local_model, models_of
 from .logs import Log, Scan
 from .mapping import CONFIRMED, Evidence, assemble, check_merging, gather_evidence
@@ -55,14 +56,17 @@ class Mapper:
     """
 
     ring: Ring
-    method: str = "hough"
+    method: str = "ml"
     settings: kernels.HoughSettings | None = None
+    sigma: float | None = None
+    """Standard deviation of the ranges, metres; None: estimated for each scan."""
     window: float | None = None
     """Metres of path gathered into one local model; None: every scan is one."""
     merging: str = "fused"
 
     def __post_init__(self):
         check_method(self.method)
+        check_sigma(self.sigma)
         check_merging(self.merging)
         check_window(self.window)
         object.__setattr__(self, "settings", settings_for(self.ring, self.settings, window=self.window))
@@ -81,7 +85,8 @@ class Mapper:
         if self.window is None:
             if not np.isfinite(scan.pose).all():
                 return state, _nothing("no pose")
-            model = local_model(self.ring, scan, method=self.method, settings=self.settings)
+            choices = {"method": self.method, "settings": self.settings, "sigma": self.sigma}
+            model = local_model(self.ring, scan, **choices)
             return self._with(state, model, Log.from_scans([scan]))
         if not np.isfinite(scan.pose).all():
             state, info = self._closed(state)

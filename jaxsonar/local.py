@@ -15,13 +15,15 @@ from .candidates import arcs_of as arcs_of
 from .candidates import extract
 from .candidates import settings_for as settings_for
 from .echoes import FlatEchoes
+from .explained import KINDS, Explained, check_sigma, explained
 from .logs import Log, Scan
+from .poses import wrap_angle
 from .ring import Ring
 from .verification import verified
 from .windows import Windows, check_window, gather
 
-METHODS = ("hough",)
-"""How lines are found; hough is the paper's way."""
+METHODS = ("ml", "hough")
+"""How lines are found: ml is maximum likelihood over the ranges, hough the paper's way."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +36,87 @@ class Line:
     """Direction of the normal, radians, in [-pi, pi)."""
     segment: Float[np.ndarray, "2 2"]
     """Endpoints (x, y): the outermost feet of the involved real and virtual sensors, metres."""
-    votes: int
-    """Number of arc points in the line's component."""
+    votes: float
+    """How strong it is. Method hough: number of arc points in its component; ml: nats of evidence."""
     echoes: int
-    """Number of echoes that have a point in the component."""
+    """Number of echoes that have a point in the component, or that the line explains."""
     paths: Int[np.ndarray, "paths 2"]
     """(tx, rx) of those echoes: the involved real sensors, and virtual ones where tx and rx differ."""
     scans: tuple[int, ...]
     """Numbers of the scans that those echoes come from: one, unless scans were gathered over a window."""
+    cov: Float[np.ndarray, "2 2"] | None = None
+    """Covariance of (rho, theta), square metres and radians; None: not known (method hough)."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain numbers only."""
+        line: dict[str, Any] = {"rho": self.rho, "theta": self.theta}
+        strength = "votes" if self.cov is None else "evidence"
+        if self.cov is not None:
+            line["cov"] = self.cov.tolist()
+        return line | {
+            "segment": self.segment.tolist(),
+            "echoes": self.echoes,
+            strength: self.votes,
+            "paths": self.paths.tolist(),
+        }
+
+
+@dataclass(frozen=True)
+class Point:
+    """One corner, edge or pole as seen from one scan, robot frame."""
+
+    x: float
+    """Metres."""
+    y: float
+    """Metres."""
+    kind: str
+    """"corner" (right-angled, reflects twice) or "edge" (diffracts; thin poles, too)."""
+    cov: Float[np.ndarray, "2 2"]
+    """Covariance of (x, y), square metres."""
+    echoes: int
+    """Number of echoes that it explains."""
+    paths: Int[np.ndarray, "paths 2"]
+    """(tx, rx) of those echoes."""
+    probability: float
+    """That it is of this kind."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain numbers only."""
+        return {
+            "x": self.x,
+            "y": self.y,
+            "cov": self.cov.tolist(),
+            "kind": self.kind,
+            "echoes": self.echoes,
+            "probability": self.probability,
+            "paths": self.paths.tolist(),
+        }
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """A reflector whose kind the echoes do not decide: what it is if it is a wall, and where if it is a point."""
+
+    rho: float
+    """Distance of the line that its echoes touch, metres."""
+    theta: float
+    """Direction of the normal of that line, radians, in [-pi, pi)."""
+    x: float
+    """Place of the corner or edge; of a wall the middle of what was seen, metres."""
+    y: float
+    """Metres."""
+    probability: dict[str, float]
+    """Of "plane", "corner" and "edge"."""
+    echoes: int
+    """Number of echoes."""
+    paths: Int[np.ndarray, "paths 2"]
+    """(tx, rx) of those echoes."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain numbers only."""
+        return {name: getattr(self, name) for name in ("rho", "theta", "x", "y", "probability", "echoes")} | {
+            "paths": self.paths.tolist()
+        }
 
 
 @dataclass(frozen=True)
@@ -53,24 +128,27 @@ class LocalModel:
     stamp: float
     """Seconds; NaN where the log has none."""
     lines: tuple[Line, ...]
-    """Strongest first."""
+    """Walls, strongest first."""
     empty: str = ""
     """Why there is no line; empty if there is one."""
+    points: tuple[Point, ...] = ()
+    """Corners and edges, strongest first; method hough finds none."""
+    undecided: tuple[Undecided, ...] = ()
+    """What may be a wall or a corner or an edge; method hough takes everything for a wall."""
+    sigma: float = float("nan")
+    """Noise of the ranges, given or estimated from this scan, metres; NaN with method hough."""
 
     def as_json(self) -> dict[str, Any]:
         """One object of the JSON Lines format, plain numbers only."""
-        lines = [
-            {
-                "rho": line.rho,
-                "theta": line.theta,
-                "segment": line.segment.tolist(),
-                "echoes": line.echoes,
-                "votes": line.votes,
-                "paths": line.paths.tolist(),
-            }
-            for line in self.lines
-        ]
-        model = {"scan": self.scan, "stamp": None if np.isnan(self.stamp) else self.stamp, "lines": lines}
+        model: dict[str, Any] = {
+            "scan": self.scan,
+            "stamp": None if np.isnan(self.stamp) else self.stamp,
+            "lines": [line.as_json() for line in self.lines],
+        }
+        if not np.isnan(self.sigma):
+            model["points"] = [point.as_json() for point in self.points]
+            model["undecided"] = [reflector.as_json() for reflector in self.undecided]
+            model["sigma"] = self.sigma
         return model | {"empty": self.empty} if self.empty else model
 
 
@@ -78,39 +156,49 @@ def extract_lines(
     ring: Ring,
     ranges: Float[np.ndarray, "scans paths echoes"],
     *,
-    method: str = "hough",
+    method: str = "ml",
     settings: kernels.HoughSettings | None = None,
+    sigma: float | None = None,
 ) -> Lines:
     """Straight lines around the robot, for a batch of scans (paper, section 4).
 
     Args:
         ring: the sensors; its ``paths`` give the order of the second axis.
         ranges: (scans, paths, echoes) half path lengths as a log has them, metres, NaN = no echo.
-        method: "hough", the paper's way.
+        method: "ml", maximum likelihood over the ranges, or "hough", the paper's way.
         settings: accumulator, low pass and threshold; the paper's, as large as the ring needs, if left out.
+        sigma: standard deviation of the ranges, metres, for ml; estimated for each scan if left out.
 
     Raises:
-        SonarError: another shape, a range that is not positive, an unknown method.
+        SonarError: another shape, a range that is not positive, an unknown method, a sigma that is not positive.
     """
     check_method(method)
-    echoes = FlatEchoes.from_dense(ring, ranges)
-    steps = [step.lines for step in extract(ring, echoes, settings_for(ring, settings))]
+    check_sigma(sigma)
+    echoes, settings = FlatEchoes.from_dense(ring, ranges), settings_for(ring, settings)
+    found = extract(ring, echoes, settings) if method == "hough" else explained(ring, echoes, settings, sigma)
+    steps = [step.lines for step in found]
     return _concatenate(steps)
 
 
 def local_model(
-    ring: Ring, scan: Scan, *, method: str = "hough", settings: kernels.HoughSettings | None = None
+    ring: Ring,
+    scan: Scan,
+    *,
+    method: str = "ml",
+    settings: kernels.HoughSettings | None = None,
+    sigma: float | None = None,
 ) -> LocalModel:
     """The walls around the robot from one scan of a log; arguments and errors as ``local_models``."""
-    return next(local_models(ring, scan.as_log(), method=method, settings=settings))
+    return next(local_models(ring, scan.as_log(), method=method, settings=settings, sigma=sigma))
 
 
 def local_models(
     ring: Ring,
     log: Log,
     *,
-    method: str = "hough",
+    method: str = "ml",
     settings: kernels.HoughSettings | None = None,
+    sigma: float | None = None,
     window: float | None = None,
     on_left_out: Callable[[int], None] | None = None,
 ) -> Iterator[LocalModel]:
@@ -119,16 +207,20 @@ def local_models(
     Args:
         ring: the sensors.
         log: scans; their poses are used for windows only.
-        method: "hough", the paper's way.
+        method: "ml": the walls, corners and edges that explain the echoes best, by maximum likelihood over the ranges;
+            "hough": the paper's way, lines only.
         settings: accumulator, low pass and threshold; the paper's, as large as the ring needs, if left out.
+        sigma: standard deviation of the ranges, metres, for ml; estimated for each scan if left out.
         window: gather the scans of this length of path into one local model, metres (``windows.gather``), for rings so
-            sparse that one scan cannot carry a line; every scan for itself if left out.
+            sparse that one scan cannot carry a line; every scan for itself if left out. Both methods then take the
+            Hough step's lines that a fit to the ranges confirms (``verification``).
         on_left_out: told once how many echoes are of pairs (tx, rx) that this ring does not listen to.
 
     Raises:
-        SonarError: a sensor number that the ring does not have, an unknown method, a window that is not positive.
+        SonarError: a sensor number that the ring does not have, an unknown method, a window or a sigma out of range.
     """
     check_method(method)
+    check_sigma(sigma)
     check_window(window)
     settings = settings_for(ring, settings, window=window)
     if window is None:
@@ -138,6 +230,8 @@ def local_models(
         windows, left_out = gather(ring, log, length=window)
     if left_out and on_left_out is not None:
         on_left_out(left_out)
+    if window is None and method == "ml":
+        return _explained_models(ring, log, windows.echoes, settings, sigma)
     return models_of(ring, log, windows, settings)
 
 
@@ -168,6 +262,46 @@ def models_of(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSet
             yield LocalModel(int(log.scan[index]), float(log.stamp[index]), lines, empty)
 
 
+def _explained_models(
+    ring: Ring, log: Log, echoes: FlatEchoes, settings: kernels.HoughSettings, sigma: float | None
+) -> Iterator[LocalModel]:
+    """A local model of every scan of a log by maximum likelihood."""
+    for found in explained(ring, echoes, settings, sigma):
+        for row, index in enumerate(range(found.step.scans.start, found.step.scans.stop)):
+            yield _explained_model(ring, found, row, int(log.scan[index]), float(log.stamp[index]))
+
+
+def _explained_model(ring: Ring, explained: Explained, row: int, scan: int, stamp: float) -> LocalModel:
+    step, found, decided = explained.step, explained.found, explained.decided[row]
+    lines, points, undecided = [], [], []
+    for k in np.flatnonzero(found.kind[row] >= 0):
+        own = np.flatnonzero(found.involved[row, k])
+        seen: dict[str, Any] = {"echoes": len(own), "paths": ring.paths[np.unique(step.path[row, own])]}
+        a, b = found.parameters[row, k].tolist()
+        cov = np.asarray(found.covariance[row, k], dtype=np.float64)
+        probability: dict[str, float] = dict(zip(KINDS, found.probability[row, k].tolist(), strict=True))
+        segment = np.asarray(found.segment[row, k])
+        if decided[k] == kernels.PLANE:
+            evidence = float(found.evidence[row, k])
+            lines.append(Line(rho=a, theta=b, segment=segment, votes=evidence, scans=(scan,), cov=cov, **seen))
+        elif decided[k] >= 0:
+            kind = KINDS[decided[k]]
+            points.append(Point(x=a, y=b, kind=kind, cov=cov, probability=probability[kind], **seen))
+        else:
+            plane = found.kind[row, k] == kernels.PLANE
+            rho, theta = (a, b) if plane else (float(np.hypot(a, b)), float(wrap_angle(np.arctan2(b, a))))
+            x, y = segment.mean(axis=0).tolist() if plane else (a, b)
+            undecided.append(Undecided(rho=rho, theta=theta, x=x, y=y, probability=probability, **seen))
+    empty = ""
+    if not lines:
+        corrected = np.asarray(ring.corrected(step.reported[row], *ring.paths[step.path[row]].T))
+        heard = int((corrected < ring.max_range).sum())
+        others = len(points) + len(undecided)
+        empty = f"no wall, but {others} other reflectors" if others else "no reflector explains the echoes"
+        empty = "no echo within the maximum range" if heard == 0 else empty
+    return LocalModel(scan, stamp, tuple(lines), empty, tuple(points), tuple(undecided), float(found.sigma[row]))
+
+
 def check_method(method: str) -> None:
     """Raise a SonarError for an unknown method."""
     if method not in METHODS:
@@ -186,8 +320,8 @@ def _why_empty(heard: int, components: int, min_echoes: int) -> str:
 
 def _concatenate(steps: list[Lines]) -> Lines:
     """One batch from several, with room for as many lines as the scan with the most, at least one."""
-    empty = np.zeros((0, 1), np.float32)
-    nothing = Lines(empty, empty, empty.astype(np.float64), empty.astype(np.int64), np.zeros((0, 1, 2, 2), np.float32))
+    none, pair = np.zeros((0, 1), np.float32), np.zeros((0, 1, 2, 2), np.float32)
+    nothing = Lines(none, none, none.astype(np.float64), none.astype(np.int64), segments=pair, cov=pair)
     steps = [nothing, *steps]
     most = max(step.rho.shape[1] for step in steps)
 

@@ -89,8 +89,9 @@ def build_map(
     ring: Ring,
     log: Log,
     *,
-    method: str = "hough",
+    method: str = "ml",
     settings: kernels.HoughSettings | None = None,
+    sigma: float | None = None,
     window: float | None = None,
     merging: str = "fused",
     on_left_out: Callable[[int], None] | None = None,
@@ -102,6 +103,7 @@ def build_map(
         log: scans; those without a pose are left out.
         method: how lines are found in a scan, as ``local_models``.
         settings: of the Hough step, as ``local_models``.
+        sigma: noise of the ranges, as ``local_models``.
         window: metres of path gathered into one local model, as ``local_models``.
         merging: "fused", or "paper" for the paper's way.
         on_left_out: told how many echoes are of pairs of sensors that this ring does not listen to.
@@ -111,7 +113,8 @@ def build_map(
     """
     check_merging(merging)
     check_poses(log)
-    models = list(local_models(ring, log, method=method, settings=settings, window=window, on_left_out=on_left_out))
+    choices = {"method": method, "settings": settings, "sigma": sigma, "window": window}
+    models = list(local_models(ring, log, **choices, on_left_out=on_left_out))
     evidence = gather_evidence(ring, log, models)
     return assemble(evidence, merging=merging, confirmed=1 if window else CONFIRMED)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .local import LocalModel
+from .local import Line, LocalModel
 from .poses import to_world, wrap_angle
 
 SIGMA_OFFSET, SIGMA_THETA = 0.01, float(np.radians(3.0))
@@ -96,7 +96,7 @@ def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]
     theta = np.array([line.theta for _, line in lines]) + poses[model, 2]
     segments = np.array([line.segment for _, line in lines], dtype=np.float64).reshape(-1, 2, 2)
     ends = np.array([to_world(poses[k], segment) for k, segment in zip(model, segments, strict=True)]).reshape(-1, 2, 2)
-    centre = ends.mean(axis=1)
+    centre, info_offset, info_theta = _known_best(lines, ends, theta)
     tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
     echoes = np.array([line.echoes for _, line in lines], dtype=np.int64)
     along = np.sort(((ends - centre[:, None]) * tangent[:, None]).sum(-1), axis=1)
@@ -106,8 +106,8 @@ def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]
         centre=centre,
         theta=wrap_angle(theta),
         ends=along,
-        info_offset=np.full(len(lines), SIGMA_OFFSET**-2),
-        info_theta=np.full(len(lines), SIGMA_THETA**-2),
+        info_offset=info_offset,
+        info_theta=info_theta,
         misfit=np.zeros(len(lines)),
         count=np.ones(len(lines), dtype=np.int64),
         echoes=echoes,
@@ -115,6 +115,32 @@ def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]
         latest=when[model],
         scans=unique_pairs(*seen.reshape(-1, 2).T),
     )
+
+
+def _known_best(
+    lines: Sequence[tuple[int, Line]], ends: Float[np.ndarray, "lines 2 2"], theta: Float[np.ndarray, " lines"]
+) -> tuple[Float[np.ndarray, "lines 2"], Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
+    """The point of each line where the errors of offset and direction are independent, and their inverse variances.
+
+    A line without covariance has it in the middle of its feet. With one, the offset at s along the line (from the foot
+    of the origin) errs by d_rho - s d_theta, and that is independent of d_theta at s = cov(rho, theta) / var(theta).
+    """
+    centre = ends.mean(axis=1)
+    info_offset, info_theta = np.full(len(lines), SIGMA_OFFSET**-2), np.full(len(lines), SIGMA_THETA**-2)
+    known = np.array([k for k, (_, line) in enumerate(lines) if line.cov is not None], dtype=np.int64)
+    if len(known):
+        chosen = [lines[k][1] for k in known]
+        cov = np.array([line.cov for line in chosen])
+        turn = theta[known] - [line.theta for line in chosen]  # the robot's heading
+        middle = np.array([line.segment.mean(axis=0) for line in chosen], dtype=np.float64)
+        own = np.array([line.theta for line in chosen])
+        along = middle[:, 1] * np.cos(own) - middle[:, 0] * np.sin(own)  # of the middle of the feet
+        slide = cov[:, 0, 1] / cov[:, 1, 1] - along
+        tangent = np.stack([-np.sin(own + turn), np.cos(own + turn)], axis=-1)
+        centre[known] += slide[:, None] * tangent
+        info_offset[known] = 1 / (cov[:, 0, 0] - cov[:, 0, 1] ** 2 / cov[:, 1, 1])
+        info_theta[known] = 1 / cov[:, 1, 1]
+    return centre, info_offset, info_theta
 
 
 def join(parts: Sequence[Pieces]) -> Pieces:

@@ -8,6 +8,12 @@ from .arcs import tangent_rho as tangent_rho
 from .clusters import Clusters as Clusters
 from .clusters import centres_of_gravity as centres_of_gravity
 from .clusters import extent as extent
+from .explanation import CORNER as CORNER
+from .explanation import EDGE as EDGE
+from .explanation import PLANE as PLANE
+from .explanation import Expectations as Expectations
+from .explanation import Explanation as Explanation
+from .explanation import explain as explain
 from .extraction import Echoes as Echoes
 from .extraction import RingArcs as RingArcs
 from .extraction import accumulators as accumulators

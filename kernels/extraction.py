@@ -43,6 +43,8 @@ class RingArcs(eqx.Module):
     """Speed of sound over the speed that the reported ranges assume."""
     max_range: Float[Array, ""]
     """Half path length up to which an echo counts, metres."""
+    full_wall: Float[Array, ""]
+    """Number of paths that hear a wide wall."""
 
 
 @partial(jax.jit, static_argnames=("settings", "points"))
@@ -63,6 +65,7 @@ def ring_arcs(sensors: Sensors, *, settings: HoughSettings, points: int) -> Ring
         level=settings.threshold * hough.full_wall_votes(paths, settings),
         range_scale=sensors.range_scale,
         max_range=sensors.max_range,
+        full_wall=hough.full_wall_paths(paths),
     )
 
 
@@ -109,7 +112,7 @@ def lines_of_scan(ring: RingArcs, echoes: Echoes, settings: HoughSettings) -> Ta
     return jax.vmap(one_echo, in_axes=(0, 0, poses))(echoes.path, echoes.range, echoes.pose)
 
 
-def _over_scans(one_scan: Callable, *scans):
+def over_scans(one_scan: Callable, *scans):
     """One scan after the other where caches are small (CPU), all at once where cores are many (GPU)."""
     return jax.lax.platform_dependent(
         *scans,
@@ -138,7 +141,7 @@ def occupied_cells(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -
         level = ring.level if scan.gathered is None else ring.level * scan.gathered
         return smooth > level  # highly occupied cells
 
-    return _over_scans(one_scan, echoes)
+    return over_scans(one_scan, echoes)
 
 
 @partial(jax.jit, static_argnames="settings")
@@ -151,7 +154,7 @@ def accumulators(
         votes = hough.accumulate(lines_of_scan(ring, scan, settings).cell, settings)
         return votes, hough.lowpass(votes, settings)
 
-    return _over_scans(one_scan, echoes)
+    return over_scans(one_scan, echoes)
 
 
 @partial(jax.jit, static_argnames=("settings", "size"))
@@ -187,4 +190,4 @@ def cluster_lines(
         )
         return lines, segments
 
-    return _over_scans(one_scan, echoes, labels)
+    return over_scans(one_scan, echoes, labels)

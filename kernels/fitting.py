@@ -12,7 +12,6 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from . import arcs
@@ -81,7 +80,8 @@ def fit(
     start: Float[Array, "2"],
     echoes: Heard,
     *,
-    tolerance: float,
+    tolerance: float | Float[Array, ""],
+    widest: float | Float[Array, ""] | None = None,
 ) -> tuple[Float[Array, "2"], Float[Array, " echoes"]]:
     """Robust Gauss-Newton fit of ONE reflector with two parameters to the echoes of ONE model.
 
@@ -90,6 +90,7 @@ def fit(
         start: first guess.
         echoes: all echoes, those of other reflectors included.
         tolerance: residual up to which an echo counts as explained, metres.
+        widest: scale of the loss in the first step, metres; four tolerances if left out.
 
     Returns:
         The parameters, and how well they explain every echo: 1 - (residual / tolerance)^2, at least 0.
@@ -116,7 +117,8 @@ def fit(
         move = jnp.stack([yy * gx - xy * gy, xx * gy - xy * gx]) / (xx * yy - xy * xy)
         return x + jnp.clip(move, -_LONGEST_STEP, _LONGEST_STEP), None
 
-    scales = tolerance * jnp.asarray(np.geomspace(_WIDEST, 1.0, _STEPS), start.dtype)
+    widest = _WIDEST * tolerance if widest is None else widest
+    scales = tolerance * (widest / tolerance) ** jnp.linspace(1, 0, _STEPS, dtype=start.dtype)
     x, _ = jax.lax.scan(step, start, scales)
     residual, _ = look(x)
     return x, jnp.maximum(1 - (residual / tolerance) ** 2, 0)

@@ -163,11 +163,47 @@ def lowpass(votes: Num[Array, "theta rho"], settings: HoughSettings) -> Float[Ar
 def full_wall_votes(paths: EchoPaths, settings: HoughSettings) -> Float[Array, ""]:
     """Points that a fully seen wall puts into its cell: the unit of the threshold.
 
-    The number of paths that hear a plane in a given direction, averaged over the directions that any path hears, times
-    the points that an arc has in one cell. So the threshold depends neither on the point pitch nor on the ring.
+    The paths that hear it times the points that an arc has in one cell. So the threshold depends neither on the point
+    pitch nor on the ring.
     """
+    return full_wall_paths(paths) * settings.theta_cell / settings.point_pitch
+
+
+@jax.jit
+def full_wall_paths(paths: EchoPaths) -> Float[Array, ""]:
+    """Number of paths that hear a wide plane in a given direction, averaged over the directions that any path hears."""
     directions = (jnp.arange(_DIRECTIONS, dtype=paths.width.dtype) + 0.5) * (2 * jnp.pi / _DIRECTIONS)
     heard = jnp.mod(directions[:, None] - paths.start[None, :], 2 * jnp.pi) < paths.width[None, :]
     covered = jnp.maximum(heard.any(axis=1).mean(), 1 / _DIRECTIONS) * 2 * jnp.pi
-    points_per_cell = settings.theta_cell / settings.point_pitch
-    return paths.width.sum() / covered * points_per_cell
+    return paths.width.sum() / covered
+
+
+def peaks(
+    smooth: Float[Array, "theta rho"], level: Float[Array, ""], *, size: int, settings: HoughSettings
+) -> tuple[Float[Array, " size"], Float[Array, " size"]]:
+    """The highest maxima of an accumulator after the low pass, as lines (rho, theta), both seams kept.
+
+    Args:
+        smooth: occupancies.
+        level: a maximum must be higher.
+        size: of the result; NaN where there are fewer.
+        settings: of the accumulator.
+
+    Returns:
+        rho, theta: centres of gravity of the occupancy around each maximum, metres and radians.
+    """
+    rows, columns = smooth.shape
+    before = jnp.roll(smooth[:, :1], rows // 2, axis=0)  # before rho = 0 the same line lies half a turn further
+    wide = jnp.concatenate([before, smooth, jnp.zeros_like(before)], axis=1)
+    steps = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
+    around = [jnp.roll(wide, -down, axis=0)[:, 1 + right : 1 + right + columns] for down, right in steps]
+    highest = smooth > level
+    for step, neighbor in zip(steps, around, strict=True):
+        if step != (0, 0):  # of equal neighbors one is the maximum
+            highest &= smooth > neighbor if step > (0, 0) else smooth >= neighbor
+    height, cell = jax.lax.top_k(jnp.where(highest, smooth, 0).ravel(), size)
+    mass = jnp.stack([neighbor.ravel()[cell] for neighbor in around])
+    off = jnp.asarray(steps, smooth.dtype).T @ mass / jnp.maximum(mass.sum(axis=0), 1e-6)
+    theta = (cell // columns + 0.5 + off[0]) * settings.theta_cell - jnp.pi
+    rho = (cell % columns + 0.5 + off[1]) * settings.rho_cell
+    return jnp.where(height > 0, rho, jnp.nan), jnp.where(height > 0, theta, jnp.nan)

@@ -42,6 +42,10 @@ class EchoPaths(eqx.Module):
     """Width of the detection range, radians, counter-clockwise from start; 0 where the cones do not overlap."""
     range_offset: Float[Array, "*paths"]
     """Metres that the path reports too much: the mean of its two sensors."""
+    heading: Float[Array, "*paths 2"]
+    """Directions that tx and rx look to, radians."""
+    half_beam: Float[Array, "*paths 2"]
+    """Half the cones of tx and rx, radians."""
 
 
 @jax.jit
@@ -60,6 +64,8 @@ def echo_paths(sensors: Sensors) -> EchoPaths:
             start=sensors.heading[tx] + first,
             width=jnp.maximum(last - first, 0),
             range_offset=(sensors.range_offset[tx] + sensors.range_offset[rx]) / 2,
+            heading=jnp.stack([sensors.heading[tx], sensors.heading[rx]]),
+            half_beam=jnp.stack([half_tx, half_rx]),
         )
 
     return jax.vmap(one_path)(sensors.tx, sensors.rx)

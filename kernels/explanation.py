@@ -1,0 +1,516 @@
+"""What stands around the robot, given all echoes of a scan: the reflectors that explain them best, each echo once.
+
+The ranges of the right echoes determine a line to a fraction of their noise; the work is to tell which echoes these are
+and what they come from. Every candidate line of the Hough step is fitted as a plane, as a corner and as an edge. Then,
+in a few passes over the whole scan, the reflectors with the most evidence are taken one after the other, each with the
+echoes that are still free, and what was taken tells the next pass what to expect: where two walls reflect one sound,
+where corners can be, which directions the walls of this place have, how many echoes get lost, how large the noise is.
+
+Evidence is counted in nats (natural logarithms of probabilities):
+
+- echoes: how much likelier each one is from this reflector, with Gaussian noise, than from clutter;
+- silence: paths that should have heard the reflector and did not; a wall may end, an edge may be faint;
+- expectation: how likely such a reflector is before any echo, in the volume that its covariance leaves (Laplace).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from . import arcs, clusters, hough, reflectors
+from .extraction import Echoes, RingArcs, lines_of_scan, over_scans
+from .fitting import corner, edge, fit, heard, plane
+from .geometry import fold_line, normal, tangent, wrap_angle
+from .hough import HoughSettings
+from .paths import EchoPaths
+from .reflectors import Sighting
+
+PLANE, CORNER, EDGE = 0, 1, 2
+"""Kinds of reflectors, rows of ``Explanation.probability``."""
+_PASSES = 3
+
+
+@dataclass(frozen=True)
+class Expectations:
+    """What is expected of rooms and rings before any echo, and how the evidence is weighed.
+
+    The counts and weights were chosen on rooms drawn at random (``jaxsonar.random_room``); they matter where the ranges
+    leave it open what a reflector is, and hardly where they do not.
+    """
+
+    candidates: int = 20
+    """Maxima of the accumulator that are fitted."""
+    reflectors: int = 12
+    """Reflectors that a scan can have."""
+    peak: float = 0.1
+    """Occupancy of a candidate, as a fraction of the points that a fully seen wall puts into its cell."""
+    sigma: float = 0.006
+    """Noise of the ranges to begin with where it is to be estimated, metres."""
+    sigma_weight: float = 6.0
+    """Number of echoes that this first guess counts for."""
+    least_sigma: float = 1e-4
+    """Metres; single precision and what sensors can do."""
+    clutter: float = 0.5
+    """Echoes a metre and path that nothing explains."""
+    heard: float = 0.8
+    """Share of the echoes inside the cones that arrive; the guess that the scan's own share is added to."""
+    heard_weight: float = 8.0
+    """Number of paths that this guess counts for."""
+    blanking: float = 0.035
+    """Metres behind an echo in which a path does not hear the next one."""
+    planes: float = 3.0
+    """Walls that a scan sees."""
+    corners: float = 1.0
+    """Right-angled corners that a scan sees."""
+    edges: float = 0.3
+    """Edges and poles that a scan sees."""
+    corner_alone: float = 0.1
+    """Share of the corners of which neither wall is seen."""
+    corner_of_one: float = 0.2
+    """Share of the corners of which one wall is seen; for each wall."""
+    corner_of_two: float = 0.5
+    """Share of the corners of which both walls are seen; for each pair."""
+    edge_alone: float = 0.4
+    """Share of the edges and poles that do not stand on the line of a wall."""
+    square: float = 0.4
+    """Share of the walls that are parallel or square to another one."""
+    crossing: float = 2.0
+    """Nats against a wall whose foot lies on the line of another wall, where a corner would be."""
+    wall: float = 2.0
+    """Length of walls, metres: one ends within a gap g between two feet with probability g / wall."""
+    hidden: float = 6.0
+    """Nats that silence costs at most: something may stand before a reflector."""
+    faint: float = 1.0
+    """Nats that silence off the axes costs at most at an edge, which may be faint."""
+    full: float = 7.7
+    """Nats for a wall that all its paths hear, against one that none hears: points answer to fewer of them."""
+    usual: float = 0.55
+    """Share of a full wall's echoes from which on there are more of them than expected of a point."""
+    silence_plane: float = 0.7
+    """Weight of the silence of a wall."""
+    silence_point: float = 1.15
+    """Weight of the silence of a corner or edge."""
+    prior: float = 1.4
+    """Weight of the expectations."""
+    least: float = 6.0
+    """Nats above clutter that a reflector needs."""
+    temper: float = 0.44
+    """From nats to the logarithm of odds: echoes of one reflector err together."""
+    doubt: float = 2.5
+    """Nats by which a wall must be likelier than a point for even odds: there are many points to choose from."""
+
+
+class Explanation(eqx.Module):
+    """The reflectors of scans, those with the most evidence first; kind -1 where there are fewer."""
+
+    kind: Int[Array, "*scans reflectors"]
+    """PLANE, CORNER or EDGE, the likeliest; -1 none."""
+    parameters: Float[Array, "*scans reflectors 2"]
+    """(rho, theta) of a plane, (x, y) of a corner or an edge; robot frame, metres, radians."""
+    covariance: Float[Array, "*scans reflectors 2 2"]
+    """Of the parameters, from the ranges' noise."""
+    probability: Float[Array, "*scans reflectors 3"]
+    """Of plane, corner and edge, given that it is one of them."""
+    evidence: Float[Array, "*scans reflectors"]
+    """Nats above clutter."""
+    involved: Bool[Array, "*scans reflectors echoes"]
+    """Echoes that each explains; no echo twice."""
+    segment: Float[Array, "*scans reflectors 2 2"]
+    """Planes: endpoints, the outermost feet of the sensors involved (paper, section 5), metres."""
+    sigma: Float[Array, "*scans"]
+    """Noise of the ranges, given or estimated, metres."""
+
+
+class _Scan(NamedTuple):
+    """ONE scan, ready to be explained."""
+
+    paths: EchoPaths
+    """All paths of the ring."""
+    echo: EchoPaths
+    """The path of each echo."""
+    reach: Array
+    """(echoes,) corrected ranges, metres."""
+    valid: Array
+    """(echoes,) which of them are echoes."""
+    max_range: Array
+    full_wall: Array
+
+
+class _Scene(NamedTuple):
+    """What the passes so far say about the place."""
+
+    wall: Array
+    """(reflectors, 2) rho, theta."""
+    covariance: Array
+    """(reflectors, 2, 2) of them."""
+    known: Array
+    """(reflectors,) which of the rows are walls."""
+    share: Array
+    """Share of the expected echoes that arrive."""
+    sigma: Array
+    """Noise of the ranges, metres."""
+
+
+class _Support(NamedTuple):
+    """What speaks for hypotheses."""
+
+    parameters: Array
+    """(2,)"""
+    information: Array
+    """(2, 2) inverse covariance."""
+    gain: Array
+    """(echoes,) nats that each echo brings; negative: another reflector's, or clutter."""
+    foot: Array
+    """(echoes,) where along a plane each echo is reflected."""
+    residual: Array
+    """(echoes,) metres."""
+    base: Array
+    """Nats of silence and expectation."""
+
+
+Model = Callable[[Float[Array, "2"], EchoPaths], Sighting]
+_MODELS: tuple[Model, ...] = (reflectors.plane, reflectors.corner, reflectors.edge)
+
+
+@partial(jax.jit, static_argnames=("settings", "expected"))
+def explain(
+    ring: RingArcs,
+    echoes: Echoes,
+    sigma: Float[Array, ""],
+    *,
+    settings: HoughSettings,
+    expected: Expectations,
+) -> Explanation:
+    """Find the reflectors that explain a batch of scans, in one compiled step.
+
+    Args:
+        ring: arcs of the ring's paths.
+        echoes: (scans, echoes) packed echoes.
+        sigma: standard deviation of the ranges, metres; NaN: estimated for each scan.
+        settings: of the Hough step.
+        expected: what is expected of rooms and rings.
+    """
+
+    def one_scan(packed: Echoes) -> Explanation:
+        # Candidates: maxima of the paper's accumulator.
+        voting = lines_of_scan(ring, packed, settings)
+        smooth = hough.lowpass(hough.accumulate(voting.cell, settings), settings)
+        level = expected.peak * hough.full_wall_votes(ring.paths, settings)
+        rho, theta = hough.peaks(smooth, level, size=expected.candidates, settings=settings)
+        # Each fitted as plane, corner and edge, robustly; the noise is not known yet to more than an order.
+        echo = jax.tree.map(lambda leaf: leaf[packed.path], ring.paths)
+        reach = jax.vmap(lambda r, o: arcs.corrected_range(r, range_offset=o, range_scale=ring.range_scale))(
+            packed.range, echo.range_offset
+        )
+        valid = (reach > 0) & (reach < ring.max_range)
+        scan = _Scan(ring.paths, echo, reach, valid, ring.max_range, ring.full_wall)
+        known = jnp.isfinite(sigma)
+        first = jnp.where(known, jnp.maximum(sigma, expected.least_sigma), expected.sigma)
+        start = _fitted(ring, packed, rho, theta, first)
+        # Passes over the whole scan, each with what the one before has found.
+        size = expected.reflectors
+        nothing = jnp.zeros((size, 2)), jnp.zeros((size, 2, 2)), jnp.zeros(size, bool)
+        scene = _Scene(*nothing, jnp.asarray(expected.heard, reach.dtype), first)
+
+        def look_again(scene: _Scene, _: None) -> tuple[_Scene, None]:
+            supports = _weighed(scan, start, scene, expected)
+            chosen = _chosen(scan, supports, jnp.isfinite(rho), expected)
+            return _learned(scan, _taken(supports, chosen[0]), chosen, scene, sigma, expected), None
+
+        scene, _ = jax.lax.scan(look_again, scene, None, length=_PASSES)
+        supports = _weighed(scan, start, scene, expected)
+        index, kind, evidence, involved, probability = _chosen(scan, supports, jnp.isfinite(rho), expected)
+        found = _taken(supports, index)
+        is_plane = kind == PLANE
+        rho, theta = fold_line(found.parameters[:, 0], found.parameters[:, 1])
+        flipped = is_plane & (found.parameters[:, 0] < 0)
+        covariance = jax.vmap(_inverse)(found.information)
+        found = found._replace(
+            parameters=jnp.where(is_plane[:, None], jnp.stack([rho, theta], axis=-1), found.parameters)
+        )
+        covariance = jnp.where(flipped[:, None, None], covariance * np.array([[1, -1], [-1, 1]]), covariance)
+        segment = jax.vmap(lambda x, own: clusters.extent(x[0], x[1], echo.midpoint, own))(found.parameters, involved)
+        return Explanation(
+            kind=jnp.where(evidence > -jnp.inf, kind, -1),
+            parameters=found.parameters,
+            covariance=covariance,
+            probability=probability,
+            evidence=evidence,
+            involved=involved,
+            segment=segment,
+            sigma=scene.sigma,
+        )
+
+    return over_scans(one_scan, echoes)
+
+
+def _fitted(
+    ring: RingArcs, packed: Echoes, rho: Float[Array, " k"], theta: Float[Array, " k"], sigma: Float[Array, ""]
+) -> Float[Array, "3 k 2"]:
+    """Every candidate as a plane, a corner and an edge, fitted robustly to the echoes around it."""
+    echo = heard(ring, packed)
+    tolerance = 2.5 * sigma
+    widest = jnp.maximum(0.04, tolerance)  # m: a cell of the accumulator
+
+    def one(rho: Float[Array, ""], theta: Float[Array, ""]) -> Float[Array, "3 2"]:
+        place = rho * normal(theta)
+        starts = (plane, jnp.stack([rho, theta])), (corner, place), (edge, place)
+        return jnp.stack([fit(model, x, echo, tolerance=tolerance, widest=widest)[0] for model, x in starts])
+
+    here = jnp.isfinite(rho)
+    return jnp.moveaxis(jax.vmap(one)(jnp.where(here, rho, 1), jnp.where(here, theta, 0)), 1, 0)
+
+
+def _weighed(scan: _Scan, start: Float[Array, "3 k 2"], scene: _Scene, expected: Expectations) -> _Support:
+    """The support of every candidate as every kind, (3 k, ...), planes first."""
+    clutter = jnp.log(expected.clutter + _second_order(scan, scene))
+    priors = (_plane_prior, partial(_point_prior, kind=CORNER), partial(_point_prior, kind=EDGE))
+
+    def one(kind: int, x: Float[Array, "2"]) -> _Support:
+        support = _refined(scan, _MODELS[kind], x, scene, clutter)
+        silence = _silence(scan, kind, support, scene, expected)
+        weight = expected.silence_plane if kind == PLANE else expected.silence_point
+        prior = priors[kind](scan, support, scene, expected)
+        volume = jnp.log(2 * jnp.pi) - 0.5 * jnp.log(_determinant(support.information) + 1)
+        return support._replace(base=weight * silence + prior + volume)
+
+    kinds = [jax.vmap(partial(one, kind))(start[kind]) for kind in (PLANE, CORNER, EDGE)]
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *kinds)
+
+
+def _refined(
+    scan: _Scan, model: Model, x: Float[Array, "2"], scene: _Scene, clutter: Float[Array, " echoes"]
+) -> _Support:
+    """Maximum likelihood over the ranges: each echo weighs as much as it is likely to come from this reflector."""
+
+    def look(x: Float[Array, "2"]):
+        def one(path: EchoPaths):
+            def sighted(x: Float[Array, "2"]):
+                sighting = model(x, path)
+                return sighting.range, sighting
+
+            slope, sighting = jax.grad(sighted, has_aux=True)(x)
+            return slope, sighting, scene.share * reflectors.heard_share(sighting, path)
+
+        slope, sighting, share = jax.vmap(one)(scan.echo)
+        residual = scan.reach - sighting.range
+        odds = jnp.log(share / (1 - share) + 1e-9) + _gauss(residual, scene.sigma) - clutter
+        gain = jnp.where(scan.valid, odds, -jnp.inf)
+        weight = jax.nn.sigmoid(gain) / scene.sigma**2
+        information = jnp.einsum("e,ei,ej->ij", weight, slope, slope)
+        return information, (weight * residual) @ slope, gain, sighting.foot, residual
+
+    def step(x: Float[Array, "2"], _: None):
+        information, pull = look(x)[:2]
+        return x + jnp.clip(_inverse(information) @ pull, -0.05, 0.05), None
+
+    x, _ = jax.lax.scan(step, x, None, length=3)
+    information, _, gain, foot, residual = look(x)
+    return _Support(x, information, gain, foot, residual, jnp.zeros(()))
+
+
+def _silence(scan: _Scan, kind: int, support: _Support, scene: _Scene, expected: Expectations) -> Float[Array, ""]:
+    """Nats, at most 0, that the paths cost which should have heard the reflector and did not.
+
+    A path that heard something so little before that its blanking hides the reflector is excused.
+    """
+
+    def look(path: EchoPaths):
+        sighting = _MODELS[kind](support.parameters, path)
+        near = sighting.range < scan.max_range - 1e-3 - 2 * scene.sigma
+        share = jnp.where(near, reflectors.heard_share(sighting, path), 0)
+        return sighting, share, jnp.log1p(-scene.share * share), reflectors.off_axis(sighting, path)
+
+    sighting, share, cost, off_axis = jax.vmap(look)(scan.paths)
+    by_echo, _, excuse, echo_off_axis = jax.vmap(look)(scan.echo)
+    behind = scan.reach - by_echo.range
+    excused = scan.valid & (behind < 4 * scene.sigma) & (behind > -expected.blanking - 4 * scene.sigma)
+    excuse = jnp.where(excused, excuse, 0)
+
+    def total(paths: Bool[Array, " paths"], echoes: Bool[Array, " echoes"]) -> Float[Array, ""]:
+        return jnp.minimum(jnp.where(paths, cost, 0).sum() - jnp.where(echoes, excuse, 0).sum(), 0)
+
+    mine = support.gain > 0
+    if kind == CORNER:
+        return jnp.maximum(total(share >= 0, scan.valid), -expected.hidden)
+    if kind == EDGE:  # a faint one is heard near the axes only
+        border = jnp.where(mine, echo_off_axis, 0).max() + 1e-3
+        inside = total(off_axis < border, echo_off_axis < border)
+        outside = total(off_axis >= border, echo_off_axis >= border)
+        return jnp.maximum(inside, -expected.hidden) + jnp.maximum(outside, -expected.faint)
+    # A wall may end beyond its outermost feet: somewhere between them and the next path that is silent.
+    low, high = jnp.where(mine, support.foot, jnp.inf).min(), jnp.where(mine, support.foot, -jnp.inf).max()
+    foot, by_echo = sighting.foot, by_echo.foot
+    inside = total((foot >= low) & (foot <= high), (by_echo >= low) & (by_echo <= high))
+    silence = jnp.maximum(inside, -expected.hidden)
+    for beyond, echoes_beyond, gap in (
+        (foot < low, by_echo < low, low - foot),
+        (foot > high, by_echo > high, foot - high),
+    ):
+        next_silent = jnp.where(beyond & (share > 0.4) & (gap > 1e-3), gap, jnp.inf).min()
+        ends = jnp.log(jnp.clip(next_silent, 0.02, expected.wall) / expected.wall)
+        silence += jnp.where(jnp.isfinite(next_silent), jnp.maximum(total(beyond, echoes_beyond), ends), 0)
+    return silence
+
+
+def _plane_prior(scan: _Scan, support: _Support, scene: _Scene, expected: Expectations) -> Float[Array, ""]:
+    """Nats before any echo: anywhere, rather square to other walls, not across their corners, heard by many paths."""
+    rho, theta = support.parameters
+    density = jnp.log(expected.planes / (2 * jnp.pi * scan.max_range))
+    turn = wrap_angle(scene.wall[:, 1] - theta)
+    short = scene.wall[:, 0] - normal(scene.wall[:, 1]) @ (rho * normal(theta))
+    crossing = (scene.known & (jnp.abs(short) < 0.06) & _oblique(turn)).any()
+    itself = (jnp.abs(scene.wall[:, 0] - rho) < 0.08) & (jnp.abs(turn) < 0.15)
+    skew = jnp.abs(jnp.mod(turn + jnp.pi / 4, jnp.pi / 2) - jnp.pi / 4)  # to the next quarter turn
+    variance = _inverse(support.information)[1, 1] + scene.covariance[:, 1, 1] + np.radians(0.5) ** 2
+    square = jnp.where(scene.known & ~itself, jnp.exp(_gauss(skew, jnp.sqrt(variance))) * jnp.pi / 2, -1).max()
+    direction = jnp.log(1 - expected.square + expected.square * jnp.maximum(square, 0))
+    density += jnp.where(square < 0, 0, direction) - expected.crossing * crossing
+    share = (support.gain > 0).sum() / scan.full_wall
+    return expected.prior * density + expected.full * (share - expected.usual)
+
+
+def _point_prior(
+    scan: _Scan, support: _Support, scene: _Scene, expected: Expectations, *, kind: int
+) -> Float[Array, ""]:
+    """Nats before any echo: corners are where walls meet, edges where they end; both also where no wall is seen."""
+    place = support.parameters
+    n, along = normal(scene.wall[:, 1]), tangent(scene.wall[:, 1]) @ place
+    own = jnp.einsum("wi,ij,wj->w", n, _inverse(support.information), n)
+    c = scene.covariance
+    lever = c[:, 0, 0] - 2 * along * c[:, 0, 1] + along**2 * c[:, 1, 1]  # the line's uncertainty, here
+    off = scene.wall[:, 0] - n @ place
+    bearing = jnp.arctan2(place[1], jnp.where((place == 0).all(), 1, place[0]))
+    beside = scene.known & _oblique(wrap_angle(scene.wall[:, 1] - bearing))  # not the point itself taken for a wall
+    on_wall = jnp.where(beside, jnp.exp(_gauss(off, jnp.sqrt(own + lever + scene.sigma**2))), 0)
+    anywhere = 1 / (jnp.pi * scan.max_range**2)
+    along_one = on_wall.sum() / (2 * scan.max_range)
+    if kind == EDGE:
+        beside_walls = along_one / jnp.maximum(scene.known.sum(), 1)
+        density = expected.edge_alone * anywhere + (1 - expected.edge_alone) * beside_walls
+        return expected.prior * jnp.log(expected.edges * density)
+    angle = jnp.abs(wrap_angle(scene.wall[:, None, 1] - scene.wall[None, :, 1])) - jnp.pi / 2
+    right = angle**2 < 9 * (c[:, None, 1, 1] + c[None, :, 1, 1] + np.radians(0.5) ** 2)
+    at_two = jnp.triu(jnp.where(right, on_wall[:, None] * on_wall[None, :], 0), 1).sum()
+    density = expected.corner_alone * anywhere + expected.corner_of_one * along_one + expected.corner_of_two * at_two
+    return expected.prior * jnp.log(expected.corners * density)
+
+
+def _second_order(scan: _Scan, scene: _Scene) -> Float[Array, " echoes"]:
+    """How dense echoes from wall to wall are expected at each echo's range, 1/m."""
+    size = len(scene.known)
+    first, second = np.nonzero(~np.eye(size, dtype=bool))
+
+    def pair(first: Float[Array, "2"], second: Float[Array, "2"], known: Bool[Array, ""]) -> Float[Array, " echoes"]:
+        def one(path: EchoPaths, reach: Float[Array, ""]) -> Float[Array, ""]:
+            sighting = reflectors.second_order(first, second, path)
+            spread = 2 * scene.sigma + 0.002
+            return reflectors.heard_share(sighting, path) * jnp.exp(_gauss(reach - sighting.range, spread))
+
+        return jnp.where(known, scene.share * jax.vmap(one)(scan.echo, scan.reach), 0)
+
+    known = scene.known[first] & scene.known[second]
+    densities = jax.vmap(pair)(scene.wall[first], scene.wall[second], known)
+    return jnp.where(scan.valid, densities.max(axis=0), 0)
+
+
+def _chosen(
+    scan: _Scan, supports: _Support, here: Bool[Array, " k"], expected: Expectations
+) -> tuple[
+    Int[Array, " reflectors"],
+    Int[Array, " reflectors"],
+    Float[Array, " reflectors"],
+    Bool[Array, "reflectors echoes"],
+    Float[Array, "reflectors 3"],
+]:
+    """Reflectors in the order of their evidence, each with the echoes that are left when its turn comes.
+
+    Returns:
+        Index of the hypothesis, its kind, evidence (-inf where no reflector has enough), echoes, and the probabilities
+        of the three kinds for these echoes.
+    """
+    kinds = jnp.repeat(jnp.arange(3), len(here))
+    gain = jnp.maximum(supports.gain, 0)
+    open_ = jnp.tile(here, 3) & jnp.isfinite(supports.base)
+
+    def take(free: Bool[Array, " echoes"], _: None):
+        score = jnp.where(open_, (gain * free).sum(axis=1) + supports.base, -jnp.inf)
+        best = score.argmax()
+        enough = score[best] > expected.least
+        own = free & (supports.gain[best] > 0) & enough
+        rivals = ((supports.gain > 0) & own).sum(axis=1) >= 0.5 * own.sum()
+        of_kind = jnp.where(rivals & (kinds == jnp.arange(3)[:, None]), score, -jnp.inf).max(axis=1)
+        odds = expected.temper * (of_kind - jnp.asarray([expected.doubt, 0, 0]))
+        probability = jax.nn.softmax(odds)
+        return free & ~own, (best, kinds[best], jnp.where(enough, score[best], -jnp.inf), own, probability)
+
+    _, chosen = jax.lax.scan(take, scan.valid, None, length=expected.reflectors)
+    return chosen
+
+
+def _taken(supports: _Support, index: Int[Array, " reflectors"]) -> _Support:
+    return jax.tree.map(lambda leaf: leaf[index], supports)
+
+
+def _learned(
+    scan: _Scan, found: _Support, chosen: tuple, scene: _Scene, sigma: Float[Array, ""], expected: Expectations
+) -> _Scene:
+    """What the reflectors of a pass tell the next one."""
+    _, kind, evidence, involved, _ = chosen
+    wall = (kind == PLANE) & (evidence > -jnp.inf)
+    covariance = jax.vmap(_inverse)(found.information)
+    # The share of the paths well inside all cones and between the outermost feet that heard their wall.
+    low = jnp.where(involved, found.foot, jnp.inf).min(axis=1) + 1e-3
+    high = jnp.where(involved, found.foot, -jnp.inf).max(axis=1) - 1e-3
+
+    def certain(line: Float[Array, "2"], low: Float[Array, ""], high: Float[Array, ""], path: EchoPaths):
+        sighting = reflectors.plane(line, path)
+        near = sighting.range < scan.max_range - 1e-3 - 2 * scene.sigma
+        between = (sighting.foot > low) & (sighting.foot < high)
+        return near & between & (reflectors.heard_share(sighting, path) > 0.95)
+
+    each_path = jax.vmap(jax.vmap(certain, in_axes=(None, None, None, 0)), in_axes=(0, 0, 0, None))
+    asked = jnp.where(wall, each_path(found.parameters, low, high, scan.paths).sum(axis=1), 0).sum()
+    answered = (each_path(found.parameters, low, high, scan.echo) & involved & wall[:, None]).sum()
+    weight = expected.heard_weight
+    share = jnp.clip((weight * expected.heard + answered) / (weight + asked), 0.3, 0.97)
+    # Noise: what is left between ranges and walls; two of each wall's residuals are spent on the wall itself.
+    many = wall & (involved.sum(axis=1) >= 5)
+    left = jnp.where(involved & many[:, None], found.residual**2, 0).sum()
+    free = (involved.sum(axis=1) - 2) @ many
+    guess = expected.sigma_weight * scene.sigma**2
+    estimate = jnp.sqrt((guess + left) / (expected.sigma_weight + free))
+    return _Scene(
+        wall=found.parameters,
+        covariance=covariance,
+        known=wall,
+        share=share,
+        sigma=jnp.where(jnp.isfinite(sigma), scene.sigma, jnp.maximum(estimate, expected.least_sigma)),
+    )
+
+
+def _oblique(turn: Float[Array, "*any"]) -> Bool[Array, "*any"]:
+    """Directions that differ by 11 to 126 deg: of a wall, and of a point on its line that is not its foot."""
+    return (jnp.abs(turn) > 0.2) & (jnp.abs(turn) < 2.2)
+
+
+def _gauss(x: Float[Array, "*any"], sigma: Float[Array, "*#any"]) -> Float[Array, "*any"]:
+    """Logarithm of the normal density."""
+    return -0.5 * (x / sigma) ** 2 - jnp.log(sigma * np.sqrt(2 * np.pi))
+
+
+def _determinant(m: Float[Array, "2 2"]) -> Float[Array, ""]:
+    return jnp.maximum(m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0], 0)
+
+
+def _inverse(m: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
+    """Inverse of an information matrix; one that is not determined gets a large variance instead of an infinite one."""
+    a, b, d = m[0, 0] * (1 + 1e-5) + 1, m[0, 1], m[1, 1] * (1 + 1e-5) + 1
+    return jnp.stack([jnp.stack([d, -b]), jnp.stack([-b, a])]) / (a * d - b * b)
