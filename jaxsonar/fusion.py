@@ -16,19 +16,26 @@ OFFSET_GATE = 0.06
 """Metres; pieces of one wall lie at most this far off one another, across the wall."""
 TURN_GATE = 3.0
 """Standard deviations by which their directions may differ."""
-OFFSET_FLOOR = 0.012
-"""Metres; how well an offset can agree at best."""
-TURN_FLOOR = float(np.radians(1.5))
-"""Radians; how well a direction can agree at best: walls are not quite straight, nor is odometry."""
+OFFSET_FLOOR = 0.005
+"""Metres; how well an offset can agree at best: walls are not quite straight, nor is odometry."""
+TURN_PER_OFFSET = 2.2
+"""Radians per metre; how well a direction can agree at best, for how well an offset can."""
 BOTH_SIDES = 0.04
 """Metres; faces seen from opposite sides and less than this apart are one thin wall, else two."""
+BESIDE = 0.025
+"""Metres; nothing stands this little before a wall: lines side by side this near are of one wall, however they differ."""
 Opening = Callable[[Float[np.ndarray, "gaps 2 2"], Float[np.ndarray, " gaps"]], Bool[np.ndarray, " gaps"]]
 """Tells of gaps (both ends, metres, and the direction of the wall's normal) whether they are openings."""
+OUTLYING = 3.0
+"""Standard deviations from which on a piece is off its wall by more than noise."""
+_ROUNDS = 5
 _LEVER = 2.0  # metres that a radian counts for, when neighbors are looked for
 _NEAREST = 12
 
 
-def fuse(pieces: Pieces, *, gap: float, opening: Opening | None = None) -> tuple[Pieces, Int[np.ndarray, " pieces"]]:
+def fuse(
+    pieces: Pieces, *, gap: float, opening: Opening | None = None, beside: float = 0.0
+) -> tuple[Pieces, Int[np.ndarray, " pieces"]]:
     """Walls from pieces: in rounds, those that are each other's best match add up, until no two of them match.
 
     Two pieces match if they face the same way, their directions agree, they lie on one line (``OFFSET_GATE``), and not
@@ -39,6 +46,7 @@ def fuse(pieces: Pieces, *, gap: float, opening: Opening | None = None) -> tuple
         pieces: pieces of walls.
         gap: metres.
         opening: if given, tells which gaps, from end to end, are openings and stay open.
+        beside: pieces side by side that are nowhere farther apart match as well, metres.
 
     Returns:
         The walls, and which of them each piece belongs to.
@@ -51,6 +59,8 @@ def fuse(pieces: Pieces, *, gap: float, opening: Opening | None = None) -> tuple
         # Only pieces that changed can match anew; first with the nearest, at last with all of them.
         new = _neighbors(pieces, changed, gap, nearest=None if thorough else _NEAREST)
         badness, between = _compared(pieces, new, gap)
+        if beside:
+            badness = np.minimum(badness, _width(pieces, new) / beside)
         new, badness, between = new[badness <= 1], badness[badness <= 1], between[badness <= 1]
         if opening is not None and (between > 0).any():
             apart = np.flatnonzero(between > 0)
@@ -72,6 +82,28 @@ def fuse(pieces: Pieces, *, gap: float, opening: Opening | None = None) -> tuple
     return replace(pieces, scans=unique_pairs(wall_of[seen[0]], seen[1])), wall_of
 
 
+def settle(pieces: Pieces, wall_of: Int[np.ndarray, " pieces"], walls: Pieces) -> Pieces:
+    """The walls again, each piece counting for as much as it agrees with its wall.
+
+    A line with echoes of another reflector in it is farther off than its covariance tells. Where the deviation of a
+    piece exceeds ``OUTLYING`` standard deviations, its information is divided by the square of the excess.
+
+    Args:
+        pieces: pieces of walls.
+        wall_of: which wall each belongs to.
+        walls: their sums, to begin with.
+    """
+    for _ in range(_ROUNDS):
+        off, turn = deviations(pieces, walls, wall_of)
+        squared = (pieces.info_offset * off**2 + pieces.info_theta * turn**2) / pieces.count
+        share = np.minimum(1, OUTLYING**2 / np.maximum(squared, 1e-9))
+        weighed = replace(
+            pieces, info_offset=share * pieces.info_offset, info_theta=share * pieces.info_theta
+        )
+        walls = add_up(weighed, wall_of)
+    return walls
+
+
 def mismatch(pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"], *, gap: float) -> Float[np.ndarray, " pairs"]:
     """How badly the pieces of each pair agree: 0 for the same piece twice, 1 at the first gate, more beyond it."""
     return _compared(pieces, pairs, gap)[0]
@@ -86,6 +118,9 @@ def _compared(
     opposite = np.abs(turn) > np.pi / 2
     turn = np.where(opposite, wrap_angle(turn + np.pi), turn)
     variance = 1 / pieces.info_theta
+    # What does not average out: half of what one line errs by (echoes of others in it, cells), and the floor.
+    floor = OFFSET_FLOOR**2 + np.maximum(pieces.count[a] / pieces.info_offset[a], pieces.count[b] / pieces.info_offset[b])
+    turn_floor = TURN_PER_OFFSET**2 * floor
 
     # The common line, as ``add_up`` would draw it, and how far the ends of both pieces are from it.
     share = pieces.info_theta[b] / (pieces.info_theta[a] + pieces.info_theta[b])
@@ -106,11 +141,31 @@ def _compared(
     between = np.maximum(between, 0)
     # How far either must be turned to lie on the common line, in standard deviations.
     turns = np.abs(np.stack([share * turn + bend, (share - 1) * turn + bend]))
-    turns = (turns / np.sqrt(variance[[a, b]] + TURN_FLOOR**2)).max(axis=0)
-    turns = np.maximum(turns, np.abs(turn) / np.sqrt(variance[a] + variance[b] + 2 * TURN_FLOOR**2)) / TURN_GATE
-    spread = np.sqrt(1 / info_a + 1 / info_b + OFFSET_FLOOR**2)
+    turns = (turns / np.sqrt(variance[[a, b]] + turn_floor)).max(axis=0)
+    turns = np.maximum(turns, np.abs(turn) / np.sqrt(variance[a] + variance[b] + 2 * turn_floor)) / TURN_GATE
+    spread = np.sqrt(1 / info_a + 1 / info_b + floor)
     offset_gate = np.where(opposite, BOTH_SIDES, np.minimum(OFFSET_GATE, TURN_GATE * spread))
     return np.maximum.reduce([apart / offset_gate, turns, between / gap]), between
+
+
+def deviations(
+    pieces: Pieces, walls: Pieces, wall_of: Int[np.ndarray, " pieces"]
+) -> tuple[Float[np.ndarray, " pieces"], Float[np.ndarray, " pieces"]]:
+    """How far each piece's centre is off its wall, metres, and how far it is turned, radians, in [-pi/2, pi/2]."""
+    off = ((pieces.centre - walls.centre[wall_of]) * walls.normal[wall_of]).sum(-1)
+    return off, (pieces.theta - walls.theta[wall_of] + np.pi / 2) % np.pi - np.pi / 2
+
+
+def _width(pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"]) -> Float[np.ndarray, " pairs"]:
+    """How far apart two pieces are where they run side by side, metres; infinite unless half of one does."""
+    a, b = pairs.T
+    a, b = np.where(pieces.length[a] < pieces.length[b], [b, a], [a, b])  # b is the shorter one
+    offset = pieces.segments[b] - pieces.centre[a][:, None]
+    along, across = (offset * pieces.tangent[a][:, None]).sum(-1), (offset * pieces.normal[a][:, None]).sum(-1)
+    run = along[:, 1] - along[:, 0]
+    share = (np.clip(along, *pieces.ends[a].T[..., None]) - along[:, :1]) / np.where(run == 0, np.nan, run)[:, None]
+    at_ends = across[:, :1] + share * (across[:, 1:] - across[:, :1])
+    return np.where(np.abs(share[:, 1] - share[:, 0]) >= 0.5, np.abs(at_ends).max(axis=1), np.inf)
 
 
 def gaps(
@@ -136,7 +191,8 @@ def _neighbors(
     double = 2 * pieces.theta[piece]  # both sides of a wall have one direction
     direction = 0.5 * _LEVER * np.stack([np.cos(double), np.sin(double)], axis=-1)
     points = np.concatenate([place, direction], axis=-1)
-    steepest = TURN_GATE * np.sqrt(2 / pieces.info_theta.min() + 2 * TURN_FLOOR**2)
+    turn_floor = TURN_PER_OFFSET**2 * (OFFSET_FLOOR**2 + (pieces.count / pieces.info_offset).max())
+    steepest = TURN_GATE * np.sqrt(2 / pieces.info_theta.min() + 2 * turn_floor)
     reach = float(np.hypot(1.6 * gap + OFFSET_GATE, _LEVER * min(steepest, np.pi / 2)))
     tree, asking = KDTree(points), np.flatnonzero(changed[piece])
     if nearest is None and len(asking) == len(points):

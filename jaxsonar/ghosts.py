@@ -55,8 +55,8 @@ def without_corners(pieces: Pieces, walls: Pieces) -> Pieces:
     return pieces.take(~ghost)
 
 
-def without_points(walls: Pieces) -> Pieces:
-    """The walls without the lines that poles leave: short ones with different directions at one place.
+def points_among(walls: Pieces) -> Bool[np.ndarray, " walls"]:
+    """Which walls are lines that poles leave: short ones with different directions at one place.
 
     A point answers to every pose, and its line is always square to the line of sight.
     """
@@ -67,7 +67,7 @@ def without_points(walls: Pieces) -> Pieces:
         a, b = short[pairs.reshape(-1, 2).T]
         crossed = _turn(walls.theta[a], walls.theta[b]) > TURNED
         ghost[a[crossed]] = ghost[b[crossed]] = True
-    return walls.take(~ghost)
+    return ghost
 
 
 def trim(pieces: Pieces, wall_of: Int[np.ndarray, " pieces"], seen: SeenThrough) -> Pieces:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Int
@@ -11,8 +12,8 @@ from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
 from .echoes import FlatEchoes
-from .fusion import fuse
-from .ghosts import openings, trim, without_corners, without_points
+from .fusion import BESIDE, fuse, settle
+from .ghosts import openings, points_among, trim, without_corners
 from .local import LocalModel, local_models
 from .logs import Log
 from .maps import GlobalMap
@@ -174,10 +175,16 @@ def assemble(evidence: Evidence, *, merging: str = "fused", confirmed: int = CON
         walls, _ = fuse(pieces, gap=evidence.gap)
     # Corners and poles answer like walls, from every pose in another direction.
     pieces = without_corners(pieces, walls)
-    walls = without_points(fuse(pieces, gap=evidence.gap)[0])
-    walls = walls.take(walls.count >= confirmed)
+    walls, wall_of = fuse(pieces, gap=evidence.gap)
+    real = np.flatnonzero(~points_among(walls) & (walls.count >= confirmed))
     # A wall goes on behind what hides it, but not across an opening that something was seen through.
-    walls, _ = fuse(walls, gap=BRIDGE, opening=lambda gaps, theta: openings(gaps, theta, pieces, seen))
+    opening = partial(openings, pieces=pieces, seen=seen)
+    walls, whole = fuse(walls.take(real), gap=BRIDGE, opening=opening, beside=BESIDE)
+    one_of = np.full(wall_of.max(initial=-1) + 1, -1)
+    one_of[real] = whole
+    # Each piece counts for as much as it agrees with its wall.
+    own = one_of[wall_of] >= 0
+    walls = settle(pieces.take(own), one_of[wall_of][own], walls)
     return _as_map(walls)
 
 

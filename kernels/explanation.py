@@ -80,7 +80,9 @@ class Expectations:
     edge_alone: float = 0.4
     """Share of the edges and poles that do not stand on the line of a wall."""
     square: float = 0.4
-    """Share of the walls that are parallel or square to another one."""
+    """Share of the walls that are parallel or square to another one; the guess that the scan's own share is added to."""
+    square_weight: float = 2.0
+    """Number of walls that this guess counts for."""
     crossing: float = 2.0
     """Nats against a wall whose foot lies on the line of another wall, where a corner would be."""
     wall: float = 2.0
@@ -154,6 +156,8 @@ class _Scene(NamedTuple):
     """(reflectors,) which of the rows are walls."""
     share: Array
     """Share of the expected echoes that arrive."""
+    square: Array
+    """Share of the walls that are parallel or square to another one."""
     sigma: Array
     """Noise of the ranges, metres."""
 
@@ -217,7 +221,8 @@ def explain(
         # Passes over the whole scan, each with what the one before has found.
         size = expected.reflectors
         nothing = jnp.zeros((size, 2)), jnp.zeros((size, 2, 2)), jnp.zeros(size, bool)
-        scene = _Scene(*nothing, jnp.asarray(expected.heard, reach.dtype), first)
+        shares = (jnp.asarray(guess, reach.dtype) for guess in (expected.heard, expected.square))
+        scene = _Scene(*nothing, *shares, first)
 
         def look_again(scene: _Scene, _: None) -> tuple[_Scene, None]:
             supports = _weighed(scan, start, scene, expected)
@@ -260,9 +265,12 @@ def _fitted(
     widest = jnp.maximum(0.04, tolerance)  # m: a cell of the accumulator
 
     def one(rho: Float[Array, ""], theta: Float[Array, ""]) -> Float[Array, "3 2"]:
-        place = rho * normal(theta)
-        starts = (plane, jnp.stack([rho, theta])), (corner, place), (edge, place)
-        return jnp.stack([fit(model, x, echo, tolerance=tolerance, widest=widest)[0] for model, x in starts])
+        line, score = fit(plane, jnp.stack([rho, theta]), echo, tolerance=tolerance, widest=widest)
+        # Points begin in the middle of what the plane explains, and may move along it.
+        foot = (echo.tx + echo.rx) / 2 @ tangent(line[1])
+        place = line[0] * normal(line[1]) + (score * foot).sum() / jnp.maximum(score.sum(), 1e-6) * tangent(line[1])
+        points = [fit(model, place, echo, tolerance=tolerance, widest=tolerance)[0] for model in (corner, edge)]
+        return jnp.stack([line, *points])
 
     here = jnp.isfinite(rho)
     return jnp.moveaxis(jax.vmap(one)(jnp.where(here, rho, 1), jnp.where(here, theta, 0)), 1, 0)
@@ -367,14 +375,22 @@ def _plane_prior(scan: _Scan, support: _Support, scene: _Scene, expected: Expect
     turn = wrap_angle(scene.wall[:, 1] - theta)
     short = scene.wall[:, 0] - normal(scene.wall[:, 1]) @ (rho * normal(theta))
     crossing = (scene.known & (jnp.abs(short) < 0.06) & _oblique(turn)).any()
-    itself = (jnp.abs(scene.wall[:, 0] - rho) < 0.08) & (jnp.abs(turn) < 0.15)
-    skew = jnp.abs(jnp.mod(turn + jnp.pi / 4, jnp.pi / 2) - jnp.pi / 4)  # to the next quarter turn
-    variance = _inverse(support.information)[1, 1] + scene.covariance[:, 1, 1] + np.radians(0.5) ** 2
-    square = jnp.where(scene.known & ~itself, jnp.exp(_gauss(skew, jnp.sqrt(variance))) * jnp.pi / 2, -1).max()
-    direction = jnp.log(1 - expected.square + expected.square * jnp.maximum(square, 0))
-    density += jnp.where(square < 0, 0, direction) - expected.crossing * crossing
+    square = _squareness(support.parameters, _inverse(support.information)[1, 1], scene)
+    direction = jnp.log(1 - scene.square + scene.square * square)
+    density += direction - expected.crossing * crossing
     share = (support.gain > 0).sum() / scan.full_wall
     return expected.prior * density + expected.full * (share - expected.usual)
+
+
+def _squareness(line: Float[Array, "2"], variance: Float[Array, ""], scene: _Scene) -> Float[Array, ""]:
+    """How much likelier this direction is than any other if walls are parallel or square; 1 without another wall."""
+    turn = wrap_angle(scene.wall[:, 1] - line[1])
+    itself = (jnp.abs(scene.wall[:, 0] - line[0]) < 0.08) & (jnp.abs(turn) < 0.15)
+    skew = jnp.abs(jnp.mod(turn + jnp.pi / 4, jnp.pi / 2) - jnp.pi / 4)  # to the next quarter turn
+    spread = jnp.sqrt(variance + scene.covariance[:, 1, 1] + np.radians(0.5) ** 2)
+    others = scene.known & ~itself
+    square = jnp.where(others, jnp.exp(_gauss(skew, spread)) * jnp.pi / 2, 0).max()
+    return jnp.where(others.any(), square, 1)
 
 
 def _point_prior(
@@ -487,11 +503,14 @@ def _learned(
     free = (involved.sum(axis=1) - 2) @ many
     guess = expected.sigma_weight * scene.sigma**2
     estimate = jnp.sqrt((guess + left) / (expected.sigma_weight + free))
-    return _Scene(
-        wall=found.parameters,
-        covariance=covariance,
-        known=wall,
+    # The share of the walls that are parallel or square to another one.
+    known = scene._replace(wall=found.parameters, covariance=covariance, known=wall)
+    square = jax.vmap(lambda line, c: _squareness(line, c[1, 1], known))(found.parameters, covariance)
+    member = scene.square * square / (1 - scene.square + scene.square * square)
+    squares = jnp.where(wall, member, 0).sum() + expected.square_weight * expected.square
+    return known._replace(
         share=share,
+        square=squares / (wall.sum() + expected.square_weight),
         sigma=jnp.where(jnp.isfinite(sigma), scene.sigma, jnp.maximum(estimate, expected.least_sigma)),
     )
 
