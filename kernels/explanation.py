@@ -60,7 +60,7 @@ class Expectations:
     clutter: float = 0.5
     """Echoes a metre and path that nothing explains."""
     heard: float = 0.8
-    """Share of the echoes inside the cones that arrive; the guess that the scan's own share is added to."""
+    """Share of the echoes inside the cones that arrive; a guess that the scan's own share adds to."""
     heard_weight: float = 8.0
     """Number of paths that this guess counts for."""
     blanking: float = 0.035
@@ -80,7 +80,7 @@ class Expectations:
     edge_alone: float = 0.4
     """Share of the edges and poles that do not stand on the line of a wall."""
     square: float = 0.4
-    """Share of the walls that are parallel or square to another one; the guess that the scan's own share is added to."""
+    """Share of the walls that are parallel or square to another one; a guess that the scan's own share adds to."""
     square_weight: float = 2.0
     """Number of walls that this guess counts for."""
     crossing: float = 2.0
