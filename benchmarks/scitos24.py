@@ -143,8 +143,8 @@ def main() -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     console = Console(width=110)
     for ring in (shipped, replace(shipped, beam=np.radians(15.0))):
-        models = list(local_models(ring, log))
-        chance = list(local_models(ring, shuffled(log, np.random.default_rng(0))))
+        models = list(local_models(ring, log, method="hough"))
+        chance = list(local_models(ring, shuffled(log, np.random.default_rng(0)), method="hough"))
         found = {
             name: agreement(models, minima[:, column], square[name], float(ring.heading[sensor]), radius)
             for name, (sensor, column) in DIRECTIONS.items()

@@ -1,4 +1,4 @@
-"""The demo: the embedded office and its map, and 200 random poses, high-resolution ring against a conventional one."""
+"""The demo: the embedded office and its map, and 200 random poses, against the paper's method and a usual ring."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ from .files import atomic_write, make_folder
 from .gridfile import save_nav2
 from .gridmap import occupancy
 from .local import LocalModel, local_models, settings_for
-from .logs import save_log
+from .logs import Log, save_log
 from .mapfile import save_map
 from .mapping import assemble, gather_evidence
 from .modelfile import save_models
@@ -35,6 +35,8 @@ from .simulate import Simulation, simulate
 SIGMA = 0.003
 """Range noise of every scan in the demo, metres."""
 RANDOM_ROOMS, POSES_PER_ROOM = 40, 5
+PAPERS, USUAL = "paper's method", "conventional ring"
+"""What else is compared: the Hough step alone, and the usual ring with it."""
 PAPER = {"rho_max_mm": 32.3, "theta_max_deg": 7.41}
 """The paper's largest deviations, over three walls of one scan (section 4)."""
 
@@ -64,22 +66,24 @@ def run_demo(
     simulation = simulate(office.ring, office.room, office.poses, sigma=SIGMA, seed=seed, stamps=office.stamps)
     log = simulation.as_log(office.ring, office.poses)
     models = list(local_models(office.ring, log))
+    paper_models = list(local_models(office.ring, log, method="hough"))
     usual = conventional_ring(office.ring)
     usual_simulation = simulate(usual, office.room, office.poses, sigma=SIGMA, seed=seed, max_echoes=1)
-    usual_models = list(local_models(usual, usual_simulation.as_log(usual, office.poses)))
+    usual_models = list(local_models(usual, usual_simulation.as_log(usual, office.poses), method="hough"))
 
     on_step("the map of the office")
     evidence = gather_evidence(office.ring, log, models)
+    paper_evidence = gather_evidence(office.ring, log, paper_models)
     world = assemble(evidence)
-    by_paper = assemble(evidence, merging="paper")
     grid = occupancy(office.ring, log, walls=world.segments)
     in_reach = walls_in_reach(simulation, office.room, len(office.poses))
     maps = [
         {"what": name}
         | map_summary(evaluate(segments, office.room.walls, gate_distance=GATE_RHO, gate_angle=GATE_THETA), in_reach)
         for name, segments in (
-            ("aggregated, of 17 scans", evidence.pieces.segments),
-            ("merged as in the paper", by_paper.segments),
+            (f"lines of 17 scans, {PAPERS}", paper_evidence.pieces.segments),
+            (f"merged, {PAPERS}", assemble(paper_evidence, merging="paper").segments),
+            ("lines of 17 scans", evidence.pieces.segments),
             ("the map", world.segments),
         )
     ]
@@ -87,8 +91,10 @@ def run_demo(
     on_step(f"{RANDOM_ROOMS * POSES_PER_ROOM} random poses in {RANDOM_ROOMS} random rooms")
     rows = [
         ("office, first pose", _deviations(office.ring, models[:1], simulation, office)),
+        (f"office, first pose, {PAPERS}", _deviations(office.ring, paper_models[:1], simulation, office)),
         ("office, 17 poses", _deviations(office.ring, models, simulation, office)),
-        ("office, 17 poses, conventional ring", _deviations(usual, usual_models, usual_simulation, office, simulation)),
+        (f"office, 17 poses, {PAPERS}", _deviations(office.ring, paper_models, simulation, office)),
+        (f"office, 17 poses, {USUAL}", _deviations(usual, usual_models, usual_simulation, office, simulation)),
         *_random_rows(office.ring, usual, seed, on_room),
     ]
 
@@ -105,7 +111,7 @@ def run_demo(
     for name, table in (("table", line_rows), ("map-table", maps)):
         with atomic_write(output / f"{name}.json") as file:
             json.dump(table, file, indent=1)
-    drawn = draw(office, log, models, world, grid)
+    drawn = draw(office, log, models, paper_models, world, grid)
     for name, figure in drawn.items():
         figures.save(figure, output / f"{name}.svg")
         figures.save(figure, output / f"{name}.png")
@@ -181,19 +187,30 @@ def _deviations(
 def _random_rows(
     ring: Ring, usual: Ring, seed: int, on_room: Callable[[int], None]
 ) -> Iterator[tuple[str, Deviations]]:
-    """Both rings in the same random rooms, the walls to be found being those that the first one hears well."""
+    """Both methods and both rings in the same random rooms; to be found are the walls that the first ring hears well."""
     rng = np.random.default_rng(seed)
-    full, conventional = [], []
+    rooms, places, full, conventional = [], [], [], []
     for k in range(RANDOM_ROOMS):
         room: Room = random_room(rng)
         poses = np.stack([random_pose(rng, room) for _ in range(POSES_PER_ROOM)])
-        heard = simulate(ring, room, poses, sigma=SIGMA, seed=seed + k)
-        models = list(local_models(ring, heard.as_log(ring, poses)))
-        full.append(compare(ring, models, heard, room, poses, sigma=SIGMA))
-        first = simulate(usual, room, poses, sigma=SIGMA, seed=seed + k, max_echoes=1)
-        models = list(local_models(usual, first.as_log(usual, poses)))
-        conventional.append(compare(usual, models, first, room, poses, sigma=SIGMA, judge=heard))
+        full.append(simulate(ring, room, poses, sigma=SIGMA, seed=seed + k))
+        conventional.append(simulate(usual, room, poses, sigma=SIGMA, seed=seed + k, max_echoes=1))
+        rooms.append(room)
+        places.append(poses)
         on_room(k + 1)
+
+    def compared(ring: Ring, heard: list[Simulation], method: str) -> Deviations:
+        logs = [simulation.as_log(ring, poses) for simulation, poses in zip(heard, places, strict=True)]
+        scans = [replace(scan, scan=number) for number, scan in enumerate(scan for log in logs for scan in log)]
+        models = list(local_models(ring, Log.from_scans(scans), method=method))
+        return pooled(
+            [
+                compare(ring, models[k * POSES_PER_ROOM :][:POSES_PER_ROOM], one, room, poses, sigma=SIGMA, judge=judge)
+                for k, (one, judge, room, poses) in enumerate(zip(heard, full, rooms, places, strict=True))
+            ]
+        )
+
     what = f"{RANDOM_ROOMS * POSES_PER_ROOM} random poses"
-    yield what, pooled(full)
-    yield f"{what}, conventional ring", pooled(conventional)
+    yield what, compared(ring, full, "ml")
+    yield f"{what}, {PAPERS}", compared(ring, full, "hough")
+    yield f"{what}, {USUAL}", compared(usual, conventional, "hough")

@@ -26,9 +26,23 @@ CORNER, AROUND = (-1.47, -1.96), 2.5
 
 
 def draw(
-    office: Office, log: Log, models: Sequence[LocalModel], world: GlobalMap, grid: OccupancyGrid
+    office: Office,
+    log: Log,
+    models: Sequence[LocalModel],
+    paper_models: Sequence[LocalModel],
+    world: GlobalMap,
+    grid: OccupancyGrid,
 ) -> dict[str, Figure]:
-    """The paper's figures 1 to 7, the accumulator and the grid, by the names of their files."""
+    """The paper's figures 1 to 7, the accumulator and the grid, by the names of their files.
+
+    Args:
+        office: ring, room and poses.
+        log: the scans.
+        models: what was found in each.
+        paper_models: the same by the paper's method, for the accumulator.
+        world: the map.
+        grid: the occupancy grid.
+    """
     ring, room, poses = office.ring, office.room, office.poses
     first = poses[0]
     bearing = np.arange(BEAMS) * (2 * np.pi / BEAMS) - np.pi
@@ -40,7 +54,7 @@ def draw(
         "2-reference": figures_map.laser_figure(laser, seen),
         "3-arcs": figures_scan.arcs_figure(ring, log[0], room=room, pose=first),
         "4-lines": figures_scan.lines_figure(ring, log[0], models[0], room=room, pose=first),
-        "4-accumulator": figures_scan.accumulator_figure(ring, log[0], models[0]),
+        "4-accumulator": figures_scan.accumulator_figure(ring, log[0], paper_models[0]),
         "5-modeling": figures_map.modeling_figure(
             ring, models, poses, scans=(0, 1, 2), near=CORNER, within=AROUND, room=room
         ),
@@ -79,8 +93,8 @@ def write_page(
         picture("1-ring", "The ring, and the arcs of all paths of one transmitter (the paper's figure 1)."),
         picture("2-reference", "What a laser makes of the place: segments, pseudo segments, intersections (figure 2)."),
         picture("3-arcs", "All arcs of the first scan; paths without an echo are light arcs (figure 3)."),
-        picture("4-lines", "The lines extracted from this one scan (figure 4)."),
-        picture("4-accumulator", "How they were found: votes, low pass, components above the threshold."),
+        picture("4-lines", "The walls and corners that explain this one scan (figure 4)."),
+        picture("4-accumulator", "The paper's method: votes, low pass, components above the threshold."),
     ]
     whole = [
         picture(

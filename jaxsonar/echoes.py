@@ -15,6 +15,8 @@ from .ring import Ring
 
 SCANS_PER_STEP = (1, 16, 256)
 """Numbers of scans that a compiled step takes; what remains of a batch is padded with scans without echoes."""
+DEAR_SCANS_PER_STEP = (1, 32, 32)
+"""The same where a scan takes milliseconds and a compilation many seconds."""
 _FARTHEST = 1e6  # m; beyond all rings, and within single precision
 _FEW_CELLS = 50_000  # accumulators larger than this are not stacked by the hundred
 
@@ -122,9 +124,14 @@ class FlatEchoes:
         heard = path >= 0
         return cls(len(log), log.echo_scan[heard], path[heard], log.range[heard]), int((~heard).sum())
 
-    def steps(self, cells: int) -> Iterator["Step"]:
-        """The scans in rectangles of few different shapes, fewer scans at once if the accumulator has many cells."""
-        one, some, many = SCANS_PER_STEP
+    def steps(self, cells: int, *, dear: bool = False) -> Iterator["Step"]:
+        """The scans in rectangles of few different shapes, fewer scans at once if the accumulator has many cells.
+
+        Args:
+            cells: of the accumulator.
+            dear: compiling another shape is dear, a scan too: even fewer shapes, with fewer scans.
+        """
+        one, some, many = DEAR_SCANS_PER_STEP if dear else SCANS_PER_STEP
         last = 0
         while last < self.scans:
             first, left = last, self.scans - last
@@ -133,7 +140,10 @@ class FlatEchoes:
             begin, end = self.start[first], self.start[last]
             row = self.scan[begin:end] - first
             column = np.arange(begin, end) - self.start[first + row]
-            columns = room_for(int(column.max(initial=-1)) + 1, least=64 if self.pose is None else 256)
+            most = int(column.max(initial=-1)) + 1
+            columns = room_for(most, least=64 if self.pose is None else 256)
+            if dear:
+                columns = 1 << (columns - 1).bit_length()
             path = np.zeros((step, columns), np.int32)
             reported = np.full((step, columns), np.nan, np.float32)
             path[row, column] = self.path[begin:end]

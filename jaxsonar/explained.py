@@ -70,7 +70,7 @@ def explained(
     expected = kernels.Expectations() if expected is None else expected
     arcs = arcs_of(ring, settings)
     noise = jnp.asarray(np.nan if sigma is None else sigma, jnp.float32)
-    for step in echoes.steps(settings.cells):
+    for step in echoes.steps(settings.cells, dear=True):
         found = kernels.explain(arcs, step.packed, noise, settings=settings, expected=expected)
         real = slice(0, step.scans.stop - step.scans.start)  # the rest is padding
         found = jax.tree.map(lambda leaf, rows=real: np.asarray(leaf)[rows], found)

@@ -109,12 +109,12 @@ def lines_figure(
     room: Room | None = None,
     pose: Float[np.ndarray, "3"] | None = None,
 ) -> Figure:
-    """Extracted lines in bold over the arcs and, if it is known, the reference (paper, figure 4).
+    """Extracted lines in bold, corners and edges, over the arcs and, if it is known, the reference (paper, figure 4).
 
     Args:
         ring: the sensors.
         scan: its echoes.
-        model: the lines found in it.
+        model: what was found in it.
         room: the true walls, if they are known.
         pose: world_from_robot (x, y, theta); the robot frame if left out.
     """
@@ -135,6 +135,7 @@ def lines_figure(
         place = to_world(pose, (foot * (1 + 0.12 / max(line.rho, 0.12)))[None])[0]
         axes.text(place[0], place[1], str(number), color=LINE, fontweight="bold", ha="center", va="center", zorder=6)
     handles.append(Line2D([], [], color=LINE, lw=0.8, ls=(0, (4, 3)), label="the same line, continued"))
+    handles += _draw_points(axes, model, pose)
     draw_robot(axes, ring, pose)
     handles += _arc_handles(ring)
     return finish(figure, axes, [*handles, robot_handle()])
@@ -198,6 +199,22 @@ def _arc_points(sensors: kernels.Sensors, path: jax.Array, reach: jax.Array, poi
     theta = paths.start[:, None] + paths.width[:, None] * jnp.linspace(0, 1, points)[None]
     one_arc = jax.vmap(kernels.arc_point, in_axes=(None, None, 0))
     return jax.vmap(one_arc)(paths, reach, theta)
+
+
+def _draw_points(axes: Axes, model: LocalModel, pose: Float[np.ndarray, "3"]) -> list[Line2D]:
+    """Corners, edges and what is undecided, and their handles."""
+    kinds = {
+        "s": ("corner", [(p.x, p.y) for p in model.points if p.kind == "corner"]),
+        "D": ("edge or pole", [(p.x, p.y) for p in model.points if p.kind == "edge"]),
+        "o": ("wall or point, not decided", [(u.x, u.y) for u in model.undecided]),
+    }
+    handles = []
+    for marker, (label, places) in kinds.items():
+        style = {"color": LINE, "marker": marker, "ls": "", "ms": 7, "mfc": "white", "mew": 1.8, "label": label}
+        if places:
+            axes.plot(*to_world(pose, np.array(places)).T, **style, zorder=6)
+            handles.append(Line2D([], [], **style))
+    return handles
 
 
 def _tangent(theta: float) -> Float[np.ndarray, "2"]:

@@ -34,7 +34,9 @@ from .reflectors import Sighting
 
 PLANE, CORNER, EDGE = 0, 1, 2
 """Kinds of reflectors, rows of ``Explanation.probability``."""
-_PASSES = 3
+_PASSES = 4
+_STEPS = 3  # of the fit in each pass
+_SECOND_ORDER_WALLS = 7  # of a scan's reflectors, those with the most evidence, between which sound is followed
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,9 @@ class Expectations:
 
     candidates: int = 20
     """Maxima of the accumulator that are fitted."""
-    reflectors: int = 12
+    hypotheses: int = 12
+    """Of them, those that are weighed as planes, corners and edges."""
+    reflectors: int = 10
     """Reflectors that a scan can have."""
     peak: float = 0.1
     """Occupancy of a candidate, as a fraction of the points that a fully seen wall puts into its cell."""
@@ -73,11 +77,11 @@ class Expectations:
     """Edges and poles that a scan sees."""
     corner_alone: float = 0.1
     """Share of the corners of which neither wall is seen."""
-    corner_of_one: float = 0.2
+    corner_of_one: float = 0.15
     """Share of the corners of which one wall is seen; for each wall."""
     corner_of_two: float = 0.5
     """Share of the corners of which both walls are seen; for each pair."""
-    edge_alone: float = 0.4
+    edge_alone: float = 0.3
     """Share of the edges and poles that do not stand on the line of a wall."""
     square: float = 0.4
     """Share of the walls that are parallel or square to another one; a guess that the scan's own share adds to."""
@@ -91,7 +95,7 @@ class Expectations:
     """Nats that silence costs at most: something may stand before a reflector."""
     faint: float = 1.0
     """Nats that silence off the axes costs at most at an edge, which may be faint."""
-    full: float = 7.7
+    full: float = 10.0
     """Nats for a wall that all its paths hear, against one that none hears: points answer to fewer of them."""
     usual: float = 0.55
     """Share of a full wall's echoes from which on there are more of them than expected of a point."""
@@ -137,6 +141,8 @@ class _Scan(NamedTuple):
     """All paths of the ring."""
     echo: EchoPaths
     """The path of each echo."""
+    path: Array
+    """(echoes,) its row."""
     reach: Array
     """(echoes,) corrected ranges, metres."""
     valid: Array
@@ -214,25 +220,26 @@ def explain(
             packed.range, echo.range_offset
         )
         valid = (reach > 0) & (reach < ring.max_range)
-        scan = _Scan(ring.paths, echo, reach, valid, ring.max_range, ring.full_wall)
+        scan = _Scan(ring.paths, echo, packed.path, reach, valid, ring.max_range, ring.full_wall)
         known = jnp.isfinite(sigma)
         first = jnp.where(known, jnp.maximum(sigma, expected.least_sigma), expected.sigma)
-        start = _fitted(ring, packed, rho, theta, first)
+        start, here = _fitted(ring, packed, rho, theta, first, expected)
         # Passes over the whole scan, each with what the one before has found.
         size = expected.reflectors
         nothing = jnp.zeros((size, 2)), jnp.zeros((size, 2, 2)), jnp.zeros(size, bool)
         shares = (jnp.asarray(guess, reach.dtype) for guess in (expected.heard, expected.square))
         scene = _Scene(*nothing, *shares, first)
 
-        def look_again(scene: _Scene, _: None) -> tuple[_Scene, None]:
+        def look(state: tuple[_Scene, Float[Array, "3 k 2"]], _: None):
+            scene, start = state
             supports = _weighed(scan, start, scene, expected)
-            chosen = _chosen(scan, supports, jnp.isfinite(rho), expected)
-            return _learned(scan, _taken(supports, chosen[0]), chosen, scene, sigma, expected), None
+            chosen = _chosen(scan, supports, here, expected)
+            found = _taken(supports, chosen[0])
+            scene = _learned(scan, found, chosen, scene, sigma, expected)
+            return (scene, supports.parameters.reshape(start.shape)), (found, chosen, scene.sigma)
 
-        scene, _ = jax.lax.scan(look_again, scene, None, length=_PASSES)
-        supports = _weighed(scan, start, scene, expected)
-        index, kind, evidence, involved, probability = _chosen(scan, supports, jnp.isfinite(rho), expected)
-        found = _taken(supports, index)
+        _, passes = jax.lax.scan(look, (scene, start), None, length=_PASSES)
+        found, (_, kind, evidence, involved, probability), noise = jax.tree.map(lambda leaf: leaf[-1], passes)
         is_plane = kind == PLANE
         rho, theta = fold_line(found.parameters[:, 0], found.parameters[:, 1])
         flipped = is_plane & (found.parameters[:, 0] < 0)
@@ -250,30 +257,58 @@ def explain(
             evidence=evidence,
             involved=involved,
             segment=segment,
-            sigma=scene.sigma,
+            sigma=noise,
         )
 
-    return over_scans(one_scan, echoes)
+    def nothing(packed: Echoes) -> Explanation:
+        shapes = jax.eval_shape(one_scan, packed)
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        return eqx.tree_at(lambda e: e.kind, zeros, jnp.full_like(zeros.kind, -1))
+
+    def one_or_none(packed: Echoes) -> Explanation:  # padding costs nothing where scans come one after the other
+        return jax.lax.cond(jnp.isfinite(packed.range).any(), one_scan, nothing, packed)
+
+    return over_scans(one_or_none, echoes)
 
 
 def _fitted(
-    ring: RingArcs, packed: Echoes, rho: Float[Array, " k"], theta: Float[Array, " k"], sigma: Float[Array, ""]
-) -> Float[Array, "3 k 2"]:
-    """Every candidate as a plane, a corner and an edge, fitted robustly to the echoes around it."""
+    ring: RingArcs,
+    packed: Echoes,
+    rho: Float[Array, " candidates"],
+    theta: Float[Array, " candidates"],
+    sigma: Float[Array, ""],
+    expected: Expectations,
+) -> tuple[Float[Array, "3 k 2"], Bool[Array, " k"]]:
+    """The best candidates as planes, corners and edges, each fitted robustly to the echoes around it.
+
+    Returns:
+        Parameters, and which of the rows are candidates.
+    """
     echo = heard(ring, packed)
     tolerance = 2.5 * sigma
     widest = jnp.maximum(0.04, tolerance)  # m: a cell of the accumulator
+    here = jnp.isfinite(rho)
+    starts = jnp.stack([jnp.where(here, rho, 1), jnp.where(here, theta, 0)], axis=-1)
+    lines, scores = jax.vmap(lambda x: fit(plane, x, echo, tolerance=tolerance, widest=widest))(starts)
+    # Candidates that came to the same line are one.
+    total = jnp.where(here, scores.sum(axis=1), -1)
+    near = jnp.abs(lines[:, None, 0] - lines[None, :, 0]) < 0.005
+    near &= jnp.abs(wrap_angle(lines[:, None, 1] - lines[None, :, 1])) < 0.01
+    rank = jnp.arange(len(total))
+    better = (total[None, :] > total[:, None]) | ((total[None, :] == total[:, None]) & (rank[None, :] < rank[:, None]))
+    total = jnp.where((near & better).any(axis=1), -1, total)
+    total, best = jax.lax.top_k(total, expected.hypotheses)
 
-    def one(rho: Float[Array, ""], theta: Float[Array, ""]) -> Float[Array, "3 2"]:
-        line, score = fit(plane, jnp.stack([rho, theta]), echo, tolerance=tolerance, widest=widest)
-        # Points begin in the middle of what the plane explains, and may move along it.
+    def points(line: Float[Array, "2"], score: Float[Array, " echoes"]) -> Float[Array, "2 2"]:
+        # They begin in the middle of what the plane explains.
         foot = (echo.tx + echo.rx) / 2 @ tangent(line[1])
         place = line[0] * normal(line[1]) + (score * foot).sum() / jnp.maximum(score.sum(), 1e-6) * tangent(line[1])
-        points = [fit(model, place, echo, tolerance=tolerance, widest=tolerance)[0] for model in (corner, edge)]
-        return jnp.stack([line, *points])
+        return jnp.stack(
+            [fit(model, place, echo, tolerance=tolerance, widest=tolerance)[0] for model in (corner, edge)]
+        )
 
-    here = jnp.isfinite(rho)
-    return jnp.moveaxis(jax.vmap(one)(jnp.where(here, rho, 1), jnp.where(here, theta, 0)), 1, 0)
+    both = jax.vmap(points)(lines[best], scores[best])
+    return jnp.concatenate([lines[best][None], jnp.moveaxis(both, 1, 0)]), total > 0
 
 
 def _weighed(scan: _Scan, start: Float[Array, "3 k 2"], scene: _Scene, expected: Expectations) -> _Support:
@@ -298,29 +333,19 @@ def _refined(
 ) -> _Support:
     """Maximum likelihood over the ranges: each echo weighs as much as it is likely to come from this reflector."""
 
-    def look(x: Float[Array, "2"]):
-        def one(path: EchoPaths):
-            def sighted(x: Float[Array, "2"]):
-                sighting = model(x, path)
-                return sighting.range, sighting
-
-            slope, sighting = jax.grad(sighted, has_aux=True)(x)
-            return slope, sighting, scene.share * reflectors.heard_share(sighting, path)
-
-        slope, sighting, share = jax.vmap(one)(scan.echo)
-        residual = scan.reach - sighting.range
+    def step(x: Float[Array, "2"], _: None):
+        sighting = jax.vmap(model, in_axes=(None, 0))(x, scan.echo)
+        share = scene.share * jax.vmap(reflectors.heard_share)(sighting, scan.echo)
+        residual, slope = scan.reach - sighting.range, sighting.slope
         odds = jnp.log(share / (1 - share) + 1e-9) + _gauss(residual, scene.sigma) - clutter
         gain = jnp.where(scan.valid, odds, -jnp.inf)
         weight = jax.nn.sigmoid(gain) / scene.sigma**2
         information = jnp.einsum("e,ei,ej->ij", weight, slope, slope)
-        return information, (weight * residual) @ slope, gain, sighting.foot, residual
+        x = x + jnp.clip(_inverse(information) @ ((weight * residual) @ slope), -0.05, 0.05)
+        return x, (information, gain, sighting.foot, residual)
 
-    def step(x: Float[Array, "2"], _: None):
-        information, pull = look(x)[:2]
-        return x + jnp.clip(_inverse(information) @ pull, -0.05, 0.05), None
-
-    x, _ = jax.lax.scan(step, x, None, length=3)
-    information, _, gain, foot, residual = look(x)
+    x, looks = jax.lax.scan(step, x, None, length=_STEPS)
+    information, gain, foot, residual = jax.tree.map(lambda leaf: leaf[-1], looks)  # the last step is tiny
     return _Support(x, information, gain, foot, residual, jnp.zeros(()))
 
 
@@ -337,8 +362,9 @@ def _silence(scan: _Scan, kind: int, support: _Support, scene: _Scene, expected:
         return sighting, share, jnp.log1p(-scene.share * share), reflectors.off_axis(sighting, path)
 
     sighting, share, cost, off_axis = jax.vmap(look)(scan.paths)
-    by_echo, _, excuse, echo_off_axis = jax.vmap(look)(scan.echo)
-    behind = scan.reach - by_echo.range
+    foot, reach = sighting.foot, sighting.range
+    by_echo, expected_reach, excuse, echo_off_axis = (leaf[scan.path] for leaf in (foot, reach, cost, off_axis))
+    behind = scan.reach - expected_reach
     excused = scan.valid & (behind < 4 * scene.sigma) & (behind > -expected.blanking - 4 * scene.sigma)
     excuse = jnp.where(excused, excuse, 0)
 
@@ -355,7 +381,6 @@ def _silence(scan: _Scan, kind: int, support: _Support, scene: _Scene, expected:
         return jnp.maximum(inside, -expected.hidden) + jnp.maximum(outside, -expected.faint)
     # A wall may end beyond its outermost feet: somewhere between them and the next path that is silent.
     low, high = jnp.where(mine, support.foot, jnp.inf).min(), jnp.where(mine, support.foot, -jnp.inf).max()
-    foot, by_echo = sighting.foot, by_echo.foot
     inside = total((foot >= low) & (foot <= high), (by_echo >= low) & (by_echo <= high))
     silence = jnp.maximum(inside, -expected.hidden)
     for beyond, echoes_beyond, gap in (
@@ -421,7 +446,7 @@ def _point_prior(
 
 def _second_order(scan: _Scan, scene: _Scene) -> Float[Array, " echoes"]:
     """How dense echoes from wall to wall are expected at each echo's range, 1/m."""
-    size = len(scene.known)
+    size = min(len(scene.known), _SECOND_ORDER_WALLS)
     first, second = np.nonzero(~np.eye(size, dtype=bool))
 
     def pair(first: Float[Array, "2"], second: Float[Array, "2"], known: Bool[Array, ""]) -> Float[Array, " echoes"]:
@@ -493,12 +518,12 @@ def _learned(
         return near & between & (reflectors.heard_share(sighting, path) > 0.95)
 
     each_path = jax.vmap(jax.vmap(certain, in_axes=(None, None, None, 0)), in_axes=(0, 0, 0, None))
-    asked = jnp.where(wall, each_path(found.parameters, low, high, scan.paths).sum(axis=1), 0).sum()
-    answered = (each_path(found.parameters, low, high, scan.echo) & involved & wall[:, None]).sum()
+    sure = each_path(found.parameters, low, high, scan.paths) & wall[:, None]
+    asked, answered = sure.sum(), (sure[:, scan.path] & involved).sum()
     weight = expected.heard_weight
     share = jnp.clip((weight * expected.heard + answered) / (weight + asked), 0.3, 0.97)
     # Noise: what is left between ranges and walls; two of each wall's residuals are spent on the wall itself.
-    many = wall & (involved.sum(axis=1) >= 5)
+    many = wall & (involved.sum(axis=1) >= 4)
     left = jnp.where(involved & many[:, None], found.residual**2, 0).sum()
     free = (involved.sum(axis=1) - 2) @ many
     guess = expected.sigma_weight * scene.sigma**2

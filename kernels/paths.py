@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .geometry import wrap_angle
+from .geometry import normal, wrap_angle
 
 
 class Sensors(eqx.Module):
@@ -42,8 +42,8 @@ class EchoPaths(eqx.Module):
     """Width of the detection range, radians, counter-clockwise from start; 0 where the cones do not overlap."""
     range_offset: Float[Array, "*paths"]
     """Metres that the path reports too much: the mean of its two sensors."""
-    heading: Float[Array, "*paths 2"]
-    """Directions that tx and rx look to, radians."""
+    axes: Float[Array, "*paths 2 2"]
+    """Unit vectors along which tx and rx look."""
     half_beam: Float[Array, "*paths 2"]
     """Half the cones of tx and rx, radians."""
 
@@ -64,7 +64,7 @@ def echo_paths(sensors: Sensors) -> EchoPaths:
             start=sensors.heading[tx] + first,
             width=jnp.maximum(last - first, 0),
             range_offset=(sensors.range_offset[tx] + sensors.range_offset[rx]) / 2,
-            heading=jnp.stack([sensors.heading[tx], sensors.heading[rx]]),
+            axes=normal(jnp.stack([sensors.heading[tx], sensors.heading[rx]])),
             half_beam=jnp.stack([half_tx, half_rx]),
         )
 
