@@ -247,7 +247,7 @@ def models_of(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSet
                     rho=wall.rho,
                     theta=wall.theta,
                     segment=wall.segment,
-                    votes=wall.votes,
+                    votes=float(wall.votes),
                     echoes=len(wall.echoes),
                     paths=paths[np.unique(step.path[row, wall.echoes])],
                     scans=tuple(log.scan[np.unique(windows.scan[step.echo[row, wall.echoes]])].tolist()),
