@@ -31,7 +31,7 @@ from .figures import (
 )
 from .gridmap import FREE, OCCUPIED, UNKNOWN
 from .local import Line, LocalModel
-from .maps import GlobalMap
+from .maps import POINT_KINDS, GlobalMap
 from .polygonal import PolygonalModel
 from .poses import to_world
 from .ring import Ring
@@ -39,6 +39,7 @@ from .rooms import Room
 
 MOST_NUMBERS = 40
 """More robot positions than this are drawn as a path without numbers."""
+_POINT_MARKERS = {"corner": ("s", 5.5), "edge": ("D", 4.5)}  # marker, points
 _MARGIN = 0.25  # m around what a cut-out shows
 
 
@@ -160,13 +161,16 @@ def map_figure(
         room: the true walls, if they are known.
         reference: walls by another sensor, both ends of each.
         laser_points: where a laser saw something.
-        title: above the figure; the number of segments if left out.
+        title: above the figure; the numbers of segments, corners and edges if left out.
 
     All coordinates are in the world frame, metres.
     """
     count = f"{len(world)} merged segment{'' if len(world) == 1 else 's'}"
+    for kind in POINT_KINDS:
+        found = world.point_kinds.count(kind)
+        count += f", {found} {kind}{'' if found == 1 else 's'}" if found else ""
     figure, axes = plan(count if title is None else title)
-    handles = [_draw_map(axes, world)]
+    handles = _draw_map(axes, world)
     if aggregated is not None:
         axes.add_collection(LineCollection(list(aggregated), colors=CROSS, linewidths=1, alpha=0.7, zorder=4))
         handles.append(Line2D([], [], color=CROSS, lw=1, label="segment of a local model"))
@@ -240,12 +244,12 @@ def grid_figure(
         for value, label in ((OCCUPIED, "occupied"), (UNKNOWN, "unknown"), (FREE, "free"))
     ]
     if world is not None:
-        handles.append(_draw_map(axes, world))
+        handles += _draw_map(axes, world)
     return finish(figure, axes, handles, width=8.4)
 
 
-def _draw_map(axes: Axes, world: GlobalMap) -> Line2D:
-    """Segments in bold, a tick across each end, so that neighbors on one wall can be told apart."""
+def _draw_map(axes: Axes, world: GlobalMap) -> list[Line2D]:
+    """Segments in bold, a tick across each end, so that neighbors on one wall can be told apart; corners and edges."""
     axes.add_collection(
         LineCollection(list(world.segments), colors=LINE, linewidths=2.6, capstyle="butt", zorder=5),
     )
@@ -262,7 +266,14 @@ def _draw_map(axes: Axes, world: GlobalMap) -> Line2D:
         ),
         autolim=False,
     )  # fmt: skip
-    return Line2D([], [], color=LINE, lw=2.6, marker="|", ms=8, mew=1, label="merged segment and its ends")
+    handles = [Line2D([], [], color=LINE, lw=2.6, marker="|", ms=8, mew=1, label="merged segment and its ends")]
+    for kind, (marker, size) in _POINT_MARKERS.items():
+        places = world.points[np.array(world.point_kinds, dtype=np.str_) == kind]
+        if len(places):
+            look = {"marker": marker, "ls": "", "ms": size, "mfc": "white", "mec": LINE, "mew": 1.2}
+            axes.plot(*places.T, **look, zorder=6)
+            handles.append(Line2D([], [], **look, label=kind))
+    return handles
 
 
 def _draw_path(axes: Axes, poses: Float[np.ndarray, "scans 3"]) -> Line2D:

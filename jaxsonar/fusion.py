@@ -18,12 +18,14 @@ TURN_GATE = 3.0
 """Standard deviations by which their directions may differ."""
 OFFSET_FLOOR = 0.005
 """Metres; how well an offset can agree at best: walls are not quite straight, nor is odometry."""
+MOST_FLOOR = 0.02
+"""Metres; however far poses are off."""
 TURN_PER_OFFSET = 2.2
 """Radians per metre; how well a direction can agree at best, for how well an offset can."""
 BOTH_SIDES = 0.04
 """Metres; faces seen from opposite sides and less than this apart are one thin wall, else two."""
 BESIDE = 0.025
-"""Metres; nothing stands this little before a wall: lines side by side this near are of one wall, however they differ."""
+"""Metres; nothing stands this little before a wall: what is this near to its line is it, however well it is known."""
 Opening = Callable[[Float[np.ndarray, "gaps 2 2"], Float[np.ndarray, " gaps"]], Bool[np.ndarray, " gaps"]]
 """Tells of gaps (both ends, metres, and the direction of the wall's normal) whether they are openings."""
 OUTLYING = 3.0
@@ -34,7 +36,7 @@ _NEAREST = 12
 
 
 def fuse(
-    pieces: Pieces, *, gap: float, opening: Opening | None = None, beside: float = 0.0
+    pieces: Pieces, *, gap: float, floor: float = OFFSET_FLOOR, opening: Opening | None = None, beside: float = 0.0
 ) -> tuple[Pieces, Int[np.ndarray, " pieces"]]:
     """Walls from pieces: in rounds, those that are each other's best match add up, until no two of them match.
 
@@ -45,8 +47,9 @@ def fuse(
     Args:
         pieces: pieces of walls.
         gap: metres.
+        floor: how well offsets can agree at best, metres (``common_floor``).
         opening: if given, tells which gaps, from end to end, are openings and stay open.
-        beside: pieces side by side that are nowhere farther apart match as well, metres.
+        beside: a piece whose ends are this near to the line of a longer one matches it as well, metres.
 
     Returns:
         The walls, and which of them each piece belongs to.
@@ -57,10 +60,10 @@ def fuse(
     changed, thorough = np.ones(len(pieces), dtype=bool), False
     while len(pieces) > 1:
         # Only pieces that changed can match anew; first with the nearest, at last with all of them.
-        new = _neighbors(pieces, changed, gap, nearest=None if thorough else _NEAREST)
-        badness, between = _compared(pieces, new, gap)
+        new = _neighbors(pieces, changed, gap, floor, nearest=None if thorough else _NEAREST)
+        badness, between = _compared(pieces, new, gap, floor)
         if beside:
-            badness = np.minimum(badness, _width(pieces, new) / beside)
+            badness = np.minimum(badness, np.maximum(_width(pieces, new) / beside, between / gap))
         new, badness, between = new[badness <= 1], badness[badness <= 1], between[badness <= 1]
         if opening is not None and (between > 0).any():
             apart = np.flatnonzero(between > 0)
@@ -69,7 +72,7 @@ def fuse(
         pairs, once = np.unique(np.concatenate([pairs, new]), axis=0, return_index=True)
         cost = np.concatenate([cost, badness])[once]
         if len(pairs):
-            group = _mutual(pairs, cost, len(pieces))
+            group = mutual(pairs, cost, len(pieces))
             pieces, wall_of = add_up(pieces, group), group[wall_of]
             changed = np.bincount(group) > 1
             pairs = group[pairs]
@@ -82,35 +85,63 @@ def fuse(
     return replace(pieces, scans=unique_pairs(wall_of[seen[0]], seen[1])), wall_of
 
 
-def settle(pieces: Pieces, wall_of: Int[np.ndarray, " pieces"], walls: Pieces) -> Pieces:
+def common_floor(pieces: Pieces, *, gap: float) -> float:
+    """How well offsets can agree at best, metres: more than ``OFFSET_FLOOR`` where poses are off by more.
+
+    The pieces of a wall then differ by more than their covariances tell, in most walls, and even the nearest of them.
+
+    Args:
+        pieces: pieces of walls.
+        gap: metres, as for ``fuse``.
+    """
+    floor = OFFSET_FLOOR
+    while True:
+        walls, _ = fuse(pieces, gap=gap, floor=floor)
+        walls = walls.take(walls.count > 1)
+        if not len(walls):
+            return floor
+        excess = np.maximum(walls.misfit - 2 * (walls.count - 1), 0) / walls.info_offset
+        order = np.argsort(excess, kind="stable")
+        half = np.searchsorted(np.cumsum(walls.count[order]), walls.count.sum() / 2)
+        wanted = min(2 * float(np.sqrt(excess[order[half]])), MOST_FLOOR)
+        if wanted < 1.1 * floor:
+            return floor
+        floor = wanted
+
+
+def settle(
+    pieces: Pieces, wall_of: Int[np.ndarray, " pieces"], walls: Pieces, *, floor: float = OFFSET_FLOOR
+) -> Pieces:
     """The walls again, each piece counting for as much as it agrees with its wall.
 
-    A line with echoes of another reflector in it is farther off than its covariance tells. Where the deviation of a
-    piece exceeds ``OUTLYING`` standard deviations, its information is divided by the square of the excess.
+    A line with echoes of another reflector in it is farther off than its covariance tells. Where a piece deviates by
+    more than ``OUTLYING`` standard deviations of one of its lines, its information is divided by the square of the
+    excess.
 
     Args:
         pieces: pieces of walls.
         wall_of: which wall each belongs to.
         walls: their sums, to begin with.
+        floor: as for ``fuse``; what it exceeds ``OFFSET_FLOOR`` by is no piece's own fault.
     """
+    slack = floor - OFFSET_FLOOR
+    offset = pieces.count / pieces.info_offset + slack**2
+    angle = pieces.count / pieces.info_theta + (TURN_PER_OFFSET * slack) ** 2
     for _ in range(_ROUNDS):
         off, turn = deviations(pieces, walls, wall_of)
-        squared = (pieces.info_offset * off**2 + pieces.info_theta * turn**2) / pieces.count
-        share = np.minimum(1, OUTLYING**2 / np.maximum(squared, 1e-9))
-        weighed = replace(
-            pieces, info_offset=share * pieces.info_offset, info_theta=share * pieces.info_theta
-        )
+        share = np.minimum(1, OUTLYING**2 / np.maximum(off**2 / offset + turn**2 / angle, 1e-9))
+        weighed = replace(pieces, info_offset=share * pieces.info_offset, info_theta=share * pieces.info_theta)
         walls = add_up(weighed, wall_of)
     return walls
 
 
 def mismatch(pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"], *, gap: float) -> Float[np.ndarray, " pairs"]:
     """How badly the pieces of each pair agree: 0 for the same piece twice, 1 at the first gate, more beyond it."""
-    return _compared(pieces, pairs, gap)[0]
+    return _compared(pieces, pairs, gap, OFFSET_FLOOR)[0]
 
 
 def _compared(
-    pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"], gap: float
+    pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"], gap: float, floor: float
 ) -> tuple[Float[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]:
     """The mismatch of each pair, and how much of their line lies between them, metres."""
     a, b = pairs.T
@@ -118,9 +149,10 @@ def _compared(
     opposite = np.abs(turn) > np.pi / 2
     turn = np.where(opposite, wrap_angle(turn + np.pi), turn)
     variance = 1 / pieces.info_theta
-    # What does not average out: half of what one line errs by (echoes of others in it, cells), and the floor.
-    floor = OFFSET_FLOOR**2 + np.maximum(pieces.count[a] / pieces.info_offset[a], pieces.count[b] / pieces.info_offset[b])
-    turn_floor = TURN_PER_OFFSET**2 * floor
+    # What does not average out: what a single line errs by (its echoes are not all its own), and the floor.
+    single = pieces.count / pieces.info_offset
+    least = floor**2 + np.maximum(single[a], single[b])
+    turn_floor = TURN_PER_OFFSET**2 * least
 
     # The common line, as ``add_up`` would draw it, and how far the ends of both pieces are from it.
     share = pieces.info_theta[b] / (pieces.info_theta[a] + pieces.info_theta[b])
@@ -143,7 +175,7 @@ def _compared(
     turns = np.abs(np.stack([share * turn + bend, (share - 1) * turn + bend]))
     turns = (turns / np.sqrt(variance[[a, b]] + turn_floor)).max(axis=0)
     turns = np.maximum(turns, np.abs(turn) / np.sqrt(variance[a] + variance[b] + 2 * turn_floor)) / TURN_GATE
-    spread = np.sqrt(1 / info_a + 1 / info_b + floor)
+    spread = np.sqrt(1 / info_a + 1 / info_b + least)
     offset_gate = np.where(opposite, BOTH_SIDES, np.minimum(OFFSET_GATE, TURN_GATE * spread))
     return np.maximum.reduce([apart / offset_gate, turns, between / gap]), between
 
@@ -157,15 +189,11 @@ def deviations(
 
 
 def _width(pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"]) -> Float[np.ndarray, " pairs"]:
-    """How far apart two pieces are where they run side by side, metres; infinite unless half of one does."""
+    """How far the ends of the shorter piece of each pair are off the line of the longer one at most, metres."""
     a, b = pairs.T
-    a, b = np.where(pieces.length[a] < pieces.length[b], [b, a], [a, b])  # b is the shorter one
+    a, b = np.where(pieces.length[a] < pieces.length[b], [b, a], [a, b])
     offset = pieces.segments[b] - pieces.centre[a][:, None]
-    along, across = (offset * pieces.tangent[a][:, None]).sum(-1), (offset * pieces.normal[a][:, None]).sum(-1)
-    run = along[:, 1] - along[:, 0]
-    share = (np.clip(along, *pieces.ends[a].T[..., None]) - along[:, :1]) / np.where(run == 0, np.nan, run)[:, None]
-    at_ends = across[:, :1] + share * (across[:, 1:] - across[:, :1])
-    return np.where(np.abs(share[:, 1] - share[:, 0]) >= 0.5, np.abs(at_ends).max(axis=1), np.inf)
+    return np.abs((offset * pieces.normal[a][:, None]).sum(-1)).max(axis=-1)
 
 
 def gaps(
@@ -180,7 +208,7 @@ def gaps(
 
 
 def _neighbors(
-    pieces: Pieces, changed: Bool[np.ndarray, " pieces"], gap: float, *, nearest: int | None
+    pieces: Pieces, changed: Bool[np.ndarray, " pieces"], gap: float, floor: float, *, nearest: int | None
 ) -> Int[np.ndarray, "pairs 2"]:
     """Pairs that may match, one of them changed: pieces with samples near each other in place and direction."""
     parts = np.maximum(np.ceil(pieces.length / gap).astype(np.int64), 1) + 1
@@ -191,7 +219,7 @@ def _neighbors(
     double = 2 * pieces.theta[piece]  # both sides of a wall have one direction
     direction = 0.5 * _LEVER * np.stack([np.cos(double), np.sin(double)], axis=-1)
     points = np.concatenate([place, direction], axis=-1)
-    turn_floor = TURN_PER_OFFSET**2 * (OFFSET_FLOOR**2 + (pieces.count / pieces.info_offset).max())
+    turn_floor = TURN_PER_OFFSET**2 * (floor**2 + (pieces.count / pieces.info_offset).max())
     steepest = TURN_GATE * np.sqrt(2 / pieces.info_theta.min() + 2 * turn_floor)
     reach = float(np.hypot(1.6 * gap + OFFSET_GATE, _LEVER * min(steepest, np.pi / 2)))
     tree, asking = KDTree(points), np.flatnonzero(changed[piece])
@@ -210,7 +238,7 @@ def _neighbors(
     return np.stack([flat // len(pieces), flat % len(pieces)], axis=-1)
 
 
-def _mutual(
+def mutual(
     pairs: Int[np.ndarray, "pairs 2"], cost: Float[np.ndarray, " pairs"], pieces: int
 ) -> Int[np.ndarray, " pieces"]:
     """Group of each piece: two that are each other's best match share one."""

@@ -46,7 +46,7 @@ def without_corners(pieces: Pieces, walls: Pieces) -> Pieces:
     near = KDTree(vertex).query_ball_point(pieces.centre[short], NEAR)
     piece = short[np.repeat(np.arange(len(short)), [len(found) for found in near])]
     place = np.array([k for found in near for k in found], dtype=np.int64)
-    turn = _turn(pieces.theta[piece][:, None], walls.theta[owners[place]])
+    turn = turn_between(pieces.theta[piece][:, None], walls.theta[owners[place]])
     free_end = owners[place, 0] == owners[place, 1]
     square = free_end & (np.abs(turn[:, 0] - np.pi / 2) < SQUARE)
     turned = np.all(turn > TURNED, axis=1)
@@ -65,7 +65,7 @@ def points_among(walls: Pieces) -> Bool[np.ndarray, " walls"]:
     if len(short) > 1:
         pairs = KDTree(walls.centre[short]).query_pairs(NEAR, output_type="ndarray")
         a, b = short[pairs.reshape(-1, 2).T]
-        crossed = _turn(walls.theta[a], walls.theta[b]) > TURNED
+        crossed = turn_between(walls.theta[a], walls.theta[b]) > TURNED
         ghost[a[crossed]] = ghost[b[crossed]] = True
     return ghost
 
@@ -174,7 +174,7 @@ def _vertices(
     return np.concatenate([ends, places]), np.concatenate([np.stack([own, own], axis=-1), long[pairs[meets]]])
 
 
-def _turn(a: Float[np.ndarray, "*#any"], b: Float[np.ndarray, "*#any"]) -> Float[np.ndarray, "..."]:
+def turn_between(a: Float[np.ndarray, "*#any"], b: Float[np.ndarray, "*#any"]) -> Float[np.ndarray, "..."]:
     """Angle between undirected lines, radians, 0 to pi / 2."""
     turn = np.abs(wrap_angle(a - b))
     return np.minimum(turn, np.pi - turn)

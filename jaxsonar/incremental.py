@@ -7,13 +7,13 @@ from jaxtyping import Float
 
 from jaxsonar import kernels
 
+from . import pieces, points
 from .candidates import settings_for
 from .explained import check_sigma
 from .local import LocalModel, check_method, local_model, models_of
 from .logs import Log, Scan
 from .mapping import CONFIRMED, Evidence, assemble, check_merging, gather_evidence
 from .maps import GlobalMap
-from .pieces import aggregate
 from .ring import Ring
 from .seenthrough import SeenThrough
 from .windows import Stretch, check_window
@@ -73,8 +73,10 @@ class Mapper:
 
     def start(self) -> MapState:
         """A state that knows nothing."""
-        nothing = aggregate([], np.zeros((0, 3)))
-        return MapState(Evidence(nothing, SeenThrough(), np.zeros((0, 2), np.int64), 0), Stretch(), ())
+        nowhere = np.zeros((0, 3))
+        walls, corners = pieces.aggregate([], nowhere), points.aggregate([], nowhere)
+        nothing = Evidence(walls, corners, SeenThrough(), np.zeros((0, 2), np.int64), 0)
+        return MapState(nothing, Stretch(), ())
 
     def step(self, state: MapState, scan: Scan) -> tuple[MapState, StepInfo]:
         """Take in one scan; the state given is left as it was.

@@ -11,14 +11,17 @@ from scipy.spatial import KDTree
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
+from . import points
 from .echoes import FlatEchoes
-from .fusion import BESIDE, fuse, settle
+from .ends import end_at, ended, floating, mirages
+from .fusion import BESIDE, common_floor, fuse, settle
 from .ghosts import openings, points_among, trim, without_corners
 from .local import LocalModel, local_models
 from .logs import Log
 from .maps import GlobalMap
 from .merging import merge_as_paper
-from .pieces import Pieces, add_up, aggregate, join
+from .pieces import Pieces, add_up, aggregate, join, latest_scans, scan_lists
+from .points import Points
 from .poses import wrap_angle
 from .ring import Ring
 from .seenthrough import SeenThrough, silence
@@ -48,6 +51,8 @@ class Evidence:
 
     pieces: Pieces
     """Segments of local models, world frame."""
+    points: Points
+    """Corners and edges of local models, world frame."""
     seen: SeenThrough
     """Where walls would have been heard and were not."""
     places: Int[np.ndarray, "places 2"]
@@ -59,14 +64,16 @@ class Evidence:
         """The evidence of both."""
         return Evidence(
             join([self.pieces, other.pieces]),
+            points.join([self.points, other.points]),
             self.seen.joined(other.seen),
             np.unique(np.concatenate([self.places, other.places]), axis=0),
             self.models + other.models,
         )
 
     def condensed(self) -> "Evidence":
-        """The same, with pieces of one place and direction kept as their sum: no larger than the walls allow."""
-        return replace(self, pieces=condense(self.pieces, scans=SCANS_KEPT))
+        """The same, with pieces and points of one place (and direction) kept as their sum: as large as the floor."""
+        kept = points.condense(self.points, scans=SCANS_KEPT)
+        return replace(self, pieces=condense(self.pieces, scans=SCANS_KEPT), points=kept)
 
     @property
     def cut(self) -> float:
@@ -151,7 +158,7 @@ def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> Evide
         cells, who = silence(ring, log.pose[block], scan, flat.path[echo], reach[echo], walls)
         seen = seen.including(cells, when[block][who])
     places = np.unique(np.round(poses[known, :2] / _PLACE).astype(np.int64), axis=0)
-    return Evidence(pieces, seen, places, int(known.sum()))
+    return Evidence(pieces, points.aggregate(models, poses), seen, places, int(known.sum()))
 
 
 def assemble(evidence: Evidence, *, merging: str = "fused", confirmed: int = CONFIRMED) -> GlobalMap:
@@ -164,28 +171,42 @@ def assemble(evidence: Evidence, *, merging: str = "fused", confirmed: int = CON
     """
     check_merging(merging)
     if merging == "paper":
-        return _as_map(merge_as_paper(evidence.pieces, cut=evidence.cut))
+        return _as_map(merge_as_paper(evidence.pieces, cut=evidence.cut), evidence.points.take(np.arange(0)))
     pieces, seen = condense(evidence.pieces), evidence.seen
     confirmed = min(confirmed, max(1, evidence.models - 1))
+    floor = common_floor(pieces, gap=evidence.gap)
+    corners = _confirmed(points.condense(evidence.points), confirmed, floor=floor)
     # Pieces of one wall add up; what later scans look through goes, and the rest adds up again.
-    walls, wall_of = fuse(pieces, gap=evidence.gap)
+    walls, wall_of = fuse(pieces, gap=evidence.gap, floor=floor)
     trimmed = trim(pieces, wall_of, seen)
     if trimmed is not pieces:
         pieces = trimmed
-        walls, _ = fuse(pieces, gap=evidence.gap)
+        walls, _ = fuse(pieces, gap=evidence.gap, floor=floor)
     # Corners and poles answer like walls, from every pose in another direction.
     pieces = without_corners(pieces, walls)
-    walls, wall_of = fuse(pieces, gap=evidence.gap)
-    real = np.flatnonzero(~points_among(walls) & (walls.count >= confirmed))
-    # A wall goes on behind what hides it, but not across an opening that something was seen through.
-    opening = partial(openings, pieces=pieces, seen=seen)
-    walls, whole = fuse(walls.take(real), gap=BRIDGE, opening=opening, beside=BESIDE)
-    one_of = np.full(wall_of.max(initial=-1) + 1, -1)
-    one_of[real] = whole
+    walls, wall_of = fuse(pieces, gap=evidence.gap, floor=floor)
+    real = np.flatnonzero(~points_among(walls) & ~mirages(walls, corners) & (walls.count >= confirmed))
+    # A wall goes on behind what hides it, but neither beyond an edge nor across what something was seen through.
+    through = partial(openings, pieces=pieces, seen=seen)
+
+    def open_(gaps: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        return through(gaps, theta) | ended(gaps, corners)
+
+    walls, whole = fuse(walls.take(real), gap=BRIDGE, floor=floor, opening=open_, beside=BESIDE)
     # Each piece counts for as much as it agrees with its wall.
+    one_of = np.full(len(pieces), -1)
+    one_of[real] = whole
     own = one_of[wall_of] >= 0
-    walls = settle(pieces.take(own), one_of[wall_of][own], walls)
-    return _as_map(walls)
+    walls = settle(pieces.take(own), one_of[wall_of[own]], walls, floor=floor)
+    # It ends at the corners and edges on its line.
+    walls = end_at(walls, corners, through)
+    return _as_map(walls, corners.take(~floating(walls, corners)))
+
+
+def _confirmed(sightings: Points, confirmed: int, *, floor: float) -> Points:
+    """Corners and edges that enough scans saw, where they are."""
+    found, point_of = points.cluster(sightings)
+    return found.take((found.times >= confirmed) & points.steady(found, sightings, point_of, floor=floor))
 
 
 def condense(pieces: Pieces, *, scans: int | None = None) -> Pieces:
@@ -200,12 +221,7 @@ def condense(pieces: Pieces, *, scans: int | None = None) -> Pieces:
     cell = np.column_stack([np.floor(pieces.centre / _PLACE), np.floor(pieces.theta / _TURN)]).astype(np.int64)
     _, group = np.unique(cell, axis=0, return_inverse=True)
     summed = add_up(pieces, group.ravel())
-    if scans is not None:
-        row, number = summed.scans
-        last = np.searchsorted(row, row, side="right")
-        kept = np.arange(len(row)) >= last - scans
-        summed = replace(summed, scans=(row[kept], number[kept]))
-    return summed
+    return replace(summed, scans=latest_scans(summed.scans, scans))
 
 
 def check_merging(merging: str) -> None:
@@ -225,8 +241,9 @@ def check_poses(log: Log) -> None:
         raise SonarError(f"scan {log.scan[k]}: pose x {x:g}, y {y:g} m; allowed are {FARTHEST:g} m at most")
 
 
-def _as_map(walls: Pieces) -> GlobalMap:
+def _as_map(walls: Pieces, corners: Points) -> GlobalMap:
     walls = walls.take(np.lexsort((walls.centre[:, 1], walls.centre[:, 0], -walls.echoes)))
+    corners = corners.take(np.lexsort((corners.place[:, 1], corners.place[:, 0], -corners.echoes)))
     normal, tangent = walls.normal, walls.tangent
     rho, lever = (normal * walls.centre).sum(-1), (tangent * walls.centre).sum(-1)
     # The spread of the pieces around their wall tells how good they are; what is expected of them counts as one more.
@@ -242,4 +259,9 @@ def _as_map(walls: Pieces) -> GlobalMap:
         sigma_theta=sigma_theta,
         echoes=walls.echoes,
         scans=walls.scan_lists(),
+        points=corners.place,
+        point_kinds=corners.kinds,
+        point_cov=corners.honest_cov,
+        point_echoes=corners.echoes,
+        point_scans=scan_lists(corners.scans, len(corners)),
     )

@@ -71,16 +71,12 @@ class Pieces:
     def take(self, rows: Int[np.ndarray, " some"] | Bool[np.ndarray, " pieces"]) -> "Pieces":
         """Some of the pieces, in the order asked for; a row may come more than once."""
         rows = np.arange(len(self))[rows]
-        begin, end = np.searchsorted(self.scans[0], [rows, rows + 1])
-        seen = np.repeat(begin - np.cumsum(end - begin) + end - begin, end - begin) + np.arange((end - begin).sum())
         columns: dict[str, Any] = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "scans"}
-        return Pieces(**columns, scans=(np.repeat(np.arange(len(rows)), end - begin), self.scans[1][seen]))
+        return Pieces(**columns, scans=scans_of(self.scans, rows))
 
     def scan_lists(self) -> tuple[tuple[int, ...], ...]:
         """Numbers of the scans that each piece was seen in, ascending."""
-        row, number = self.scans
-        parts = np.split(number, np.searchsorted(row, np.arange(1, len(self))))
-        return tuple(tuple(part.tolist()) for part in parts[: len(self)])
+        return scan_lists(self.scans, len(self))
 
 
 def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]) -> Pieces:
@@ -247,3 +243,24 @@ def unique_pairs(row: np.ndarray, number: np.ndarray) -> tuple[Int[np.ndarray, "
     new = np.ones(len(row), dtype=bool)
     new[1:] = (np.diff(row) > 0) | (np.diff(number) != 0)
     return row[new], number[new]
+
+
+def scans_of(scans: tuple[np.ndarray, np.ndarray], rows: Int[np.ndarray, " some"]) -> tuple[np.ndarray, np.ndarray]:
+    """The pairs of some rows, in the order asked for, the rows numbered anew."""
+    begin, end = np.searchsorted(scans[0], [rows, rows + 1])
+    count = end - begin
+    seen = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
+    return np.repeat(np.arange(len(rows)), count), scans[1][seen]
+
+
+def scan_lists(scans: tuple[np.ndarray, np.ndarray], rows: int) -> tuple[tuple[int, ...], ...]:
+    """Numbers of the scans of each row, ascending."""
+    parts = np.split(scans[1], np.searchsorted(scans[0], np.arange(1, rows)))
+    return tuple(tuple(part.tolist()) for part in parts[:rows])
+
+
+def latest_scans(scans: tuple[np.ndarray, np.ndarray], most: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """At most so many scans of each row, those with the largest numbers; all if None."""
+    row, number = scans
+    kept = np.arange(len(row)) >= np.searchsorted(row, row, side="right") - (len(row) if most is None else most)
+    return row[kept], number[kept]

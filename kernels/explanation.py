@@ -247,7 +247,9 @@ def explain(
         found = found._replace(
             parameters=jnp.where(is_plane[:, None], jnp.stack([rho, theta], axis=-1), found.parameters)
         )
-        covariance = jnp.where(flipped[:, None, None], covariance * np.array([[1, -1], [-1, 1]]), covariance)
+        covariance = jnp.where(
+            flipped[:, None, None], covariance * np.array([[[1.0, -1.0], [-1.0, 1.0]]], np.float32), covariance
+        )
         segment = jax.vmap(lambda x, own: clusters.extent(x[0], x[1], echo.midpoint, own))(found.parameters, involved)
         return Explanation(
             kind=jnp.where(evidence > -jnp.inf, kind, -1),
@@ -402,8 +404,8 @@ def _plane_prior(scan: _Scan, support: _Support, scene: _Scene, expected: Expect
     crossing = (scene.known & (jnp.abs(short) < 0.06) & _oblique(turn)).any()
     square = _squareness(support.parameters, _inverse(support.information)[1, 1], scene)
     direction = jnp.log(1 - scene.square + scene.square * square)
-    density += direction - expected.crossing * crossing
-    share = (support.gain > 0).sum() / scan.full_wall
+    density += direction - jnp.where(crossing, expected.crossing, 0)
+    share = _count(support.gain > 0) / scan.full_wall
     return expected.prior * density + expected.full * (share - expected.usual)
 
 
@@ -434,7 +436,7 @@ def _point_prior(
     anywhere = 1 / (jnp.pi * scan.max_range**2)
     along_one = on_wall.sum() / (2 * scan.max_range)
     if kind == EDGE:
-        beside_walls = along_one / jnp.maximum(scene.known.sum(), 1)
+        beside_walls = along_one / jnp.maximum(_count(scene.known), 1)
         density = expected.edge_alone * anywhere + (1 - expected.edge_alone) * beside_walls
         return expected.prior * jnp.log(expected.edges * density)
     angle = jnp.abs(wrap_angle(scene.wall[:, None, 1] - scene.wall[None, :, 1])) - jnp.pi / 2
@@ -482,13 +484,13 @@ def _chosen(
     open_ = jnp.tile(here, 3) & jnp.isfinite(supports.base)
 
     def take(free: Bool[Array, " echoes"], _: None):
-        score = jnp.where(open_, (gain * free).sum(axis=1) + supports.base, -jnp.inf)
+        score = jnp.where(open_, jnp.where(free[None], gain, 0).sum(axis=1) + supports.base, -jnp.inf)
         best = score.argmax()
         enough = score[best] > expected.least
         own = free & (supports.gain[best] > 0) & enough
-        rivals = ((supports.gain > 0) & own).sum(axis=1) >= 0.5 * own.sum()
-        of_kind = jnp.where(rivals & (kinds == jnp.arange(3)[:, None]), score, -jnp.inf).max(axis=1)
-        odds = expected.temper * (of_kind - jnp.asarray([expected.doubt, 0, 0]))
+        rivals = 2 * ((supports.gain > 0) & own[None]).sum(axis=1) >= own.sum()
+        of_kind = jnp.where(rivals[None] & (kinds[None] == jnp.arange(3)[:, None]), score[None], -jnp.inf).max(axis=1)
+        odds = expected.temper * (of_kind - jnp.asarray([expected.doubt, 0, 0], of_kind.dtype))
         probability = jax.nn.softmax(odds)
         return free & ~own, (best, kinds[best], jnp.where(enough, score[best], -jnp.inf), own, probability)
 
@@ -519,13 +521,13 @@ def _learned(
 
     each_path = jax.vmap(jax.vmap(certain, in_axes=(None, None, None, 0)), in_axes=(0, 0, 0, None))
     sure = each_path(found.parameters, low, high, scan.paths) & wall[:, None]
-    asked, answered = sure.sum(), (sure[:, scan.path] & involved).sum()
+    asked, answered = _count(sure), _count(sure[:, scan.path] & involved)
     weight = expected.heard_weight
     share = jnp.clip((weight * expected.heard + answered) / (weight + asked), 0.3, 0.97)
     # Noise: what is left between ranges and walls; two of each wall's residuals are spent on the wall itself.
     many = wall & (involved.sum(axis=1) >= 4)
     left = jnp.where(involved & many[:, None], found.residual**2, 0).sum()
-    free = (involved.sum(axis=1) - 2) @ many
+    free = _count(involved & many[:, None]) - 2 * _count(many)
     guess = expected.sigma_weight * scene.sigma**2
     estimate = jnp.sqrt((guess + left) / (expected.sigma_weight + free))
     # The share of the walls that are parallel or square to another one.
@@ -535,9 +537,13 @@ def _learned(
     squares = jnp.where(wall, member, 0).sum() + expected.square_weight * expected.square
     return known._replace(
         share=share,
-        square=squares / (wall.sum() + expected.square_weight),
+        square=squares / (_count(wall) + expected.square_weight),
         sigma=jnp.where(jnp.isfinite(sigma), scene.sigma, jnp.maximum(estimate, expected.least_sigma)),
     )
+
+
+def _count(which: Bool[Array, "*any"]) -> Float[Array, ""]:
+    return which.sum(dtype=jnp.float32)
 
 
 def _oblique(turn: Float[Array, "*any"]) -> Bool[Array, "*any"]:

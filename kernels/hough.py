@@ -203,7 +203,7 @@ def peaks(
             highest &= smooth > neighbor if step > (0, 0) else smooth >= neighbor
     height, cell = jax.lax.top_k(jnp.where(highest, smooth, 0).ravel(), size)
     mass = jnp.stack([neighbor.ravel()[cell] for neighbor in around])
-    off = jnp.asarray(steps, smooth.dtype).T @ mass / jnp.maximum(mass.sum(axis=0), 1e-6)
-    theta = (cell // columns + 0.5 + off[0]) * settings.theta_cell - jnp.pi
-    rho = (cell % columns + 0.5 + off[1]) * settings.rho_cell
+    off = jnp.asarray(steps, smooth.dtype).T @ (mass / jnp.maximum(mass.sum(axis=0), 1e-6)[None])
+    row, column = (index.astype(smooth.dtype) + 0.5 for index in (cell // columns, cell % columns))
+    theta, rho = (row + off[0]) * settings.theta_cell - jnp.pi, (column + off[1]) * settings.rho_cell
     return jnp.where(height > 0, rho, jnp.nan), jnp.where(height > 0, theta, jnp.nan)

@@ -86,16 +86,21 @@ def test_a_simulated_log_is_a_scan_log_of_the_path(here):
         assert 0 < float(row["range"]) < 2.02
 
 
-def test_lines_are_as_documented(here):
+@pytest.mark.parametrize("method", ["ml", "hough"])
+def test_lines_are_as_documented(here, method):
+    if method == "hough":
+        assert call("lines", "log.csv", "--ring", "faw", "--method", "hough", "-o", "lines.jsonl") == 0
     models, log = read_models("lines.jsonl"), load_log("log.csv")
     listened = {tuple(pair) for pair in load_ring("faw").paths.tolist()}
+    more = {"points", "undecided", "sigma"} if method == "ml" else set()
+    strength = {"cov", "evidence"} if method == "ml" else {"votes"}
     assert [model["scan"] for model in models] == log.scan.tolist()
     assert [model["stamp"] for model in models] == log.stamp.tolist()
     for model in models:
+        assert set(model) - {"empty"} == {"scan", "stamp", "lines"} | more
         assert model["lines"] or model["empty"]
         for line in model["lines"]:
-            assert {"rho", "theta", "segment", "echoes"} <= set(line)
-            assert "cov" not in line, "the Hough transform knows no covariance"
+            assert set(line) == {"rho", "theta", "segment", "echoes", "paths"} | strength
             assert line["rho"] >= 0
             assert -math.pi <= line["theta"] < math.pi
             assert isinstance(line["echoes"], int)
@@ -106,6 +111,8 @@ def test_lines_are_as_documented(here):
             np.testing.assert_allclose(np.array(line["segment"]) @ normal, line["rho"], atol=1e-5)
             first, last = np.array(line["segment"]) @ np.array([-normal[1], normal[0]])
             assert first <= last, "counter-clockwise as seen from the robot"
+            if method == "ml":
+                assert (np.linalg.eigvalsh(line["cov"]) > 0).all()
 
 
 def test_settings_are_written_beside_the_result_and_give_it_again(here, office):
@@ -120,12 +127,14 @@ def test_settings_are_written_beside_the_result_and_give_it_again(here, office):
 
 def test_settings_change_the_result_and_are_those_that_are_written(here):
     Path("mine.toml").write_text("threshold = 0.35\nmin_echoes = 5\nsmoothing = [1, 2, 3, 2, 1]\n")
-    assert call("lines", "log.csv", "--ring", "faw", "--settings", "mine.toml", "-o", "again.jsonl") == 0
+    paper = ["lines", "log.csv", "--ring", "faw", "--method", "hough"]
+    assert call(*paper, "-o", "paper.jsonl") == 0
+    assert call(*paper, "--settings", "mine.toml", "-o", "again.jsonl") == 0
     assert load_settings("again.settings.toml") == load_settings("mine.toml")
     lines = [line for model in read_models("again.jsonl") for line in model["lines"]]
     assert lines
     assert min(line["echoes"] for line in lines) >= 5
-    assert Path("again.jsonl").read_bytes() != Path("lines.jsonl").read_bytes()
+    assert Path("again.jsonl").read_bytes() != Path("paper.jsonl").read_bytes()
 
 
 def test_lines_to_standard_output(here, capsys):
@@ -227,7 +236,8 @@ def test_logs_without_scans_or_echoes_are_no_mistake(here, capsys):
     assert call("convert", "empty.csv", "copy.csv") == 0
     assert Path("copy.csv").read_text() == HEADER
     Path("silent.csv").write_text(HEADER + "-7,,,,,,,\n9,1.5,,,,,,\n")
-    assert call("lines", "silent.csv", "--ring", "faw", "-o", "silent.jsonl", "--figure", "a.svg") == 0
+    silent = ["lines", "silent.csv", "--ring", "faw", "--method", "hough", "-o", "silent.jsonl"]
+    assert call(*silent, "--figure", "a.svg") == 0
     models = read_models("silent.jsonl")
     assert [(model["scan"], model["stamp"], model["lines"]) for model in models] == [(-7, None, []), (9, 1.5, [])]
     assert all(model["empty"] for model in models)
@@ -236,7 +246,7 @@ def test_logs_without_scans_or_echoes_are_no_mistake(here, capsys):
 
 def test_echoes_that_the_ring_does_not_listen_to_are_told(here, capsys):
     Path("wide.csv").write_text(HEADER + "0,,,,,3,12,1.0\n0,,,,,3,3,1.0\n")
-    assert call("lines", "wide.csv", "--ring", "faw", "-o", "wide.jsonl") == 0
+    assert call("lines", "wide.csv", "--ring", "faw", "--method", "hough", "-o", "wide.jsonl") == 0
     assert "left out 1 echo" in capsys.readouterr().err
 
 
@@ -485,7 +495,9 @@ def test_ctrl_c_leaves_no_half_result(here, capsys, monkeypatch, faw_ring):
     assert contents(here) == before
 
 
-@pytest.mark.parametrize("command", [SIMULATE, ["lines", "long.csv", "--ring", "faw"]], ids=["simulate", "lines"])
+@pytest.mark.parametrize(
+    "command", [SIMULATE, ["lines", "long.csv", "--ring", "faw", "--method", "hough"]], ids=["simulate", "lines"]
+)
 def test_a_reader_that_leaves_early_is_no_accident(here, command):
     log = load_log("log.csv")
     rows = Path("log.csv").read_text().splitlines(keepends=True)

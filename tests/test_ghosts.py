@@ -11,7 +11,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxsonar.ghosts import LONG, NEAR, openings, trim, without_corners, without_points
+from jaxsonar.ghosts import LONG, NEAR, openings, points_among, trim, without_corners
 from jaxsonar.pieces import Pieces, join
 from jaxsonar.poses import rotation
 from jaxsonar.seenthrough import CELL, DIRECTIONS, LATEST, SeenThrough
@@ -67,7 +67,8 @@ def numbered(parts):
 
 def cleaned(walls):
     """Without what corners leave, then without what poles leave."""
-    return without_points(without_corners(walls, walls))
+    walls = without_corners(walls, walls)
+    return walls.take(~points_among(walls))
 
 
 ROOM_CORNER = [

@@ -1,4 +1,7 @@
-"""Local models against the slow oracle; rotations, mirrors, padding and batches change nothing else; errors."""
+"""The paper's local models against the slow oracle; rotations, mirrors, padding, batches change nothing else; errors.
+
+Method hough throughout; method ml has test_explained.
+"""
 
 import dataclasses
 import json
@@ -13,8 +16,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxsonar import HoughSettings, Log, Ring, SonarError, extract_lines, kernels, local_model, local_models
+import jaxsonar
+from jaxsonar import HoughSettings, Log, Ring, SonarError, kernels
 from jaxsonar.local import arcs_of
+
+extract_lines = partial(jaxsonar.extract_lines, method="hough")
+local_model = partial(jaxsonar.local_model, method="hough")
+local_models = partial(jaxsonar.local_models, method="hough")
 
 THREE_WALLS = [(1.2, 0.3), (1.7, -1.9), (1.5, 3.1)]
 TURNED_RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # no point on a cell's border
@@ -314,7 +322,7 @@ def test_unusable_ranges_are_refused(faw_ring, ranges, message):
 
 def test_unusable_calls_are_refused(faw_ring):
     ranges = dense(faw_ring, [])
-    with pytest.raises(SonarError, match=r"method 'best'; allowed is hough$"):
+    with pytest.raises(SonarError, match=r"method 'best'; allowed is ml or hough$"):
         extract_lines(faw_ring, ranges, method="best")
     with pytest.raises(SonarError, match=r"rho_cells 20 x rho_cell 0\.04"):
         extract_lines(faw_ring, ranges, settings=HoughSettings(rho_cells=20))

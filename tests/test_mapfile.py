@@ -1,6 +1,7 @@
 """Global maps as GeoJSON: there and back without loss, malformed ones named, and the segments of any GeoJSON."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from jaxsonar.polygonal import PolygonalModel
 from jaxsonar.reference import save_reference
 from jaxsonar.roomfile import save_room
 
-COLUMNS = ("segments", "rho", "theta", "sigma_rho", "sigma_theta", "echoes")
+COLUMNS = ("segments", "rho", "theta", "sigma_rho", "sigma_theta", "echoes", "points", "point_cov", "point_echoes")
 
 
 def some_map(rng, count):
@@ -28,16 +29,32 @@ def some_map(rng, count):
     )
 
 
+def with_points(rng, world, count):
+    roots = rng.normal(size=(count, 2, 2)) * 10.0 ** rng.integers(-6, 1, (count, 1, 1))
+    cov = roots @ roots.swapaxes(1, 2)
+    cov[1::3] = np.nan
+    return replace(
+        world,
+        points=rng.normal(size=(count, 2)),
+        point_kinds=tuple(rng.choice(["corner", "edge"], count).tolist()),
+        point_cov=(cov + cov.swapaxes(1, 2)) / 2,
+        point_echoes=rng.integers(0, 500, count),
+        point_scans=tuple(tuple(sorted(rng.integers(0, 99, k % 4).tolist())) for k in range(count)),
+    )
+
+
 def same(one, two):
-    return one.scans == two.scans and all(
+    lists = ("scans", "point_kinds", "point_scans")
+    return all(getattr(one, name) == getattr(two, name) for name in lists) and all(
         np.array_equal(getattr(one, name), getattr(two, name), equal_nan=True) for name in COLUMNS
     )
 
 
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 9))
-def test_a_saved_map_is_the_same_map(seed, count, tmp_path_factory):
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 9), points=st.integers(0, 9))
+def test_a_saved_map_is_the_same_map(seed, count, points, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.geojson"
-    world = some_map(np.random.default_rng(seed), count)
+    rng = np.random.default_rng(seed)
+    world = with_points(rng, some_map(rng, count), points)
     save_map(world, path)
     again = load_map(path)
     assert same(again, world)
@@ -58,6 +75,18 @@ def test_the_file_is_what_others_rely_on(tmp_path, rng):
         assert entry["properties"]["kind"] == "segment"
         assert entry["properties"]["scans"] == list(world.scans[index])
     assert [entry["properties"]["sigma_rho"] is None for entry in document["features"]] == [True, False]
+
+
+def test_points_of_others_need_no_more_than_kind_and_place(tmp_path, rng):
+    write(tmp_path / "map.geojson", feature("Point", [1, 2, 0], kind="edge"), feature("LineString", ENDS, **GOOD))
+    world = load_map(tmp_path / "map.geojson")
+    assert (len(world), world.points.tolist(), world.point_kinds) == (1, [[1, 2]], ("edge",))
+    assert (world.point_echoes.tolist(), world.point_scans) == ([0], ((),))
+    assert np.isnan(world.point_cov).all()
+    save_map(with_points(rng, world, 2), tmp_path / "points.geojson")
+    features = json.loads((tmp_path / "points.geojson").read_text())["features"][1:]
+    assert [list(entry["properties"]) for entry in features] == [["kind", "cov", "echoes", "scans"]] * 2
+    assert features[1]["properties"]["cov"] is None
 
 
 def test_a_dash_is_standard_output(capsys, rng):
@@ -91,6 +120,12 @@ def write(path, *features):
         (feature("LineString", ENDS, **GOOD | {"kind": "wall"}), "LineString of kind 'wall'"),
         (feature("Point", [0, 0], kind="pole"), "Point of kind 'pole'"),
         (feature("Polygon", [ENDS], **GOOD), "Polygon of kind 'segment'"),
+        (feature("Point", [0, "east"], kind="edge"), "position [0, 'east']"),
+        (feature("Point", [0, 0], kind="edge", echoes=-2), "echoes -2"),
+        (feature("Point", [0, 0], kind="corner", scans=[0.5]), "scans [0.5]"),
+        (feature("Point", [0, 0], kind="corner", cov=[[1, 0]]), "cov [[1, 0]]; allowed are two rows"),
+        (feature("Point", [0, 0], kind="corner", cov=[[1, 2], [2, 1]]), "cov [[1, 2], [2, 1]]"),
+        (feature("Point", [0, 0], kind="corner", cov=[[1, float("nan")], [0, 1]]), "cov [[1, nan], [0, 1]]"),
         ({"type": "Feature", "geometry": None}, "no geometry"),
     ],
 )

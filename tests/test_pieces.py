@@ -108,7 +108,7 @@ def some_model(rng, scan, lines):
         n, t = np.array([math.cos(theta), math.sin(theta)]), np.array([-math.sin(theta), math.cos(theta)])
         ends = np.array([rho * n + s * t for s in np.sort(rng.uniform(-0.5, 0.5, 2))])
         paths = np.zeros((1, 2), np.int64)
-        found.append(Line(rho, theta, ends, 9, int(rng.integers(3, 99)), paths, (scan - 1, scan)))
+        found.append(Line(rho, theta, ends, 9.0, int(rng.integers(3, 99)), paths, (scan - 1, scan)))
     return LocalModel(scan, math.nan if scan % 2 else scan / 10, tuple(found))
 
 
