@@ -36,7 +36,7 @@ class Line:
     """Direction of the normal, radians, in [-pi, pi)."""
     segment: Float[np.ndarray, "2 2"]
     """Endpoints (x, y): the outermost feet of the involved real and virtual sensors, metres."""
-    votes: float
+    votes: int | float
     """How strong it is. Method hough: number of arc points in its component; ml: nats of evidence."""
     echoes: int
     """Number of echoes that have a point in the component, or that the line explains."""
@@ -247,7 +247,7 @@ def models_of(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSet
                     rho=wall.rho,
                     theta=wall.theta,
                     segment=wall.segment,
-                    votes=float(wall.votes),
+                    votes=wall.votes,
                     echoes=len(wall.echoes),
                     paths=paths[np.unique(step.path[row, wall.echoes])],
                     scans=tuple(log.scan[np.unique(windows.scan[step.echo[row, wall.echoes]])].tolist()),
