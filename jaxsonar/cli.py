@@ -85,7 +85,9 @@ def parser() -> argparse.ArgumentParser:
     lines.add_argument("--ring", required=True, help=RING_HELP)
     lines.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
     lines.add_argument("--sigma", type=_finite(1e-6, 1), metavar="METRES", help=SIGMA_HELP)
-    lines.add_argument("--settings", metavar="TOML", help="accumulator, low pass and threshold, instead of the paper's")
+    lines.add_argument(
+        "--settings", metavar="TOML", help="accumulator and low pass, for hough also threshold, instead of the paper's"
+    )
     lines.add_argument(
         "-o", "--output", metavar="LINES", required=True, help="JSON Lines, an object a scan; - = stdout"
     )
@@ -100,7 +102,10 @@ def parser() -> argparse.ArgumentParser:
     map_.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
     map_.add_argument("--sigma", type=_finite(1e-6, 1), metavar="METRES", help=SIGMA_HELP)
     map_.add_argument(
-        "--settings", type=_file, metavar="TOML", help="accumulator, low pass and threshold, instead of the paper's"
+        "--settings",
+        type=_file,
+        metavar="TOML",
+        help="accumulator and low pass, for hough also threshold, instead of the paper's",
     )
     map_.add_argument(
         "--window",

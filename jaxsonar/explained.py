@@ -36,7 +36,7 @@ class Explained(NamedTuple):
         order = np.argsort(~wall, axis=1, kind="stable")[:, : int(wall.sum(axis=1).max(initial=0))]
         found, wall = self.found, np.take_along_axis(wall, order, axis=1)
 
-        def sorted_(values: Any, filler: float = np.nan) -> np.ndarray:
+        def sorted_(values: Any, filler: float | int = np.nan) -> np.ndarray:
             shape = (..., *(None,) * (values.ndim - 2))
             return np.where(wall[shape], np.take_along_axis(values, order[shape], axis=1), filler)
 

@@ -166,7 +166,8 @@ def extract_lines(
         ring: the sensors; its ``paths`` give the order of the second axis.
         ranges: (scans, paths, echoes) half path lengths as a log has them, metres, NaN = no echo.
         method: "ml", maximum likelihood over the ranges, or "hough", the paper's way.
-        settings: accumulator, low pass and threshold; the paper's, as large as the ring needs, if left out.
+        settings: accumulator and low pass, and for hough threshold and least echoes; the paper's, as large as the ring
+            needs, if left out.
         sigma: standard deviation of the ranges, metres, for ml; estimated for each scan if left out.
 
     Raises:
@@ -209,7 +210,8 @@ def local_models(
         log: scans; their poses are used for windows only.
         method: "ml": the walls, corners and edges that explain the echoes best, by maximum likelihood over the ranges;
             "hough": the paper's way, lines only.
-        settings: accumulator, low pass and threshold; the paper's, as large as the ring needs, if left out.
+        settings: accumulator and low pass, and for hough threshold and least echoes; the paper's, as large as the ring
+            needs, if left out.
         sigma: standard deviation of the ranges, metres, for ml; estimated for each scan if left out.
         window: gather the scans of this length of path into one local model, metres (``windows.gather``), for rings so
             sparse that one scan cannot carry a line; every scan for itself if left out. Both methods then take the
@@ -297,7 +299,7 @@ def _explained_model(ring: Ring, explained: Explained, row: int, scan: int, stam
         corrected = np.asarray(ring.corrected(step.reported[row], *ring.paths[step.path[row]].T))
         heard = int((corrected < ring.max_range).sum())
         others = len(points) + len(undecided)
-        empty = f"no wall, but {others} other reflectors" if others else "no reflector explains the echoes"
+        empty = f"no wall; corners, edges and undecided: {others}" if others else "no reflector explains the echoes"
         empty = "no echo within the maximum range" if heard == 0 else empty
     return LocalModel(scan, stamp, tuple(lines), empty, tuple(points), tuple(undecided), float(found.sigma[row]))
 

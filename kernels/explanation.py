@@ -487,11 +487,13 @@ def _chosen(
         score = jnp.where(open_, jnp.where(free[None], gain, 0).sum(axis=1) + supports.base, -jnp.inf)
         best = score.argmax()
         enough = score[best] > expected.least
-        own = free & (supports.gain[best] > 0) & enough
+        own = free & (supports.gain[best] > 0)
+        enough &= own.sum() >= 2  # fewer determine nothing
+        own &= enough
         rivals = 2 * ((supports.gain > 0) & own[None]).sum(axis=1) >= own.sum()
         of_kind = jnp.where(rivals[None] & (kinds[None] == jnp.arange(3)[:, None]), score[None], -jnp.inf).max(axis=1)
         odds = expected.temper * (of_kind - jnp.asarray([expected.doubt, 0, 0], of_kind.dtype))
-        probability = jax.nn.softmax(odds)
+        probability = jax.nn.softmax(jnp.where(jnp.isfinite(odds).any(), odds, 0))
         return free & ~own, (best, kinds[best], jnp.where(enough, score[best], -jnp.inf), own, probability)
 
     _, chosen = jax.lax.scan(take, scan.valid, None, length=expected.reflectors)

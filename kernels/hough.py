@@ -201,6 +201,8 @@ def peaks(
     for step, neighbor in zip(steps, around, strict=True):
         if step != (0, 0):  # of equal neighbors one is the maximum
             highest &= smooth > neighbor if step > (0, 0) else smooth >= neighbor
+        if step == (0, -1):  # across rho = 0 both are before each other: the later half turn gives way
+            highest &= (smooth > neighbor) | (jnp.arange(rows) < rows // 2)[:, None] | (jnp.arange(columns) > 0)[None]
     height, cell = jax.lax.top_k(jnp.where(highest, smooth, 0).ravel(), size)
     mass = jnp.stack([neighbor.ravel()[cell] for neighbor in around])
     off = jnp.asarray(steps, smooth.dtype).T @ (mass / jnp.maximum(mass.sum(axis=0), 1e-6)[None])

@@ -68,33 +68,41 @@ def edge(place: Float[Array, "2"], path: EchoPaths) -> Sighting:
 def second_order(first: Float[Array, "2"], second: Float[Array, "2"], path: EchoPaths) -> Sighting:
     """Wall to wall: reflected at one plane, then at another, by the image of the image."""
     tx, rx = path.midpoint - path.half_baseline, path.midpoint + path.half_baseline
-    length, departure = _towards(_mirrored(_mirrored(rx, second), first) - tx)
-    _, arrival = _towards(_mirrored(_mirrored(tx, first), second) - rx)
-    exists = (normal(first[1]) @ departure > 0) & (normal(second[1]) @ arrival > 0)
+    behind_first, behind_second = _mirrored(tx, first), _mirrored(rx, second)
+    length, departure = _towards(_mirrored(behind_second, first) - tx)
+    _, arrival = _towards(_mirrored(behind_first, second) - rx)
+    # From behind the first to behind the second, before each other's plane, and through the first one first.
+    start, end = _before(tx, first), _before(rx, second)
+    last, next_ = _before(behind_second, first), _before(behind_first, second)
+    exists = (jnp.minimum(jnp.minimum(start, end), jnp.minimum(last, next_)) > 0) & (start * end < next_ * last)
     return Sighting(length / 2, jnp.zeros(2, length.dtype), departure, arrival, jnp.zeros_like(length), exists)
 
 
 def heard_share(sighting: Sighting, path: EchoPaths) -> Float[Array, ""]:
     """How far a sighting lies within both cones: 1 inside, 0 outside, with a soft border; 0 where it cannot exist."""
-    outer, inner = (jnp.cos(jnp.minimum(path.half_beam * (1 + sign * _SOFT), jnp.pi)) for sign in (1, -1))
-    share = jnp.clip((_cosines(sighting, path) - outer) / (inner - outer), 0, 1).min()
+    outer, inner = (4 * jnp.sin(jnp.minimum(path.half_beam * (1 + sign * _SOFT), jnp.pi) / 2) ** 2 for sign in (1, -1))
+    share = jnp.clip((outer - _off(sighting, path)) / (outer - inner), 0, 1).min()
     return jnp.where(sighting.exists, share * share * (3 - 2 * share), 0)
 
 
 def off_axis(sighting: Sighting, path: EchoPaths) -> Float[Array, ""]:
     """How far off the axes, the larger one of transmitter and receiver: 0 on the axis, 1 at the border, rising."""
-    return ((1 - _cosines(sighting, path)) / (1 - jnp.cos(path.half_beam))).max()
+    return (_off(sighting, path) / (4 * jnp.sin(path.half_beam / 2) ** 2)).max()
 
 
-def _cosines(sighting: Sighting, path: EchoPaths) -> Float[Array, "2"]:
-    """Cosines of the angles off the axes of transmitter and receiver."""
-    return jnp.stack([sighting.departure @ path.axes[0], sighting.arrival @ path.axes[1]])
+def _off(sighting: Sighting, path: EchoPaths) -> Float[Array, "2"]:
+    """Squared distances of the directions from the axes, 2 - 2 cos of the angle without its cancellation."""
+    return ((jnp.stack([sighting.departure, sighting.arrival]) - path.axes) ** 2).sum(axis=1)
 
 
 def _towards(offset: Float[Array, "2"]) -> tuple[Float[Array, ""], Float[Array, "2"]]:
     """Length and direction of a vector, with finite gradients at zero."""
     length = safe_sqrt(offset @ offset)
     return length, offset / jnp.where(length > 0, length, 1)
+
+
+def _before(point: Float[Array, "2"], line: Float[Array, "2"]) -> Float[Array, ""]:
+    return line[0] - point @ normal(line[1])
 
 
 def _mirrored(point: Float[Array, "2"], line: Float[Array, "2"]) -> Float[Array, "2"]:
