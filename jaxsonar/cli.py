@@ -15,6 +15,7 @@ from jaxsonar.hardware.errors import SonarError
 
 from .files import FIGURE_FORMATS as FIGURES
 
+SETTINGS_HELP = "accumulator and low pass, for hough also threshold, instead of the paper's"
 SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for each scan)"
 RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
 
@@ -85,9 +86,7 @@ def parser() -> argparse.ArgumentParser:
     lines.add_argument("--ring", required=True, help=RING_HELP)
     lines.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
     lines.add_argument("--sigma", type=_finite(1e-6, 1), metavar="METRES", help=SIGMA_HELP)
-    lines.add_argument(
-        "--settings", metavar="TOML", help="accumulator and low pass, for hough also threshold, instead of the paper's"
-    )
+    lines.add_argument("--settings", metavar="TOML", help=SETTINGS_HELP)
     lines.add_argument(
         "-o", "--output", metavar="LINES", required=True, help="JSON Lines, an object a scan; - = stdout"
     )
@@ -105,7 +104,7 @@ def parser() -> argparse.ArgumentParser:
         "--settings",
         type=_file,
         metavar="TOML",
-        help="accumulator and low pass, for hough also threshold, instead of the paper's",
+        help=SETTINGS_HELP,
     )
     map_.add_argument(
         "--window",

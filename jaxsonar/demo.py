@@ -187,7 +187,7 @@ def _deviations(
 def _random_rows(
     ring: Ring, usual: Ring, seed: int, on_room: Callable[[int], None]
 ) -> Iterator[tuple[str, Deviations]]:
-    """Both methods and both rings in the same random rooms; to be found are the walls that the first ring hears well."""
+    """Both methods and both rings in the same random rooms; to be found are walls that the first ring hears well."""
     rng = np.random.default_rng(seed)
     rooms, places, full, conventional = [], [], [], []
     for k in range(RANDOM_ROOMS):

@@ -238,7 +238,7 @@ def test_direct_echoes_alone_leave_corner_and_edge_open_and_the_model_says_so(co
     assert abs(oracles.wrap(reflector.theta - math.atan2(place[1], place[0]))) < 0.1
     (came,) = written(model)["undecided"]
     assert came["probability"] == reflector.probability
-    assert model.empty == "no wall, but 1 other reflectors" or "1 other reflector" in model.empty
+    assert model.empty == "no wall; corners, edges and undecided: 1"
     assert nothing.empty == "no echo within the maximum range"
     assert nothing.undecided == ()
 
