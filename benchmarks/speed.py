@@ -107,11 +107,13 @@ def main() -> None:
     scans, peer = len(ranges), NumpyPeer(ring, settings)
 
     start = time.perf_counter()
-    extract_lines(ring, ranges[:1], settings=settings)
+    extract_lines(ring, ranges[:1], method="hough", settings=settings)
     cold = time.perf_counter() - start
     one_by_one = itertools.cycle(ranges[k : k + 1] for k in range(scans))
-    single = seconds(lambda: extract_lines(ring, next(one_by_one), settings=settings), repeats=20 * repeats)
-    batch = seconds(lambda: extract_lines(ring, ranges, settings=settings), repeats=repeats)
+    single = seconds(
+        lambda: extract_lines(ring, next(one_by_one), method="hough", settings=settings), repeats=20 * repeats
+    )
+    batch = seconds(lambda: extract_lines(ring, ranges, method="hough", settings=settings), repeats=repeats)
     plain = seconds(lambda: [peer.lines(scan) for scan in ranges], repeats=max(repeats // 3, 2))
 
     arcs = arcs_of(ring, settings)

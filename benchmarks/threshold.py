@@ -38,7 +38,7 @@ def main() -> None:
             [
                 compare(
                     ring,
-                    list(local_models(ring, heard.as_log(ring, poses), settings=settings)),
+                    list(local_models(ring, heard.as_log(ring, poses), method="hough", settings=settings)),
                     heard,
                     room,
                     poses,

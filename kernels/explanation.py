@@ -226,9 +226,9 @@ def explain(
         start, here = _fitted(ring, packed, rho, theta, first, expected)
         # Passes over the whole scan, each with what the one before has found.
         size = expected.reflectors
-        nothing = jnp.zeros((size, 2)), jnp.zeros((size, 2, 2)), jnp.zeros(size, bool)
-        shares = (jnp.asarray(guess, reach.dtype) for guess in (expected.heard, expected.square))
-        scene = _Scene(*nothing, *shares, first)
+        walls, unknown, none = jnp.zeros((size, 2)), jnp.zeros((size, 2, 2)), jnp.zeros(size, bool)
+        share, square = (jnp.asarray(guess, reach.dtype) for guess in (expected.heard, expected.square))
+        scene = _Scene(walls, unknown, none, share, square, first)
 
         def look(state: tuple[_Scene, Float[Array, "3 k 2"]], _: None):
             scene, start = state
