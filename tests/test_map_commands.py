@@ -76,9 +76,22 @@ def features(path):
     return document["features"]
 
 
+def segments(path):
+    """The walls of a map, without its corners and edges."""
+    return [entry for entry in features(path) if entry["geometry"]["type"] == "LineString"]
+
+
 def assert_map_as_documented(path, scans):
-    """FORMATS: segments with all their properties, whose rho and theta are those of their ends."""
-    walls = features(path)
+    """FORMATS: segments with all their properties, whose rho and theta are those of their ends; corners and edges."""
+    for point in features(path):
+        if point["geometry"]["type"] == "Point":
+            told = point["properties"]
+            assert set(told) == {"kind", "cov", "echoes", "scans"}
+            assert told["kind"] in ("corner", "edge")
+            assert np.shape(point["geometry"]["coordinates"]) == (2,)
+            assert np.linalg.eigvalsh(told["cov"]).min() > 0
+            assert set(told["scans"]) <= set(scans)
+    walls = segments(path)
     for wall in walls:
         told, line = wall["properties"], wall["geometry"]
         assert set(told) == {"kind", *NUMBERS, "echoes", "scans"}
@@ -129,7 +142,7 @@ def test_the_office_is_found_and_evaluated(here, capsys):
     assert "precision" in table
     assert "recall" in table
     found = strict(Path("out.json").read_text())
-    assert found["segments"] == len(features("map.geojson"))
+    assert found["segments"] == len(segments("map.geojson"))
     assert found["references"] == sum(  # a polygon or line of n positions is n - 1 walls
         len(line) - 1
         for entry in strict(Path("office.geojson").read_text())["features"]
@@ -186,7 +199,7 @@ def test_figure_grid_and_drawing_are_of_the_map(here):
     assert (kind, depth) == (b"P5", b"255")
     assert math.prod(map(int, size.split())) == len(cells)
     drawn = [[tuple(line.dxf.start)[:2], tuple(line.dxf.end)[:2]] for line in ezdxf.readfile("D.DXF").modelspace()]
-    np.testing.assert_allclose(drawn, [wall["geometry"]["coordinates"] for wall in features("map.geojson")], atol=1e-9)
+    np.testing.assert_allclose(drawn, [wall["geometry"]["coordinates"] for wall in segments("map.geojson")], atol=1e-9)
 
 
 def test_parquet_is_as_good_as_csv(here):
