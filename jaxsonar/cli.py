@@ -85,7 +85,7 @@ def parser() -> argparse.ArgumentParser:
     lines.add_argument("log", metavar="LOG", help="scan log, .csv or .parquet")
     lines.add_argument("--ring", required=True, help=RING_HELP)
     lines.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
-    lines.add_argument("--sigma", type=_finite(1e-6, 1), metavar="METRES", help=SIGMA_HELP)
+    lines.add_argument("--sigma", type=_finite(1e-4, 1), metavar="METRES", help=SIGMA_HELP)
     lines.add_argument("--settings", metavar="TOML", help=SETTINGS_HELP)
     lines.add_argument(
         "-o", "--output", metavar="LINES", required=True, help="JSON Lines, an object a scan; - = stdout"
@@ -99,7 +99,7 @@ def parser() -> argparse.ArgumentParser:
     map_.add_argument("log", type=_file, metavar="LOG", help="scan log with poses, .csv or .parquet")
     map_.add_argument("--ring", type=_file, required=True, help=RING_HELP)
     map_.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
-    map_.add_argument("--sigma", type=_finite(1e-6, 1), metavar="METRES", help=SIGMA_HELP)
+    map_.add_argument("--sigma", type=_finite(1e-4, 1), metavar="METRES", help=SIGMA_HELP)
     map_.add_argument(
         "--settings",
         type=_file,

@@ -47,6 +47,7 @@ def lines(options: argparse.Namespace) -> None:
     check_outputs({"-o": options.output, "--figure": options.figure}, [options.log, options.ring, options.settings])
     if options.scan is not None and not options.figure:
         raise SonarError(f"--scan {options.scan} came alone; allowed is --scan with --figure, to which it belongs")
+    _check_sigma_is_used(options.sigma, options.method, None)
     ring, log = load_ring(options.ring), load_log(options.log)
     settings = settings_for(ring, load_settings(options.settings) if options.settings else None)
     if options.scan is not None and options.scan not in log.scan:
@@ -115,6 +116,7 @@ def map(options: argparse.Namespace) -> None:
 
         load_ezdxf(options.dxf)
     check_window(options.window)
+    _check_sigma_is_used(options.sigma, options.method, options.window)
     ring, log = load_ring(options.ring), load_log(options.log)
     given = None if options.settings is None else load_settings(options.settings)
     settings = settings_for(ring, given, window=options.window)
@@ -161,7 +163,10 @@ def map(options: argparse.Namespace) -> None:
         )
     save_map(world, options.output)
     if beside is not None:
-        write_toml(_said(settings, window=options.window, merging=options.merging), beside)
+        write_toml(
+            _said(settings, method=options.method, sigma=options.sigma, window=options.window, merging=options.merging),
+            beside,
+        )
     if grid is not None:
         from .gridfile import save_nav2
 
@@ -294,6 +299,14 @@ def convert(options: argparse.Namespace) -> None:
 
     log = convert_log(options.source, options.destination, from_=options.from_)
     _say(f"{len(log)} scans, {len(log.range)} echoes")
+
+
+def _check_sigma_is_used(sigma: float | None, method: str, window: float | None) -> None:
+    from .hardware.errors import SonarError
+
+    other = f"--method {method}" if method != "ml" else "--window" if window is not None else ""
+    if sigma is not None and other:
+        raise SonarError(f"--sigma {sigma:g} came with {other}; allowed is --sigma with --method ml, without --window")
 
 
 def _laser_files(recording: str | None) -> list[Path]:

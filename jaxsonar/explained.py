@@ -16,6 +16,8 @@ from .ring import Ring
 
 DECIDED = 0.7
 """Probability from which on a reflector is said to be a wall, a corner or an edge."""
+LEAST_SIGMA = kernels.Expectations().least_sigma
+"""Metres; ranges are single precision."""
 KINDS = ("plane", "corner", "edge")
 """Names of ``kernels.PLANE``, ``kernels.CORNER`` and ``kernels.EDGE``."""
 
@@ -77,10 +79,13 @@ def explained(
         sure = (found.kind >= 0) & (found.probability.max(axis=-1) >= DECIDED)
         # The kind that explains most must be the likeliest one, too: its parameters are those that were fitted.
         sure &= found.probability.argmax(axis=-1) == found.kind
+        # From direct echoes alone corner and edge are the same; only where walls are would tell, and that is a guess.
+        cross = (found.involved & (ring.paths[step.path, 0] != ring.paths[step.path, 1])[real, None]).any(axis=-1)
+        sure &= (found.kind == kernels.PLANE) | cross
         yield Explained(step, found, np.where(sure, found.kind, -1))
 
 
 def check_sigma(sigma: float | None) -> None:
     """Raise a SonarError for a noise that no ring has."""
-    if sigma is not None and not 1e-6 <= sigma <= 1:
-        raise SonarError(f"sigma {sigma:g} m; allowed are 1e-06 to 1 m, or none for an estimate")
+    if sigma is not None and not LEAST_SIGMA <= sigma <= 1:
+        raise SonarError(f"sigma {sigma:g} m; allowed are {LEAST_SIGMA:g} to 1 m, or none for an estimate")

@@ -285,13 +285,16 @@ def _explained_model(ring: Ring, explained: Explained, row: int, scan: int, stam
         segment = np.asarray(found.segment[row, k])
         if decided[k] == kernels.PLANE:
             evidence = float(found.evidence[row, k])
-            lines.append(Line(rho=a, theta=b, segment=segment, votes=evidence, scans=(scan,), cov=cov, **seen))
+            lines.append(
+                Line(rho=a, theta=float(wrap_angle(b)), segment=segment, votes=evidence, scans=(scan,), cov=cov, **seen)
+            )
         elif decided[k] >= 0:
             kind = KINDS[decided[k]]
             points.append(Point(x=a, y=b, kind=kind, cov=cov, probability=probability[kind], **seen))
         else:
             plane = found.kind[row, k] == kernels.PLANE
-            rho, theta = (a, b) if plane else (float(np.hypot(a, b)), float(wrap_angle(np.arctan2(b, a))))
+            rho, theta = (a, b) if plane else (float(np.hypot(a, b)), np.arctan2(b, a))
+            theta = float(wrap_angle(theta))
             x, y = segment.mean(axis=0).tolist() if plane else (a, b)
             undecided.append(Undecided(rho=rho, theta=theta, x=x, y=y, probability=probability, **seen))
     empty = ""
@@ -299,7 +302,7 @@ def _explained_model(ring: Ring, explained: Explained, row: int, scan: int, stam
         corrected = np.asarray(ring.corrected(step.reported[row], *ring.paths[step.path[row]].T))
         heard = int((corrected < ring.max_range).sum())
         others = len(points) + len(undecided)
-        empty = f"no wall; corners, edges and undecided: {others}" if others else "no reflector explains the echoes"
+        empty = "no wall, only corners, edges and what is undecided" if others else "no reflector explains the echoes"
         empty = "no echo within the maximum range" if heard == 0 else empty
     return LocalModel(scan, stamp, tuple(lines), empty, tuple(points), tuple(undecided), float(found.sigma[row]))
 

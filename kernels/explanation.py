@@ -33,7 +33,7 @@ from .paths import EchoPaths
 from .reflectors import Sighting
 
 PLANE, CORNER, EDGE = 0, 1, 2
-"""Kinds of reflectors, rows of ``Explanation.probability``."""
+"""Kinds of reflectors, in the order of ``Explanation.probability``."""
 _PASSES = 4
 _STEPS = 3  # of the fit in each pass
 _SECOND_ORDER_WALLS = 7  # of a scan's reflectors, those with the most evidence, between which sound is followed
@@ -58,7 +58,7 @@ class Expectations:
     sigma: float = 0.006
     """Noise of the ranges to begin with where it is to be estimated, metres."""
     sigma_weight: float = 6.0
-    """Number of echoes that this first guess counts for."""
+    """Number of echoes that the guess of the pass before counts for."""
     least_sigma: float = 1e-4
     """Metres; single precision and what sensors can do."""
     clutter: float = 0.5
@@ -265,7 +265,9 @@ def explain(
     def nothing(packed: Echoes) -> Explanation:
         shapes = jax.eval_shape(one_scan, packed)
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        return eqx.tree_at(lambda e: e.kind, zeros, jnp.full_like(zeros.kind, -1))
+        noise = jnp.where(jnp.isfinite(sigma), sigma, expected.sigma).astype(zeros.sigma.dtype)
+        filled = jnp.full_like(zeros.kind, -1), jnp.full_like(zeros.evidence, -jnp.inf), noise
+        return eqx.tree_at(lambda e: (e.kind, e.evidence, e.sigma), zeros, filled)
 
     def one_or_none(packed: Echoes) -> Explanation:  # padding costs nothing where scans come one after the other
         return jax.lax.cond(jnp.isfinite(packed.range).any(), one_scan, nothing, packed)
@@ -484,12 +486,12 @@ def _chosen(
     open_ = jnp.tile(here, 3) & jnp.isfinite(supports.base)
 
     def take(free: Bool[Array, " echoes"], _: None):
-        score = jnp.where(open_, jnp.where(free[None], gain, 0).sum(axis=1) + supports.base, -jnp.inf)
+        several = ((supports.gain > 0) & free[None]).sum(axis=1) >= 2  # fewer determine nothing
+        score = jnp.where(free[None], gain, 0).sum(axis=1) + supports.base
+        score = jnp.where(open_ & several, score, -jnp.inf)
         best = score.argmax()
         enough = score[best] > expected.least
-        own = free & (supports.gain[best] > 0)
-        enough &= own.sum() >= 2  # fewer determine nothing
-        own &= enough
+        own = free & (supports.gain[best] > 0) & enough
         rivals = 2 * ((supports.gain > 0) & own[None]).sum(axis=1) >= own.sum()
         of_kind = jnp.where(rivals[None] & (kinds[None] == jnp.arange(3)[:, None]), score[None], -jnp.inf).max(axis=1)
         odds = expected.temper * (of_kind - jnp.asarray([expected.doubt, 0, 0], of_kind.dtype))

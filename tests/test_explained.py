@@ -238,7 +238,7 @@ def test_direct_echoes_alone_leave_corner_and_edge_open_and_the_model_says_so(co
     assert abs(oracles.wrap(reflector.theta - math.atan2(place[1], place[0]))) < 0.1
     (came,) = written(model)["undecided"]
     assert came["probability"] == reflector.probability
-    assert model.empty == "no wall; corners, edges and undecided: 1"
+    assert model.empty == "no wall, only corners, edges and what is undecided"
     assert nothing.empty == "no echo within the maximum range"
     assert nothing.undecided == ()
 
@@ -267,7 +267,7 @@ def test_a_noise_that_no_ring_has_is_refused_in_one_line(sigma):
         lambda: local_models(RING, log_of([]), sigma=sigma),
         lambda: local_model(RING, log_of([])[0], sigma=sigma),
     ):
-        with pytest.raises(SonarError, match=r"^sigma .* m; allowed are 1e-06 to 1 m") as refused:
+        with pytest.raises(SonarError, match=r"^sigma .* m; allowed are 0.0001 to 1 m") as refused:
             call()
         assert len(str(refused.value).splitlines()) == 1
 
@@ -312,10 +312,10 @@ def test_the_command_takes_the_noise_and_writes_what_the_library_gives(log, tmp_
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--sigma", "0"], ["--sigma", "'0'", "1e-06 to 1"]),
+        (["--sigma", "0"], ["--sigma", "'0'", "0.0001 to 1"]),
         (["--sigma", "-0.001"], ["--sigma", "-0.001"]),
-        (["--sigma", "2"], ["--sigma", "'2'", "1e-06 to 1"]),
-        (["--sigma", "nan"], ["--sigma", "nan", "1e-06 to 1"]),
+        (["--sigma", "2"], ["--sigma", "'2'", "0.0001 to 1"]),
+        (["--sigma", "nan"], ["--sigma", "nan", "0.0001 to 1"]),
         (["--sigma", "much"], ["--sigma", "much", "a number"]),
         (["--sigma"], ["--sigma", "one argument"]),
         (["--method", "best"], ["--method", "best", "ml", "hough"]),
