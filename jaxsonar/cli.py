@@ -16,7 +16,6 @@ from jaxsonar.hardware.errors import SonarError
 from .files import FIGURE_FORMATS as FIGURES
 
 SETTINGS_HELP = "accumulator and low pass, for hough also threshold, instead of the paper's"
-SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for each scan)"
 RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
 
 
@@ -68,6 +67,16 @@ def _ending_in(*suffixes: str):
 _figure = _ending_in(*FIGURES)
 
 
+def _choose_method(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
+    command.add_argument(
+        "--sigma",
+        type=_finite(1e-4, 1),
+        metavar="METRES",
+        help="standard deviation of the ranges, for ml (default: estimated for each scan)",
+    )
+
+
 def parser() -> argparse.ArgumentParser:
     """The whole command line."""
     top = _Parser(prog="jaxsonar", description="Maps from the echoes of an ultrasonic ring.", allow_abbrev=False)
@@ -84,8 +93,7 @@ def parser() -> argparse.ArgumentParser:
     lines = command("lines", "Straight lines around the robot, from every scan of a log.")
     lines.add_argument("log", metavar="LOG", help="scan log, .csv or .parquet")
     lines.add_argument("--ring", required=True, help=RING_HELP)
-    lines.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
-    lines.add_argument("--sigma", type=_finite(1e-4, 1), metavar="METRES", help=SIGMA_HELP)
+    _choose_method(lines)
     lines.add_argument("--settings", metavar="TOML", help=SETTINGS_HELP)
     lines.add_argument(
         "-o", "--output", metavar="LINES", required=True, help="JSON Lines, an object a scan; - = stdout"
@@ -98,8 +106,7 @@ def parser() -> argparse.ArgumentParser:
     map_ = command("map", "The walls of the world, from a log of scans with poses.")
     map_.add_argument("log", type=_file, metavar="LOG", help="scan log with poses, .csv or .parquet")
     map_.add_argument("--ring", type=_file, required=True, help=RING_HELP)
-    map_.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
-    map_.add_argument("--sigma", type=_finite(1e-4, 1), metavar="METRES", help=SIGMA_HELP)
+    _choose_method(map_)
     map_.add_argument(
         "--settings",
         type=_file,

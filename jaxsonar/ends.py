@@ -8,9 +8,10 @@ from scipy.spatial import KDTree
 
 from .fusion import Opening
 from .ghosts import LONG, REACH, TURNED, turn_between
-from .pieces import Pieces, add_up, join
+from .pieces import Pieces, add_up
 from .points import GATE, Points
 from .rooms import cross
+from .sightings import join
 
 INSIDE = 0.2
 """Metres that the feet of a wall may lie beyond its end, where echoes of the edge itself were taken for the wall's."""

@@ -58,7 +58,6 @@ def explained(
     echoes: FlatEchoes,
     settings: kernels.HoughSettings,
     sigma: float | None,
-    expected: kernels.Expectations | None = None,
 ) -> Iterator[Explained]:
     """The reflectors of every scan, step by step over a batch.
 
@@ -67,9 +66,8 @@ def explained(
         echoes: of single scans.
         settings: of the Hough step that gives the candidates.
         sigma: noise of the ranges, metres; estimated for each scan if None.
-        expected: what is expected of rooms; the default if left out.
     """
-    expected = kernels.Expectations() if expected is None else expected
+    expected = kernels.Expectations()
     arcs = arcs_of(ring, settings)
     noise = jnp.asarray(np.nan if sigma is None else sigma, jnp.float32)
     for step in echoes.steps(settings.cells, dear=True):

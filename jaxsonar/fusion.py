@@ -9,8 +9,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from .pieces import Pieces, add_up, unique_pairs
+from .pieces import Pieces, add_up
 from .poses import wrap_angle
+from .sightings import unique_pairs
 
 OFFSET_GATE = 0.06
 """Metres; pieces of one wall lie at most this far off one another, across the wall."""

@@ -14,7 +14,7 @@ from .candidates import Lines as Lines
 from .candidates import arcs_of as arcs_of
 from .candidates import extract
 from .candidates import settings_for as settings_for
-from .echoes import FlatEchoes
+from .echoes import FlatEchoes, Step
 from .explained import KINDS, Explained, check_sigma, explained
 from .logs import Log, Scan
 from .poses import wrap_angle
@@ -258,9 +258,7 @@ def models_of(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSet
             )
             empty = ""
             if not lines:
-                corrected = np.asarray(ring.corrected(step.reported[row], *paths[step.path[row]].T))
-                heard = int((corrected < ring.max_range).sum())
-                empty = _why_empty(heard, int(extracted.components[row]), settings.min_echoes)
+                empty = _why_empty(_heard(ring, step, row), int(extracted.components[row]), settings.min_echoes)
             yield LocalModel(int(log.scan[index]), float(log.stamp[index]), lines, empty)
 
 
@@ -299,12 +297,16 @@ def _explained_model(ring: Ring, explained: Explained, row: int, scan: int, stam
             undecided.append(Undecided(rho=rho, theta=theta, x=x, y=y, probability=probability, **seen))
     empty = ""
     if not lines:
-        corrected = np.asarray(ring.corrected(step.reported[row], *ring.paths[step.path[row]].T))
-        heard = int((corrected < ring.max_range).sum())
         others = len(points) + len(undecided)
         empty = "no wall, only corners, edges and what is undecided" if others else "no reflector explains the echoes"
-        empty = "no echo within the maximum range" if heard == 0 else empty
+        empty = "no echo within the maximum range" if _heard(ring, step, row) == 0 else empty
     return LocalModel(scan, stamp, tuple(lines), empty, tuple(points), tuple(undecided), float(found.sigma[row]))
+
+
+def _heard(ring: Ring, step: Step, row: int) -> int:
+    """Number of echoes of one scan within the maximum range."""
+    corrected = np.asarray(ring.corrected(step.reported[row], *ring.paths[step.path[row]].T))
+    return int((corrected < ring.max_range).sum())
 
 
 def check_method(method: str) -> None:

@@ -20,11 +20,12 @@ from .local import LocalModel, local_models
 from .logs import Log
 from .maps import GlobalMap
 from .merging import merge_as_paper
-from .pieces import Pieces, add_up, aggregate, join, latest_scans, scan_lists
+from .pieces import Pieces, add_up, aggregate
 from .points import Points
 from .poses import wrap_angle
 from .ring import Ring
 from .seenthrough import SeenThrough, silence
+from .sightings import join, latest_scans
 
 MERGINGS = ("fused", "paper")
 """How pieces become walls: pieces that agree add up, or the paper's clusters of midpoints and Hough transform."""
@@ -64,7 +65,7 @@ class Evidence:
         """The evidence of both."""
         return Evidence(
             join([self.pieces, other.pieces]),
-            points.join([self.points, other.points]),
+            join([self.points, other.points]),
             self.seen.joined(other.seen),
             np.unique(np.concatenate([self.places, other.places]), axis=0),
             self.models + other.models,
@@ -263,5 +264,5 @@ def _as_map(walls: Pieces, corners: Points) -> GlobalMap:
         point_kinds=corners.kinds,
         point_cov=corners.honest_cov,
         point_echoes=corners.echoes,
-        point_scans=scan_lists(corners.scans, len(corners)),
+        point_scans=corners.scan_lists(),
     )

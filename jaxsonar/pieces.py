@@ -9,13 +9,15 @@ from jaxtyping import Bool, Float, Int
 
 from .local import Line, LocalModel
 from .poses import to_world, wrap_angle
+from .sightings import Sightings, unique_pairs
+from .sightings import join as join
 
 SIGMA_OFFSET, SIGMA_THETA = 0.01, float(np.radians(3.0))
 """Standard deviations of a line of the Hough step, metres and radians: what cells and cut-off arcs leave."""
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class Pieces(Sightings):
     """Straight pieces of walls, world frame, one row each.
 
     A piece knows its line best at ``centre``: there the errors of its offset (across the line) and of its direction are
@@ -32,21 +34,8 @@ class Pieces:
     """1 / m^2."""
     info_theta: Float[np.ndarray, " pieces"]
     """1 / rad^2."""
-    misfit: Float[np.ndarray, " pieces"]
-    """Sum of the squared, normalised deviations of the added pieces from their common line."""
-    count: Int[np.ndarray, " pieces"]
-    """How many lines of local models the piece is the sum of."""
-    echoes: Int[np.ndarray, " pieces"]
-    """How many echoes they rest on."""
     distance: Float[np.ndarray, " pieces"]
     """From how far it was seen, the mean of the lines, metres."""
-    latest: Float[np.ndarray, " pieces"]
-    """When it was last seen: seconds, or the scan number where there is no stamp."""
-    scans: tuple[Int[np.ndarray, " seen"], Int[np.ndarray, " seen"]]
-    """Row and scan number of every scan that a piece was seen in, ascending, each once."""
-
-    def __len__(self) -> int:
-        return len(self.theta)
 
     @property
     def normal(self) -> Float[np.ndarray, "pieces 2"]:
@@ -67,16 +56,6 @@ class Pieces:
     def length(self) -> Float[np.ndarray, " pieces"]:
         """Metres."""
         return self.ends[:, 1] - self.ends[:, 0]
-
-    def take(self, rows: Int[np.ndarray, " some"] | Bool[np.ndarray, " pieces"]) -> "Pieces":
-        """Some of the pieces, in the order asked for; a row may come more than once."""
-        rows = np.arange(len(self))[rows]
-        columns: dict[str, Any] = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "scans"}
-        return Pieces(**columns, scans=scans_of(self.scans, rows))
-
-    def scan_lists(self) -> tuple[tuple[int, ...], ...]:
-        """Numbers of the scans that each piece was seen in, ascending."""
-        return scan_lists(self.scans, len(self))
 
 
 def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]) -> Pieces:
@@ -137,16 +116,6 @@ def _known_best(
         info_offset[known] = 1 / (cov[:, 0, 0] - cov[:, 0, 1] ** 2 / cov[:, 1, 1])
         info_theta[known] = 1 / cov[:, 1, 1]
     return centre, info_offset, info_theta
-
-
-def join(parts: Sequence[Pieces]) -> Pieces:
-    """The pieces of several collections as one."""
-    columns: dict[str, Any] = {
-        f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Pieces) if f.name != "scans"
-    }
-    offset = np.cumsum([0, *(len(part) for part in parts[:-1])])
-    rows = np.concatenate([part.scans[0] + first for part, first in zip(parts, offset, strict=True)])
-    return Pieces(**columns, scans=(rows, np.concatenate([part.scans[1] for part in parts])))
 
 
 def add_up(pieces: Pieces, group: Int[np.ndarray, " pieces"]) -> Pieces:
@@ -234,33 +203,3 @@ def overwrite(pieces: Pieces, rows: Bool[np.ndarray, " pieces"], by: Pieces) -> 
             values[rows] = getattr(by, field.name)
             columns[field.name] = values
     return replace(pieces, **columns)
-
-
-def unique_pairs(row: np.ndarray, number: np.ndarray) -> tuple[Int[np.ndarray, " seen"], Int[np.ndarray, " seen"]]:
-    """Pairs of row and scan number, ascending, each once."""
-    order = np.lexsort((number, row))
-    row, number = row[order], number[order]
-    new = np.ones(len(row), dtype=bool)
-    new[1:] = (np.diff(row) > 0) | (np.diff(number) != 0)
-    return row[new], number[new]
-
-
-def scans_of(scans: tuple[np.ndarray, np.ndarray], rows: Int[np.ndarray, " some"]) -> tuple[np.ndarray, np.ndarray]:
-    """The pairs of some rows, in the order asked for, the rows numbered anew."""
-    begin, end = np.searchsorted(scans[0], [rows, rows + 1])
-    count = end - begin
-    seen = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
-    return np.repeat(np.arange(len(rows)), count), scans[1][seen]
-
-
-def scan_lists(scans: tuple[np.ndarray, np.ndarray], rows: int) -> tuple[tuple[int, ...], ...]:
-    """Numbers of the scans of each row, ascending."""
-    parts = np.split(scans[1], np.searchsorted(scans[0], np.arange(1, rows)))
-    return tuple(tuple(part.tolist()) for part in parts[:rows])
-
-
-def latest_scans(scans: tuple[np.ndarray, np.ndarray], most: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """At most so many scans of each row, those with the largest numbers; all if None."""
-    row, number = scans
-    kept = np.arange(len(row)) >= np.searchsorted(row, row, side="right") - (len(row) if most is None else most)
-    return row[kept], number[kept]

@@ -1,8 +1,7 @@
 """Corners and edges in the world frame, with what is known of each, and the law by which sightings of one add up."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -10,8 +9,9 @@ from scipy.spatial import KDTree
 
 from .fusion import mutual
 from .local import LocalModel
-from .pieces import latest_scans, scans_of, unique_pairs
 from .poses import to_world
+from .sightings import Sightings, latest_scans, unique_pairs
+from .sightings import join as join
 
 CELL = 0.05
 """Metres; sightings of one cell of the floor are kept as their sum."""
@@ -30,7 +30,7 @@ SURE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class Points(Sightings):
     """Corners and edges, world frame, one row each; a corner is right-angled, thin poles are edges."""
 
     place: Float[np.ndarray, "points 2"]
@@ -39,21 +39,8 @@ class Points:
     """Inverse covariance of ``place``, 1 / m^2: across the line of sight much less is known than along it."""
     evidence: Float[np.ndarray, " points"]
     """For a corner and against an edge: sum of log odds, nats."""
-    misfit: Float[np.ndarray, " points"]
-    """Sum of the squared, normalised deviations of the added sightings from their common place."""
-    count: Int[np.ndarray, " points"]
-    """How many points of local models it is the sum of."""
-    echoes: Int[np.ndarray, " points"]
-    """How many echoes they rest on."""
-    latest: Float[np.ndarray, " points"]
-    """When it was last seen: seconds, or the scan number where there is no stamp."""
     cell: Int[np.ndarray, "points 2"]
     """Cell of the floor that it was first sighted in; of a sum, that of one of its members."""
-    scans: tuple[Int[np.ndarray, " seen"], Int[np.ndarray, " seen"]]
-    """Row and scan number of every scan that a point was seen in, ascending, each once."""
-
-    def __len__(self) -> int:
-        return len(self.place)
 
     @property
     def cov(self) -> Float[np.ndarray, "points 2 2"]:
@@ -75,12 +62,6 @@ class Points:
     def times(self) -> Int[np.ndarray, " points"]:
         """In how many scans each was seen."""
         return np.bincount(self.scans[0], minlength=len(self))
-
-    def take(self, rows: Int[np.ndarray, " some"] | Bool[np.ndarray, " points"]) -> "Points":
-        """Some of the points, in the order asked for."""
-        rows = np.arange(len(self))[rows]
-        columns: dict[str, Any] = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "scans"}
-        return Points(**columns, scans=scans_of(self.scans, rows))
 
 
 def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]) -> Points:
@@ -118,16 +99,6 @@ def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]
         cell=np.floor(place / CELL).astype(np.int64),
         scans=unique_pairs(*seen.T),
     )
-
-
-def join(parts: Sequence[Points]) -> Points:
-    """The points of several collections as one."""
-    columns: dict[str, Any] = {
-        f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Points) if f.name != "scans"
-    }
-    first = np.cumsum([0, *[len(part) for part in parts[:-1]]])
-    rows = np.concatenate([part.scans[0] + start for part, start in zip(parts, first, strict=True)])
-    return Points(**columns, scans=(rows, np.concatenate([part.scans[1] for part in parts])))
 
 
 def add_up(points: Points, group: Int[np.ndarray, " points"]) -> Points:

@@ -212,7 +212,7 @@ def explain(
         # Candidates: maxima of the paper's accumulator.
         voting = lines_of_scan(ring, packed, settings)
         smooth = hough.lowpass(hough.accumulate(voting.cell, settings), settings)
-        level = expected.peak * hough.full_wall_votes(ring.paths, settings)
+        level = expected.peak * hough.votes_of(ring.full_wall, settings)
         rho, theta = hough.peaks(smooth, level, size=expected.candidates, settings=settings)
         # Each fitted as plane, corner and edge, robustly; the noise is not known yet to more than an order.
         echo = jax.tree.map(lambda leaf: leaf[packed.path], ring.paths)

@@ -166,7 +166,12 @@ def full_wall_votes(paths: EchoPaths, settings: HoughSettings) -> Float[Array, "
     The paths that hear it times the points that an arc has in one cell. So the threshold depends neither on the point
     pitch nor on the ring.
     """
-    return full_wall_paths(paths) * settings.theta_cell / settings.point_pitch
+    return votes_of(full_wall_paths(paths), settings)
+
+
+def votes_of(paths: Float[Array, ""], settings: HoughSettings) -> Float[Array, ""]:
+    """Points that so many paths put into the cell of a wall that all of them hear."""
+    return paths * settings.theta_cell / settings.point_pitch
 
 
 @jax.jit
