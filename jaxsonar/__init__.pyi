@@ -1,6 +1,12 @@
+from .calibration import Calibration as Calibration
+from .calibration import calibrate as calibrate
+from .calibrationfile import save_calibration as save_calibration
 from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
+from .focusing import focus as focus
 from .hardware.errors import SonarError as SonarError
+from .health import Health as Health
+from .health import check as check
 from .incremental import Mapper as Mapper
 from .incremental import MapState as MapState
 from .incremental import StepInfo as StepInfo

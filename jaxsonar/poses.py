@@ -29,3 +29,16 @@ def relative(
     c, s = np.cos(world_from_a[..., 2]), np.sin(world_from_a[..., 2])
     x, y = c * offset[..., 0] + s * offset[..., 1], c * offset[..., 1] - s * offset[..., 0]
     return np.stack([x, y, wrap_angle(world_from_b[..., 2] - world_from_a[..., 2])], axis=-1)
+
+
+def inverse(a_from_b: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """b_from_a."""
+    return relative(a_from_b, np.zeros_like(a_from_b))
+
+
+def composed(
+    a_from_b: Float[np.ndarray, "3"], b_from_c: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 3"]:
+    """a_from_c."""
+    place = to_world(a_from_b, b_from_c[..., :2])
+    return np.concatenate([place, wrap_angle(b_from_c[..., 2:] + a_from_b[2])], axis=-1)

@@ -146,16 +146,24 @@ def save_ring(ring: Ring, path: str | os.PathLike[str]) -> None:
     Raises:
         SonarError: the place cannot be written.
     """
+    with atomic_write(path) as file:
+        file.write(ring_toml(ring))
+
+
+def ring_toml(ring: Ring, *, each: bool = False) -> str:
+    """A ring as the text of its file.
+
+    Args:
+        ring: the ring.
+        each: as ``[array]`` with a ``[[sensor]]`` each, even where ``[ring]`` would do.
+    """
     speed = float(np.asarray(ring.speed_of_sound, dtype=np.float64))
     head: dict[str, Any] = {"name": ring.name, "speed_of_sound": speed}
-    if circle := _circle(ring):
-        text = tomli_w.dumps({**head, "ring": circle})
-    else:
-        text = tomli_w.dumps({**head, "array": {"neighbors": ring.neighbors, "max_range": ring.max_range}})
-        # One by one, since the library would put short tables into an inline array.
-        text += "".join(f"\n[[sensor]]\n{tomli_w.dumps(sensor)}" for sensor in _sensors(ring))
-    with atomic_write(path) as file:
-        file.write(text)
+    if (circle := _circle(ring)) and not each:
+        return tomli_w.dumps({**head, "ring": circle})
+    text = tomli_w.dumps({**head, "array": {"neighbors": ring.neighbors, "max_range": ring.max_range}})
+    # One by one, since the library would put short tables into an inline array.
+    return text + "".join(f"\n[[sensor]]\n{tomli_w.dumps(sensor)}" for sensor in _sensors(ring))
 
 
 def _circle(ring: Ring) -> dict[str, Any] | None:

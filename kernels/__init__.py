@@ -1,10 +1,24 @@
 """Pure JAX kernels: from the ranges of echoes to votes, occupied cells and lines. Arrays in, arrays out."""
 
+from .adjustment import Adjusted as Adjusted
+from .adjustment import Heard as Heard
+from .adjustment import Problem as Problem
+from .adjustment import Unknowns as Unknowns
+from .adjustment import adjust as adjust
+from .adjustment import cost as cost
+from .adjustment import moved_sensors as moved_sensors
+from .adjustment import residuals as residuals
 from .arcs import Arc as Arc
 from .arcs import arc as arc
 from .arcs import arc_point as arc_point
 from .arcs import corrected_range as corrected_range
 from .arcs import tangent_rho as tangent_rho
+from .association import Association as Association
+from .association import Candidates as Candidates
+from .association import associate as associate
+from .beams import Beams as Beams
+from .beams import beam_misfit as beam_misfit
+from .beams import off_axis_angles as off_axis_angles
 from .clusters import Clusters as Clusters
 from .clusters import centres_of_gravity as centres_of_gravity
 from .clusters import extent as extent
@@ -43,3 +57,10 @@ from .merging import occupied_by_lines as occupied_by_lines
 from .paths import EchoPaths as EchoPaths
 from .paths import Sensors as Sensors
 from .paths import echo_paths as echo_paths
+from .scene import SECOND as SECOND
+from .scene import Reflection as Reflection
+from .scene import Scene as Scene
+from .scene import audible as audible
+from .scene import expected_range as expected_range
+from .scene import expected_report as expected_report
+from .scene import seen_from as seen_from

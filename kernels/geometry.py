@@ -63,3 +63,9 @@ def edge_range(edge: Float[Array, "2"], tx: Float[Array, "2"], rx: Float[Array, 
     """Range in metres of the diffraction at an edge or a thin pole: half the way to it and on to the receiver."""
     out, back = edge - tx, edge - rx
     return (safe_sqrt(out @ out) + safe_sqrt(back @ back)) / 2
+
+
+def mirrored(point: Float[Array, "2"], line: Float[Array, "2"]) -> Float[Array, "2"]:
+    """A point's image behind a line (rho, theta), metres: where its sound seems to come from."""
+    n = normal(line[1])
+    return point + 2 * (line[0] - point @ n) * n

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .geometry import normal, safe_sqrt, tangent
+from .geometry import mirrored, normal, safe_sqrt, tangent
 from .paths import EchoPaths
 
 _SOFT = 0.08  # of half a cone; where its border is neither inside nor outside
@@ -68,9 +68,9 @@ def edge(place: Float[Array, "2"], path: EchoPaths) -> Sighting:
 def second_order(first: Float[Array, "2"], second: Float[Array, "2"], path: EchoPaths) -> Sighting:
     """Wall to wall: reflected at one plane, then at another, by the image of the image."""
     tx, rx = path.midpoint - path.half_baseline, path.midpoint + path.half_baseline
-    behind_first, behind_second = _mirrored(tx, first), _mirrored(rx, second)
-    length, departure = _towards(_mirrored(behind_second, first) - tx)
-    _, arrival = _towards(_mirrored(behind_first, second) - rx)
+    behind_first, behind_second = mirrored(tx, first), mirrored(rx, second)
+    length, departure = _towards(mirrored(behind_second, first) - tx)
+    _, arrival = _towards(mirrored(behind_first, second) - rx)
     # From behind the first to behind the second, before each other's plane, and through the first one first.
     start, end = _before(tx, first), _before(rx, second)
     last, next_ = _before(behind_second, first), _before(behind_first, second)
@@ -103,8 +103,3 @@ def _towards(offset: Float[Array, "2"]) -> tuple[Float[Array, ""], Float[Array, 
 
 def _before(point: Float[Array, "2"], line: Float[Array, "2"]) -> Float[Array, ""]:
     return line[0] - point @ normal(line[1])
-
-
-def _mirrored(point: Float[Array, "2"], line: Float[Array, "2"]) -> Float[Array, "2"]:
-    n = normal(line[1])
-    return point + 2 * (line[0] - point @ n) * n

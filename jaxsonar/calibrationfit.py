@@ -1,0 +1,223 @@
+"""The inner loop of a calibration: place the scans, build the map, let everything settle, and again while it helps."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxsonar import kernels
+from jaxsonar.hardware.errors import SonarError
+
+from .local import local_models
+from .logs import Log
+from .maps import GlobalMap
+from .placing import place_parts
+from .ring import Ring
+from .ringmodes import RingModes
+from .settling import Data, Settled, State, settle
+from .surroundings import seen_world, surroundings
+
+PINNED = 0.001
+"""Metres; the mean range offset is estimated where its standard deviation is at most this."""
+LEAST_SCANS = 3
+"""Scans that must be laid on one another to tell anything."""
+_WIDE, _WIDE_PLACED = 0.04, 0.08  # m; scale of the first association: poses given, poses found
+_AGAIN = 0.01  # m; scale of the first one after the map was made anew
+_MAPS = 5  # made anew at most, as long as each explains more echoes
+_GROWN = 1.005  # by so much
+_PLACINGS = 3  # likewise
+_MARGIN = 0.5  # nats; a wrong place does little harm here, a scan that is left out tells nothing
+_LEAST_SECOND = 10  # wall to wall echoes
+_MISFIT = 1.5  # sigma; of wall to wall echoes where walls do meet as the map says
+_KEEPS = 0.97  # of the echoes that were explained with corners of their own
+
+
+class Fitted(NamedTuple):
+    """A ring that fits scans, their poses and a map."""
+
+    logs: list[Log]
+    """One for every world."""
+    data: Data
+    worlds: list[GlobalMap]
+    settled: Settled
+
+    @property
+    def used(self) -> int:
+        """Echoes that are explained."""
+        return int(self.settled.used.sum())
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked for."""
+
+    ring: Ring
+    """Where the modes begin."""
+    modes: RingModes
+    estimate: bool
+    """Whether poses are estimated; those of the logs are odometry then."""
+    odometry: float
+    """Share of the way and of the turn that it is wrong by."""
+    sigma: float | None
+    """Noise of the ranges, metres."""
+    window: float | None
+    """Metres of path for a local model."""
+    say: Callable[[str], None]
+
+    @property
+    def held(self) -> RingModes:
+        """The modes without the mean offset."""
+        return self.modes.only(*(name for name in self.modes.names if name != "mean"))
+
+    def fitted(self, near: Ring, logs: Sequence[Log]) -> Fitted:
+        """Ring, poses and map that fit, the mean offset held; poses, where they are estimated, are found first.
+
+        Args:
+            near: a ring that is nearer to the truth than the one that the modes begin at.
+            logs: as they came.
+        """
+        best = None
+        for _ in range(_PLACINGS if self.estimate and self.window is None else 1):
+            fit = self._fitted(near, *self._placed(near, logs))
+            if best is not None and fit.used <= best.used:
+                break
+            best, near = fit, moved_ring(self.ring, self.modes, fit.settled.state)
+        assert best is not None
+        return best
+
+    def _fitted(self, near: Ring, logs: list[Log], measured: list[Float[np.ndarray, "scans 3"]]) -> Fitted:
+        """The map so far; echoes to its reflectors and least squares, closer and closer; the same with that ring."""
+        data = Data.of(self.ring, logs, measured, self.odometry)
+        state = State(_coordinates(self.held, _change(self.ring, near)), data.poses, surroundings([], tied=False))
+        found = None
+        for _ in range(_MAPS):
+            self.say("building the map")
+            worlds = [seen_world(near, one, window=self.window) for one in data.placed(logs, state.poses)]
+            if not any(len(world) for world in worlds):
+                raise SonarError(
+                    "calibration: no wall found; allowed are scans of a place with straight walls in reach"
+                )
+            self.say("least squares")
+            state = state._replace(around=surroundings(worlds, tied=False))
+            first = _WIDE_PLACED if self.estimate else _WIDE
+            settled = self.settle(data, state, self.held, first if found is None else _AGAIN)
+            before = 0 if found is None else found.used
+            if settled.used.sum() <= before:
+                break
+            found = Fitted(logs, data, worlds, settled)
+            if found.used <= _GROWN * before:
+                break
+            state = settled.state
+            near = moved_ring(self.ring, self.held, state)
+        if found is None:
+            raise SonarError("calibration: no echo fits the walls; is it the right ring, are poses and units right?")
+        return found
+
+    def settle(self, data: Data, state: State, modes: RingModes, widest: float) -> Settled:
+        """In double precision."""
+        with jax.enable_x64(True):
+            return settle(self.ring, data, modes, state, widest=widest, poses_free=self.estimate, sigma=self.sigma)
+
+    def _placed(self, ring: Ring, logs: Sequence[Log]) -> tuple[list[Log], list[Float[np.ndarray, "scans 3"]]]:
+        """Logs with poses from their local models, and their odometry; as they came where poses are given.
+
+        What cannot be laid together becomes several logs, each with a world of its own. Where single scans are sparse,
+        odometry alone must do.
+        """
+        placed, measured = list(logs), [log.pose for log in logs]
+        if self.estimate and self.window is None:
+            self.say("placing the scans")
+            placed, measured = [], []
+            for log in logs:
+                odometry = log.pose if np.isfinite(log.pose).any() else None
+                models = list(local_models(ring, log))
+                parts = place_parts(models, odometry, slip=self.odometry, margin=_MARGIN)
+                enough = [part for part in parts if np.isfinite(part[:, 0]).sum() >= LEAST_SCANS]
+                placed += [replace(log, pose=part) for part in enough]
+                measured += [log.pose] * len(enough)
+        _check_poses(placed)
+        return placed, measured
+
+    def pinned(self, alone: Fitted) -> tuple[Fitted, str]:
+        """The same with the mean offset free, where wall to wall echoes pin it; or as it is, and why."""
+        around = surroundings(alone.worlds, tied=True)
+        if not (np.asarray(around.candidates.reflection.kind) == kernels.SECOND).any():
+            return alone, "no walls that meet at a right angle, so no wall to wall echoes"
+        state = alone.settled.state._replace(around=around)
+        tied = self.settle(alone.data, state, self.modes, 2 * _AGAIN)
+        second = tied.used & (np.asarray(tied.problem.heard.reflection.kind) == kernels.SECOND)
+        count = int(second.sum())
+        sd = float(np.sqrt(covariance(tied)[: self.ring.count, : self.ring.count].mean()))
+        if count < _LEAST_SECOND or sd > PINNED:
+            return alone, f"{count} wall to wall echoes pin it to {1e3 * sd:.1f} mm only; needed is {1e3 * PINNED:g} mm"
+        misfit = float(np.sqrt(np.mean(tied.residual[second] ** 2))) / tied.sigma
+        if misfit > _MISFIT or tied.used.sum() < _KEEPS * alone.used:
+            return alone, f"wall to wall echoes do not fit the walls ({misfit:.1f} sigma); are they square?"
+        return alone._replace(settled=tied), ""
+
+    def before(self, fit: Fitted) -> Float[np.ndarray, "scans echoes"]:
+        """Residuals of the same echoes with the ring as it was, reflectors and free poses fitted to it, metres."""
+        found = fit.settled
+        nothing = np.zeros(found.problem.modes.shape)
+        with jax.enable_x64(True):
+            problem = eqx.tree_at(lambda p: p.modes, found.problem, jnp.asarray(nothing))
+            start = kernels.Unknowns(
+                jnp.asarray(nothing[0]),
+                jnp.asarray(found.state.poses),
+                jnp.asarray(found.state.around.scene.parameters),
+            )
+            fitted = kernels.adjust(problem, start, poses_free=self.estimate)
+            return np.asarray(kernels.residuals(problem, fitted.unknowns))
+
+
+def covariance(found: Settled) -> Float[np.ndarray, "ring ring"]:
+    """Of offsets, log speed and positions; 0 for what was held."""
+    columns = np.asarray(found.problem.modes)
+    size = columns.shape[1]
+    return columns @ np.asarray(found.adjusted.covariance)[:size, :size] @ columns.T
+
+
+def moved_ring(ring: Ring, modes: RingModes, state: State) -> Ring:
+    """The ring after its change along the modes."""
+    change, count = modes.columns @ state.coordinates, ring.count
+    return replace(
+        ring,
+        range_offset=np.asarray(ring.range_offset) + change[:count],
+        speed_of_sound=float(ring.speed_of_sound * np.exp(change[count])),
+        position=np.asarray(ring.position) + change[count + 1 :].reshape(-1, 2),
+    )
+
+
+def _change(ring: Ring, other: Ring) -> Float[np.ndarray, " ring"]:
+    """From one ring to another one: offsets, log speed, positions."""
+    return np.concatenate(
+        [
+            np.asarray(other.range_offset) - np.asarray(ring.range_offset),
+            [np.log(float(other.speed_of_sound) / float(ring.speed_of_sound))],
+            (np.asarray(other.position) - np.asarray(ring.position)).ravel(),
+        ]
+    )
+
+
+def _coordinates(modes: RingModes, change: Float[np.ndarray, " ring"]) -> Float[np.ndarray, " modes"]:
+    return np.linalg.lstsq(modes.columns, change, rcond=1e-9)[0]
+
+
+def _check_poses(logs: Sequence[Log]) -> None:
+    if not logs:
+        raise SonarError(
+            f"calibration: no {LEAST_SCANS} scans could be laid on one another; allowed are scans that see the same "
+            "walls in two directions, or odometry"
+        )
+    for log in logs:
+        count = int(np.isfinite(log.pose).all(axis=1).sum())
+        if count < LEAST_SCANS:
+            raise SonarError(
+                f"calibration: {count} of {len(log)} scans have a pose; allowed are {LEAST_SCANS} or more in every "
+                "log, or poses to be estimated from scans that see walls in two directions"
+            )

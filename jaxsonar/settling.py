@@ -1,0 +1,365 @@
+"""Echoes to reflectors, least squares, and again: ring, poses and reflectors settle while the gate closes.
+
+Graduated non-convexity: at first an echo may be centimetres off its reflector and still pull at it, with the weight of
+Geman and McClure's loss; the scale of that loss halves until it is four sigma, where an echo is either right or not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxsonar import kernels
+
+from .echoes import FlatEchoes
+from .logs import Log
+from .poses import relative
+from .ring import Ring
+from .ringmodes import RingModes
+from .surroundings import Surroundings
+from .windows import renewed
+
+GATE, DOUBT = 4.0, 5.0
+"""Sigma; how far an echo may be off its reflector, and how near to its range another one's makes it doubtful."""
+LEAST_ECHOES = 3
+"""Echoes that a reflector needs to say anything of the ring."""
+LEAST_SIGMA = 1e-5
+"""Metres; noise-free echoes have some, too: that of their digits."""
+_ANCHOR, _LOOSE = 1e-5, 1.0  # m, rad; the first pose of a path, and all others
+_SLIP = (0.0005, 0.001)  # m, rad; of odometry even where the robot stands
+_TURN = 0.5  # rad; turn in which odometry slips as much as over a metre
+_HALVINGS = 12
+_LAST_ROUNDS = 3
+_OTHER_KIND = 0.97  # of the sum of squares; a corner that is an edge, or the other way round
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """Scans of all logs in rectangles, padded: rows scans, columns echoes."""
+
+    path: Int[np.ndarray, "scans echoes"]
+    """Row of the ring's ``paths``; 0 where there is no echo."""
+    reported: Float[np.ndarray, "scans echoes"]
+    """Metres; NaN where there is no echo."""
+    poses: Float[np.ndarray, "scans 3"]
+    """world_from_robot to start from."""
+    world: Int[np.ndarray, " scans"]
+    """Number of the log; -1 where there is no scan, or one without a pose."""
+    anchored: Float[np.ndarray, "scans 3"]
+    odometry: Float[np.ndarray, "scans 3"]
+    linked: Float[np.ndarray, "scans 3"]
+    """As in ``kernels.Problem``."""
+    rows: tuple[Int[np.ndarray, " scans"], ...]
+    """Of every log: its scans that are used, the first of them in row ``begin`` of the rectangle and so on."""
+    begin: tuple[int, ...]
+
+    @classmethod
+    def of(
+        cls, ring: Ring, logs: Sequence[Log], odometry: Sequence[Float[np.ndarray, "scans 3"]], share: float
+    ) -> "Data":
+        """Scans with poses and echoes.
+
+        Args:
+            ring: the sensors.
+            logs: scans, with the poses to start from.
+            odometry: of every log, as measured; NaN where there is none.
+            share: of the way and the turn between scans that odometry is wrong by.
+        """
+        flats = [FlatEchoes.from_log(ring, log)[0] for log in logs]
+        used, counts = [], []
+        for log, flat in zip(logs, flats, strict=True):
+            # A reading that was not renewed is the one before, not one more.
+            count = np.bincount(flat.scan[renewed(flat)], minlength=len(log))
+            rows = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1) & (count > 0))
+            used.append(rows)
+            counts.append(count[rows])
+        begin = np.cumsum([0, *(len(rows) for rows in used)])
+        most = max((int(count.max(initial=1)) for count in counts), default=1)
+        scans, columns = (1 << max(int(n) - 1, 0).bit_length() for n in (max(begin[-1], 8), max(most, 16)))
+        data = cls(
+            path=np.zeros((scans, columns), np.int32),
+            reported=np.full((scans, columns), np.nan),
+            poses=np.zeros((scans, 3)),
+            world=np.full(scans, -1, np.int32),
+            anchored=np.full((scans, 3), 1 / _LOOSE**2),
+            odometry=np.zeros((scans, 3)),
+            linked=np.zeros((scans, 3)),
+            rows=tuple(used),
+            begin=tuple(begin[:-1].tolist()),
+        )
+        for number, (log, flat, rows, measured) in enumerate(zip(logs, flats, used, odometry, strict=True)):
+            data._fill(number, log, flat, rows, measured, share)
+        return data
+
+    def _fill(self, number, log: Log, flat: FlatEchoes, rows: np.ndarray, measured: np.ndarray, share: float) -> None:
+        first = self.begin[number]
+        here = slice(first, first + len(rows))
+        place = np.full(len(log), -1)
+        place[rows] = np.arange(first, first + len(rows))
+        echo = np.flatnonzero(renewed(flat) & (place[flat.scan] >= 0))
+        row = place[flat.scan[echo]]
+        column = np.arange(len(echo)) - np.searchsorted(row, row)
+        self.path[row, column] = flat.path[echo]
+        self.reported[row, column] = flat.reported[echo]
+        self.poses[here], self.world[here] = log.pose[rows], number
+        self.anchored[first : first + 1] = 1 / _ANCHOR**2
+        if len(rows) < 2:
+            return
+        step = relative(measured[rows[:-1]], measured[rows[1:]])
+        known = np.isfinite(step).all(axis=1)
+        way, turn = np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])
+        off = np.stack([share * way + _SLIP[0]] * 2 + [share * (turn + _TURN * way) + _SLIP[1]], axis=-1)
+        self.odometry[first : first + len(rows) - 1] = np.where(known[:, None], step, 0)
+        self.linked[first : first + len(rows) - 1] = np.where(known[:, None], 1 / off**2, 0)
+
+    @property
+    def echoes(self) -> int:
+        """Number of echoes."""
+        return int(np.isfinite(self.reported).sum())
+
+    @property
+    def scans(self) -> int:
+        """Number of scans."""
+        return int((self.world >= 0).sum())
+
+    def placed(self, logs: Sequence[Log], poses: Float[np.ndarray, "scans 3"]) -> list[Log]:
+        """The logs with these poses; scans that are not used have none."""
+        out = []
+        for log, rows, first in zip(logs, self.rows, self.begin, strict=True):
+            pose = np.full((len(log), 3), np.nan)
+            pose[rows] = poses[first : first + len(rows)]
+            out.append(replace(log, pose=pose))
+        return out
+
+
+class State(NamedTuple):
+    """How far the settling has come; NumPy arrays in double precision."""
+
+    coordinates: Float[np.ndarray, " modes"]
+    """Of the ring along its modes."""
+    poses: Float[np.ndarray, "scans 3"]
+    around: Surroundings
+    """The reflectors, where they are now."""
+
+
+class Settled(NamedTuple):
+    """The end of it."""
+
+    state: State
+    problem: kernels.Problem
+    """The last least squares."""
+    adjusted: kernels.Adjusted
+    used: Bool[np.ndarray, "scans echoes"]
+    """Echoes that a reflector explains."""
+    candidate: Int[np.ndarray, "scans echoes"]
+    """Row of the surroundings' candidates that each of them comes from."""
+    residual: Float[np.ndarray, "scans echoes"]
+    """Reported minus expected, metres; only where used."""
+    sigma: float
+    """Noise of the ranges, metres."""
+
+
+def settle(
+    ring: Ring,
+    data: Data,
+    modes: RingModes,
+    state: State,
+    *,
+    widest: float,
+    poses_free: bool,
+    sigma: float | None = None,
+) -> Settled:
+    """Close the gate around a start, round by round. To be called with 64-bit floats enabled.
+
+    Args:
+        ring: where the modes begin.
+        data: the scans.
+        modes: how the ring may change.
+        state: the start.
+        widest: scale of the first round, metres.
+        poses_free: whether poses are estimated.
+        sigma: noise of the ranges, metres, if it is known.
+    """
+    state, noise = _closed(ring, data, modes, state, widest=widest, poses_free=poses_free, sigma=sigma)
+    known = int(np.linalg.matrix_rank(modes.columns)) if modes.columns.any() else 0
+    for _ in range(_LAST_ROUNDS):
+        found = _round(ring, data, modes, state, noise, poses_free)
+        reflectors = len(np.unique(np.asarray(found.problem.heard.reflection.first)[found.used]))
+        left = int(found.used.sum()) - 2 * reflectors - known - 3 * data.scans * poses_free
+        if sigma is None and left > 0:
+            noise = max(float(np.sqrt((found.residual**2).sum() / left)), LEAST_SIGMA)
+        state = _of_better_kind(found)
+    return _round(ring, data, modes, state, noise, poses_free)
+
+
+def _closed(
+    ring: Ring,
+    data: Data,
+    modes: RingModes,
+    state: State,
+    *,
+    widest: float,
+    poses_free: bool,
+    sigma: float | None,
+) -> tuple[State, float]:
+    """Round by round with half the scale, down to four sigma; and sigma, from the middle of the residuals."""
+    scale, spread, last = widest, widest / GATE, False
+    for _ in range(_HALVINGS):
+        used, _, reflection = _associated(ring, data, modes, state, gate=3 * scale, doubt=0.0)
+        residual = _residual(ring, data, modes, state, reflection)
+        weight = used / (1 + (residual / scale) ** 2) ** 2 * (GATE / scale) ** 2
+        state, _, _ = _adjusted(ring, data, modes, state, reflection, weight, poses_free)
+        residual = _residual(ring, data, modes, state, reflection)
+        near = np.abs(residual[used & (np.abs(residual) < 3 * scale)])
+        spread = max(1.4826 * float(np.median(near)) if len(near) else scale / GATE, LEAST_SIGMA)
+        if last:
+            break
+        tight = GATE * (spread if sigma is None else sigma)
+        scale, last = max(scale / 2, tight), scale / 2 <= tight
+    return state, spread if sigma is None else sigma
+
+
+def _round(ring: Ring, data: Data, modes: RingModes, state: State, noise: float, poses_free: bool) -> Settled:
+    """One round in which an echo is right or not: within the gate, and no second reflector near."""
+    used, candidate, reflection = _associated(ring, data, modes, state, gate=GATE * noise, doubt=DOUBT * noise)
+    state, problem, found = _adjusted(ring, data, modes, state, reflection, used / noise**2, poses_free)
+    residual = np.where(used, _residual(ring, data, modes, state, reflection), 0)
+    return Settled(state, problem, found, used, candidate, residual, noise)
+
+
+def ring_change(modes: RingModes, state: State) -> Float[np.ndarray, " ring"]:
+    """Change of offsets, log speed of sound and positions so far."""
+    return modes.columns @ state.coordinates
+
+
+def problem_of(
+    ring: Ring,
+    data: Data,
+    modes: RingModes,
+    state: State,
+    reflection: kernels.Reflection,
+    weight: Float[np.ndarray, "scans echoes"],
+) -> kernels.Problem:
+    """The least-squares problem of given associations."""
+    return kernels.Problem(
+        sensors=ring.sensors,
+        modes=jnp.asarray(modes.columns),
+        scene=_arrays(state.around.scene),
+        heard=kernels.Heard(
+            path=jnp.asarray(data.path),
+            reported=jnp.asarray(np.nan_to_num(data.reported)),
+            reflection=_arrays(reflection),
+            weight=jnp.asarray(weight),
+        ),
+        poses=jnp.asarray(data.poses),
+        anchored=jnp.asarray(data.anchored),
+        odometry=jnp.asarray(data.odometry),
+        linked=jnp.asarray(data.linked),
+    )
+
+
+def _associated(
+    ring: Ring, data: Data, modes: RingModes, state: State, *, gate: float, doubt: float
+) -> tuple[Bool[np.ndarray, "scans echoes"], Int[np.ndarray, "scans echoes"], kernels.Reflection]:
+    """Which echoes are within the gate of a reflector, with no second one near, and where they come from."""
+    around = state.around
+    found = kernels.associate(
+        kernels.moved_sensors(ring.sensors, jnp.asarray(ring_change(modes, state))),
+        _arrays(around.scene),
+        _arrays(around.candidates),
+        jnp.asarray(state.poses),
+        jnp.asarray(data.world),
+        jnp.asarray(data.path),
+        jnp.asarray(data.reported),
+    )
+    candidate, residual, rival = (np.asarray(column) for column in (found.candidate, found.residual, found.rival))
+    used = (candidate >= 0) & (np.abs(residual) < gate) & (rival > doubt) & np.isfinite(data.reported)
+    candidate = np.where(candidate >= 0, candidate, 0)
+    kind, first, second = (
+        np.asarray(leaf)[candidate]
+        for leaf in (
+            around.candidates.reflection.kind,
+            around.candidates.reflection.first,
+            around.candidates.reflection.second,
+        )
+    )
+    # A reflector that hardly anything comes from fits anything.
+    count = np.bincount(first[used], minlength=len(around.world))
+    used &= (count[first] >= LEAST_ECHOES) | (kind == kernels.SECOND)
+    return used, candidate, kernels.Reflection(kind.astype(np.int32), first.astype(np.int32), second.astype(np.int32))
+
+
+def _adjusted(
+    ring: Ring,
+    data: Data,
+    modes: RingModes,
+    state: State,
+    reflection: kernels.Reflection,
+    weight: Float[np.ndarray, "scans echoes"],
+    poses_free: bool,
+) -> tuple[State, kernels.Problem, kernels.Adjusted]:
+    problem = problem_of(ring, data, modes, state, reflection, weight)
+    found = kernels.adjust(problem, _unknowns(state), poses_free=poses_free)
+    now = found.unknowns
+    scene = eqx.tree_at(lambda s: s.parameters, state.around.scene, np.asarray(now.scene))
+    moved = State(np.asarray(now.modes), np.asarray(now.poses), state.around._replace(scene=scene))
+    return moved, problem, found
+
+
+def _of_better_kind(found: Settled) -> State:
+    """Corners that fit better as edges, and edges that fit better as corners, become these."""
+    state, problem, used, residual = found.state, found.problem, found.used, found.residual
+    around = state.around
+    kind = np.asarray(around.scene.kind)
+    of_point = kind > kernels.PLANE
+    flipped = np.where(of_point, kernels.CORNER + kernels.EDGE - kind, kind).astype(np.int32)
+    reflection = problem.heard.reflection
+    first = np.asarray(reflection.first)
+    single = np.asarray(reflection.kind) != kernels.SECOND
+    other = eqx.tree_at(
+        lambda p: (p.scene.kind, p.heard.reflection.kind, p.modes, p.sensors),
+        problem,
+        (
+            jnp.asarray(flipped),
+            jnp.asarray(np.where(single, flipped[first], np.asarray(reflection.kind)).astype(np.int32)),
+            jnp.zeros_like(problem.modes),
+            kernels.moved_sensors(problem.sensors, problem.modes @ jnp.asarray(state.coordinates)),
+        ),
+    )
+    fitted = kernels.adjust(other, _unknowns(state), poses_free=False).unknowns
+    then = np.where(used, np.asarray(kernels.residuals(other, fitted)), 0)
+    mine = used & single
+    sums = [np.bincount(first[mine], weights=left[mine] ** 2, minlength=len(kind)) for left in (residual, then)]
+    better = of_point & (sums[1] < _OTHER_KIND * sums[0])
+    if not better.any():
+        return state
+    now = np.where(better, flipped, kind).astype(np.int32)
+    places = np.where(better[:, None], np.asarray(fitted.scene), np.asarray(around.scene.parameters))
+    scene = eqx.tree_at(lambda s: (s.kind, s.parameters), around.scene, (now, places))
+    of_candidate = np.asarray(around.candidates.reflection.kind)
+    alone = np.isin(of_candidate, (kernels.CORNER, kernels.EDGE))
+    of_candidate = np.where(alone, now[np.asarray(around.candidates.reflection.first)], of_candidate).astype(np.int32)
+    candidates = eqx.tree_at(lambda c: c.reflection.kind, around.candidates, of_candidate)
+    return state._replace(around=around._replace(scene=scene, candidates=candidates))
+
+
+def _residual(
+    ring: Ring, data: Data, modes: RingModes, state: State, reflection: kernels.Reflection
+) -> Float[np.ndarray, "scans echoes"]:
+    problem = problem_of(ring, data, modes, state, reflection, np.zeros_like(data.reported))
+    return np.asarray(kernels.residuals(problem, _unknowns(state)))
+
+
+def _unknowns(state: State) -> kernels.Unknowns:
+    return kernels.Unknowns(
+        jnp.asarray(state.coordinates), jnp.asarray(state.poses), jnp.asarray(state.around.scene.parameters)
+    )
+
+
+def _arrays(tree):
+    return jax.tree.map(jnp.asarray, tree)
