@@ -30,7 +30,7 @@ _WIDE, _WIDE_PLACED = 0.04, 0.08  # m; scale of the first association: poses giv
 _AGAIN = 0.01  # m; scale of the first one after the map was made anew
 _MAPS = 5  # made anew at most, as long as each explains more echoes
 _GROWN = 1.005  # by so much
-_PLACINGS = 3  # likewise
+_BLURS = (1.0, 0.2, 0.5)  # of successive placings, until all scans are placed: the ring is known better and better
 _MARGIN = 0.5  # nats; a wrong place does little harm here, a scan that is left out tells nothing
 _LEAST_SECOND = 10  # wall to wall echoes
 _MISFIT = 1.5  # sigma; of wall to wall echoes where walls do meet as the map says
@@ -82,11 +82,12 @@ class Plan:
             logs: as they came.
         """
         best = None
-        for _ in range(_PLACINGS if self.estimate and self.window is None else 1):
-            fit = self._fitted(near, *self._placed(near, logs))
-            if best is not None and fit.used <= best.used:
+        for blur in _BLURS if self.estimate and self.window is None else _BLURS[:1]:
+            fit = self._fitted(near, *self._placed(near, logs, blur))
+            if best is None or fit.used > best.used:
+                best, near = fit, moved_ring(self.ring, self.modes, fit.settled.state)
+            if len(best.logs) == len(logs) and best.data.scans == sum(len(log) for log in logs):
                 break
-            best, near = fit, moved_ring(self.ring, self.modes, fit.settled.state)
         assert best is not None
         return best
 
@@ -123,7 +124,9 @@ class Plan:
         with jax.enable_x64(True):
             return settle(self.ring, data, modes, state, widest=widest, poses_free=self.estimate, sigma=self.sigma)
 
-    def _placed(self, ring: Ring, logs: Sequence[Log]) -> tuple[list[Log], list[Float[np.ndarray, "scans 3"]]]:
+    def _placed(
+        self, ring: Ring, logs: Sequence[Log], blur: float
+    ) -> tuple[list[Log], list[Float[np.ndarray, "scans 3"]]]:
         """Logs with poses from their local models, and their odometry; as they came where poses are given.
 
         What cannot be laid together becomes several logs, each with a world of its own. Where single scans are sparse,
@@ -136,7 +139,7 @@ class Plan:
             for log in logs:
                 odometry = log.pose if np.isfinite(log.pose).any() else None
                 models = list(local_models(ring, log))
-                parts = place_parts(models, odometry, slip=self.odometry, margin=_MARGIN)
+                parts = place_parts(models, odometry, slip=self.odometry, margin=_MARGIN, blur=blur)
                 enough = [part for part in parts if np.isfinite(part[:, 0]).sum() >= LEAST_SCANS]
                 placed += [replace(log, pose=part) for part in enough]
                 measured += [log.pose] * len(enough)

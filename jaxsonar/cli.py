@@ -171,6 +171,54 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--seed", type=_number(int, 0, 2**32 - 1), default=0, help="of the noise (default: 0)")
     simulate.add_argument("--max-echoes", type=_number(int, 1, 64), default=3, metavar="N", help="a path (default: 3)")
 
+    calibrate = command("calibrate", "Find out how a ring really is, from ordinary scans of a room nobody measured.")
+    calibrate.add_argument(
+        "logs", nargs="+", type=_file, metavar="LOG", help="scan logs of this ring, .csv or .parquet"
+    )
+    calibrate.add_argument("--ring", type=_file, required=True, help=f"the ring as it should be: {RING_HELP}")
+    calibrate.add_argument(
+        "-o", "--output", type=_file, metavar="RING2", required=True, help="the calibrated ring, TOML; - = stdout"
+    )
+    calibrate.add_argument(
+        "--poses",
+        choices=("trust", "estimate"),
+        default="trust",
+        help="of the logs: right (default), or odometry if anything, and to be estimated",
+    )
+    calibrate.add_argument(
+        "--free",
+        type=lambda text: tuple(name.strip() for name in text.split(",")),
+        default=("offset", "speed"),
+        metavar="LIST",
+        help="what is estimated: offset, speed, position, radius, heading, with commas (default: offset,speed)",
+    )
+    calibrate.add_argument(
+        "--odometry",
+        type=_finite(1e-4, 1),
+        default=0.02,
+        metavar="SHARE",
+        help="of the way that odometry is wrong by (default: 0.02)",
+    )
+    calibrate.add_argument(
+        "--temperature", type=_finite(-60, 85), metavar="DEG_C", help="of the air, if it was measured"
+    )
+    calibrate.add_argument(
+        "--sigma", type=_finite(1e-4, 1), metavar="METRES", help="noise of the ranges (default: estimated)"
+    )
+    calibrate.add_argument(
+        "--window", type=_finite(0.01, 100), metavar="METRES", help="gather so much path, for rings of few sensors"
+    )
+    calibrate.add_argument("--figure", type=_figure, metavar="FIG", help="report on a page, .svg, .png or .pdf")
+
+    check = command("check", "The health of a ring, sensor by sensor, from what it heard.")
+    check.add_argument("log", type=_file, metavar="LOG", help="scan log, .csv or .parquet; poses are not needed")
+    check.add_argument("--ring", type=_file, required=True, help=RING_HELP)
+    check.add_argument(
+        "--sigma", type=_finite(1e-4, 1), metavar="METRES", help="noise of the ranges (default: estimated)"
+    )
+    check.add_argument("--json", type=_file, metavar="FILE", help="the same as JSON; - = stdout instead of the table")
+    check.add_argument("--figure", type=_figure, metavar="FIG", help="draw it on a page, .svg, .png or .pdf")
+
     convert = command("convert", "Scan logs between CSV and Parquet, and recordings of devices into scan logs.")
     convert.add_argument("source", metavar="IN", help="log or recording")
     convert.add_argument("destination", metavar="OUT", help="scan log, .csv or .parquet")

@@ -293,6 +293,81 @@ def simulate(options: argparse.Namespace) -> None:
     _say(f"{len(log)} scans, {len(log.range)} echoes")
 
 
+def calibrate(options: argparse.Namespace) -> None:
+    """``jaxsonar calibrate``."""
+    from .calibration import calibrate as calibrate_ring
+    from .calibrationfile import save_calibration
+    from .files import check_outputs
+    from .hardware.errors import SonarError
+    from .logs import load_log
+    from .ringfile import load_ring
+
+    check_outputs({"-o": options.output, "--figure": options.figure}, [*options.logs, options.ring])
+    ring, logs = load_ring(options.ring), [load_log(path) for path in options.logs]
+    choices = {key: getattr(options, key) for key in ("free", "poses", "odometry", "temperature", "sigma", "window")}
+    try:
+        with _steps() as step:
+            found = calibrate_ring(ring, logs, **choices, on_step=step)
+    except SonarError as error:
+        raise SonarError(f"{', '.join(_plain(path) for path in options.logs)}: {error}") from None
+    figure = None
+    if options.figure:
+        from . import figures_calibration
+
+        figure = figures_calibration.calibration_figure(found)
+    save_calibration(found, options.output)
+    if figure is not None:
+        from . import figures
+
+        figures.save(figure, options.figure)
+    for line in found.summary():
+        _say(line)
+
+
+def check(options: argparse.Namespace) -> None:
+    """``jaxsonar check``."""
+    import json
+
+    from .files import check_outputs, open_output, shown
+    from .hardware.errors import SonarError
+    from .health import check as check_ring
+    from .logs import load_log
+    from .ringfile import load_ring
+    from .tables_health import health_table
+
+    check_outputs({"--json": options.json, "--figure": options.figure}, [options.log, options.ring])
+    ring, log = load_ring(options.ring), load_log(options.log)
+    try:
+        with _bar("scans", None) as show:
+            health = check_ring(
+                ring,
+                log,
+                sigma=options.sigma,
+                progress=lambda done, _: show(done),
+                on_left_out=partial(_say_left_out, ring.name),
+            )
+    except SonarError as error:
+        raise SonarError(f"{shown(options.log)}: {error}") from None
+    figure = None
+    if options.figure:
+        from . import figures_health
+
+        figure = figures_health.health_figure(health)
+    if options.json:
+        with open_output(options.json) as file:
+            json.dump(health.as_json(), file, allow_nan=False, indent=1)
+            file.write("\n")
+    if figure is not None:
+        from . import figures
+
+        figures.save(figure, options.figure)
+    if options.json != "-":
+        Console(width=None if sys.stdout.isatty() else 140).print(health_table(health))
+    for finding in health.findings:
+        _say(finding)
+    _say(f"{len(log)} scans, {_count(len(health.findings), 'finding')}" if health.source else health.empty)
+
+
 def convert(options: argparse.Namespace) -> None:
     """``jaxsonar convert``."""
     from .convert import convert as convert_log
@@ -380,6 +455,17 @@ def _say(text: str) -> None:
 
 def _say_left_out(ring: str, count: int) -> None:
     _say(f"left out {count} echoes of pairs of sensors that {ring!r} does not listen to")
+
+
+@contextmanager
+def _steps() -> Iterator[Callable[[str], None]]:
+    """What is being done, on standard error: a line that changes on a terminal, otherwise nothing."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda text: None
+        return
+    with console.status("") as status:
+        yield lambda text: status.update(text)
 
 
 @contextmanager

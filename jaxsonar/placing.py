@@ -35,13 +35,14 @@ def place(
     *,
     slip: float = ODOMETRY,
     margin: float = MARGIN,
+    blur: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Float[np.ndarray, "scans 3"]:
     """Poses of the scans of an unmeasured room, good to centimetres and degrees: a start for an adjustment.
 
     The first of ``place_parts``, whose arguments these are; all NaN where there is none.
     """
-    parts = place_parts(models, odometry, slip=slip, margin=margin, progress=progress)
+    parts = place_parts(models, odometry, slip=slip, margin=margin, blur=blur, progress=progress)
     return parts[0] if parts else np.full((len(models), 3), np.nan)
 
 
@@ -51,6 +52,7 @@ def place_parts(
     *,
     slip: float = ODOMETRY,
     margin: float = MARGIN,
+    blur: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Float[np.ndarray, "scans 3"]]:
     """Poses of the scans of an unmeasured room, in parts that could not be laid on one another.
@@ -63,6 +65,7 @@ def place_parts(
         odometry: (scans, 3) world_from_robot (x, y, theta), metres and radians, drifting; NaN where there is none.
         slip: standard deviation of odometry as a share of the way and of the turn.
         margin: nats by which a place must be likelier than all others; with less, more scans are placed, also wrongly.
+        blur: 1 for a ring that may be centimetres off, less for one that is known better.
         progress: called with (scans looked at, scans) now and then.
 
     Returns:
@@ -78,7 +81,7 @@ def place_parts(
     if given.shape != (count, 3):
         raise SonarError(f"place: odometry of shape {given.shape}; allowed is ({count}, 3): x, y, theta for every scan")
     given[~np.isfinite(given).all(axis=1)] = np.nan
-    tracker = _Tracker([seen_of(model) for model in models], Motion(given, slip), margin)
+    tracker = _Tracker([seen_of(model, blur=blur) for model in models], Motion(given, slip), margin)
     # Scan after scan; where the way is lost, a map of its own begins.
     parts = tracker.parts(progress)
     # Maps that fit together become one; then what was left out is looked at again, before and behind being known.

@@ -48,15 +48,15 @@ class Seen(NamedTuple):
         return float(np.linalg.norm(ends, axis=1).max(initial=0.0))
 
 
-def seen_of(model: LocalModel) -> Seen:
-    """A local model as arrays, its covariances widened for a ring that is not calibrated."""
+def seen_of(model: LocalModel, *, blur: float = 1.0) -> Seen:
+    """A local model as arrays, its covariances widened for a ring that is not calibrated: less with a smaller blur."""
     theta = np.array([line.theta for line in model.lines], dtype=np.float64)
     segment = np.array([line.segment for line in model.lines], dtype=np.float64).reshape(-1, 2, 2)
     cov = np.array([np.zeros((2, 2)) if line.cov is None else line.cov for line in model.lines], dtype=np.float64)
     cov = cov.reshape(-1, 2, 2)
     along = (segment.mean(axis=1) * tangent_of(theta)).sum(-1)
     across = cov[:, 0, 0] - 2 * along * cov[:, 0, 1] + along**2 * cov[:, 1, 1]
-    sigma = np.sqrt(np.stack([np.maximum(across, 0.0), cov[:, 1, 1]], axis=-1) + np.square(LINE_FLOOR))
+    sigma = np.sqrt(np.stack([np.maximum(across, 0.0), cov[:, 1, 1]], axis=-1) + np.square(blur * np.array(LINE_FLOOR)))
     points = [one for one in model.points if not _where_two_meet(np.array([one.x, one.y]), model)]
     noise = np.array([np.trace(one.cov) / 2 for one in points], dtype=np.float64)
     reflectors = [(line.rho, line.theta) for line in model.lines]
@@ -69,7 +69,7 @@ def seen_of(model: LocalModel) -> Seen:
         trust=np.clip(np.array([line.echoes for line in model.lines], dtype=np.float64) / ENOUGH, 0.3, 1.0),
         point=np.array([(one.x, one.y) for one in points], dtype=np.float64).reshape(-1, 2),
         kind=np.array([one.kind == "corner" for one in points], dtype=bool),
-        spread=np.sqrt(noise + POINT_FLOOR**2),
+        spread=np.sqrt(noise + (blur * POINT_FLOOR) ** 2),
         heard=np.array(reflectors, dtype=np.float64).reshape(-1, 2),
     )
 
