@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
 from .beams import beam_centres
@@ -65,6 +66,11 @@ class Calibration:
     """The map of every world with the calibrated ring."""
     maps_before: tuple[GlobalMap, ...]
     """The same with the nominal ring."""
+    problem: kernels.Problem
+    """The least squares that the result solves, in double precision: echoes, reflectors, priors. With ``unknowns`` it
+    is what ``kernels.residuals`` and ``kernels.cost`` take, for a loss of one's own on top."""
+    unknowns: kernels.Unknowns
+    """Its solution."""
 
     @property
     def range_offset_sd(self) -> Float[np.ndarray, " sensors"]:
@@ -244,6 +250,8 @@ def calibrate(
         poses=tuple(one.pose for one in final),
         maps=tuple(build_map(now, one, window=window) for one in final),
         maps_before=tuple(build_map(ring, one, window=window) for one in fit.logs),
+        problem=found.problem,
+        unknowns=found.adjusted.unknowns,
     )
 
 
