@@ -70,7 +70,7 @@ def room_messages(
     """
     group_of = _group_of(ring)
     time = _group_times(ring, stamps)
-    scans, groups = time.shape
+    groups = time.shape[1]
     pose = _group_poses(poses, time)
     heard = simulate(ring, room, pose.reshape(-1, 3), stamps=time.reshape(-1), **settings)
     tx, rx = ring.paths[heard.path].T
