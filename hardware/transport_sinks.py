@@ -17,7 +17,7 @@ from types import TracebackType
 
 from .errors import SonarError
 from .transport_sources import GOODBYE
-from .transports import Url, parse_url
+from .transports import Url, parse_url, reason
 
 LOOK = 0.05
 """Seconds between two looks at what cannot be waited for."""
@@ -317,10 +317,9 @@ def listen(url: str) -> Sink:
     try:
         return sinks[parsed.scheme](parsed)
     except (OSError, UnicodeError) as failure:
-        reason = (getattr(failure, "strerror", None) or str(failure)).splitlines()[0]
         taken = " (does a program that waits for datagrams have it?)" if parsed.scheme == "udp" else ""
         taken = taken if getattr(failure, "errno", None) == errno.EADDRINUSE else ""
-        raise SonarError(f"{parsed.text}: {reason}{taken}; needed is a free address of this machine") from None
+        raise SonarError(f"{parsed.text}: {reason(failure)}{taken}; needed is a free address of this machine") from None
 
 
 def _address(url: Url, host: str, bound: socket.socket) -> str:

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any
 
 from .errors import SonarError
-from .transports import EndOfStream, Event, OnEvent, Source, Url
+from .transports import EndOfStream, Event, OnEvent, Source, Url, reason
 
 FIRST_WAIT, LONGEST_WAIT = 0.1, 5.0
 """Seconds before the first attempt to make a link again, and before the latest ones."""
@@ -48,7 +48,7 @@ class Link(Source):
             self._open()
         except (OSError, UnicodeError) as failure:  # the latter from a host that no name can be
             self._shut()
-            raise SonarError(f"{self.url}: {_reason(failure)}; needed is a device that can be opened there") from None
+            raise SonarError(f"{self.url}: {reason(failure)}; needed is a device that can be opened there") from None
         self._connected = True
         self._heard_at = time.monotonic()
         self._told_silence = False
@@ -140,7 +140,7 @@ class Link(Source):
         self._connected = False
         self._shut()
         if not self._reconnect:
-            self._over = f"{self.url}: {_reason(failure)}"
+            self._over = f"{self.url}: {reason(failure)}"
             return
         self._after_gap = True
         now = time.monotonic()
@@ -148,7 +148,7 @@ class Link(Source):
         self._wait = min(2 * self._wait, LONGEST_WAIT)
         if self._broken_since is None:
             self._broken_since = now
-            self._tell(Event("lost", f"{self.url}: {_reason(failure)}; trying again"))
+            self._tell(Event("lost", f"{self.url}: {reason(failure)}; trying again"))
 
     def _opened_again(self, deadline: float) -> bool:
         time.sleep(max(0.0, min(self._attempt_at, deadline) - time.monotonic()))
@@ -251,7 +251,7 @@ class UdpLink(Link):
             for _ in range(64):
                 datagrams.append(self._socket.recv(AT_ONCE))
         # A datagram that was cut off must not become one frame with the next.
-        return b"\0".join([*datagrams, b""]) or None
+        return b"".join(data if data.endswith(b"\0") else data + b"\0" for data in datagrams if data) or None
 
 
 class TerminalLink(Link):
@@ -342,7 +342,7 @@ def open_serial(url: Url, *, on_event: OnEvent, reconnect: bool, silence: float)
     """
     url.check_options("baud")
     _check_path(url)
-    baud = url.number("baud", 921600, 50, 20_000_000)
+    baud = url.number("baud", 921600.0, 50.0, 2e7)
     if baud != int(baud):
         raise url.fail(f"baud {baud:g} came", "a whole number")
     _serialx(url.text)
@@ -361,8 +361,3 @@ def _serialx(url: str) -> Any:
     except ImportError:
         raise SonarError(f"{url}: serial ports need the extra live: pip install 'jaxsonar[live]'") from None
     return serialx
-
-
-def _reason(failure: Exception) -> str:
-    text = getattr(failure, "strerror", None) or str(failure) or type(failure).__name__
-    return text.splitlines()[0]

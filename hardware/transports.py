@@ -219,6 +219,12 @@ def shown(text: object) -> str:
     return line if len(line) <= 120 else f"{line[:120]}..."
 
 
+def reason(failure: Exception) -> str:
+    """What went wrong, in the words of the operating system or of a library, on one line."""
+    text = getattr(failure, "strerror", None) or str(failure) or type(failure).__name__
+    return shown(text.partition(" (while")[0].splitlines()[0])  # socket adds the address, which is in the URL
+
+
 def _host_and_port(text: str, place: str) -> tuple[str, int | None]:
     host, colon, port = place.rpartition(":")
     if not colon or place.endswith("]"):  # the colons of [::1] are its own

@@ -334,7 +334,8 @@ def test_the_end_is_said_and_taken_back():
 
 def test_the_echoes_of_a_message_stay_as_they_were():
     decoder = Decoder()
-    first = decoder.feed(encode(group()))[0]
+    (first,) = decoder.feed(encode(group()))
+    assert isinstance(first, Group)
     decoder.feed(encode(group(echoes=group().echoes[::-1].copy())) * 10)
     assert content(first) == content(group())
     with pytest.raises(ValueError, match="read-only"):
