@@ -152,10 +152,10 @@ class Url:
 Opener = Callable[..., Source]
 
 _BUILT_IN: dict[str, str] = {
-    "serial": "transport_sources:open_serial",
+    "serial": "transport_terminals:open_serial",
     "tcp": "transport_sources:open_tcp",
     "udp": "transport_sources:open_udp",
-    "pty": "transport_sources:open_pty",
+    "pty": "transport_terminals:open_pty",
     "file": "recording:open_file",
 }
 """Scheme: module of this package and opener, imported once it is needed."""
