@@ -59,6 +59,7 @@ def explained(
     settings: kernels.HoughSettings,
     sigma: float | None,
     expected: kernels.Expectations | None = None,
+    arcs: kernels.RingArcs | None = None,
 ) -> Iterator[Explained]:
     """The reflectors of every scan, step by step over a batch.
 
@@ -68,9 +69,10 @@ def explained(
         settings: of the Hough step that gives the candidates.
         sigma: noise of the ranges, metres; estimated for each scan if None.
         expected: what is expected of rooms; the default if left out.
+        arcs: of the ring's paths, where they are not those of a ring at rest.
     """
     expected = kernels.Expectations() if expected is None else expected
-    arcs = arcs_of(ring, settings)
+    arcs = arcs_of(ring, settings) if arcs is None else arcs
     noise = jnp.asarray(np.nan if sigma is None else sigma, jnp.float32)
     for step in echoes.steps(settings.cells, dear=True):
         found = kernels.explain(arcs, step.packed, noise, settings=settings, expected=expected)
