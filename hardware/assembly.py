@@ -4,6 +4,7 @@ A scan is handed on when all its groups are there, when the scan after it is, wh
 comes, or when nothing has come for a while. What comes later than that is counted and dropped.
 """
 
+from bisect import bisect_left, insort
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -118,7 +119,7 @@ class Assembler:
         self._open: dict[int, _Open] = {}
         self._closed: deque[int] = deque(maxlen=_CLOSED)
         self._seen: dict[int, tuple[int, int | None]] = {}  # sequence -> device time, and count of groups up to it
-        self._poses: deque[tuple[int, Pose]] = deque(maxlen=_REMEMBERED)
+        self._poses: list[tuple[int, Pose]] = []  # by sequence
         self._first = self._newest = -1
         self._distinct = 0
         self._newest_time = 0
@@ -205,7 +206,8 @@ class Assembler:
         if len(self._seen) > _REMEMBERED:
             del self._seen[next(iter(self._seen))]
         if isinstance(message, Pose):
-            self._poses.append((sequence, message))
+            insort(self._poses, (sequence, message), key=_sequence)
+            del self._poses[:-_REMEMBERED]
             return self._due()
         return self._put(sequence, message, received)
 
@@ -288,10 +290,10 @@ class Assembler:
 
     def _pose_before(self, sequence: int) -> tuple[float, float, float]:
         """The latest pose sent before a message; NaN where a later one may have been lost."""
-        before = [(number, pose) for number, pose in self._poses if number < sequence]
+        before = bisect_left(self._poses, sequence, key=_sequence)
         if not before:
             return (np.nan, np.nan, np.nan)
-        number, pose = max(before, key=lambda entry: entry[0])
+        number, pose = self._poses[before - 1]
         if not self.skipped and self._pose_lost(number, sequence):
             return (np.nan, np.nan, np.nan)
         return (pose.x, pose.y, pose.theta)
@@ -310,6 +312,10 @@ class Assembler:
             return True
         groups = own - rank - 1 - sum(between is not None for between in known)
         return messages > groups
+
+
+def _sequence(entry: tuple[int, Pose]) -> int:
+    return entry[0]
 
 
 def _follows(earlier: Message, later: Message) -> bool:

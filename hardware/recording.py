@@ -1,10 +1,8 @@
 """What a device said, on disk while it says it: scan logs here, raw messages in ``recording_mcap``.
 
-A scan is on its way to the disk as soon as it is whole, so that a process that is killed loses what it was writing just
-then. A file that is being written, or was when its process was killed, has an empty file beside it, named like it with
-``.recording`` behind (``mark_of``): readers then leave out a last scan that was cut off. Parquet cannot be written bit
-by bit (its footer comes last, and without it nothing can be read), so its journal is such a ``.recording`` file, a CSV
-log, that becomes Parquet at the end.
+A scan is handed to the operating system as soon as it is whole, so that a process that is killed loses what it was
+writing just then. While a log is being written there is a small file beside it, named like it with ``.recording``
+behind (``mark_of``), that says how many of its bytes are whole scans. If it is still there, readers go by it.
 """
 
 import os
@@ -73,27 +71,29 @@ def mark_of(path: str | os.PathLike[str]) -> Path:
 class CsvRecorder(Recorder):
     """A scan log as CSV, scan by scan: each is handed to the operating system in one piece, when it is whole."""
 
-    def __init__(self, path: str | os.PathLike[str], *, mark: Path | None = None):
+    def __init__(self, path: str | os.PathLike[str], *, mark: Path):
         """Begin a log.
 
         Args:
             path: the file, replaced at once.
-            mark: an empty file to keep beside it until ``close``.
+            mark: kept beside it until ``close``: how many bytes are whole scans.
 
         Raises:
             SonarError: it cannot be written.
         """
         self._path, self._mark = path, mark
-        self._file: int | None = None
+        self._size = 0
+        self._files: list[int] = []
         try:
-            if mark is not None:
-                mark.touch()
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+            for name in (mark, path):  # the mark first: a log without one is whole
+                self._files.append(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666))
             self._write(HEADER.encode())
         except OSError as failure:
-            raise SonarError(
-                f"{shown(path)}: cannot write: {failure.strerror}; allowed is a file you may write"
-            ) from None
+            for file in self._files:
+                os.close(file)
+            mark.unlink(missing_ok=True)
+            allowed = "a file that you may write"
+            raise SonarError(f"{shown(path)}: cannot write: {failure.strerror}; allowed is {allowed}") from None
 
     def scan(self, scan: RawScan) -> None:
         """See ``Recorder``."""
@@ -104,17 +104,19 @@ class CsvRecorder(Recorder):
 
     def close(self) -> None:
         """See ``Recorder``."""
-        if self._file is not None:
-            os.close(self._file)
-            self._file = None
-            if self._mark is not None:
-                self._mark.unlink(missing_ok=True)
+        if self._files:
+            for file in self._files:
+                os.close(file)
+            self._files = []
+            self._mark.unlink(missing_ok=True)
 
     def _write(self, data: bytes) -> None:
-        assert self._file is not None
+        mark, log = self._files
         rest = memoryview(data)
         while rest:
-            rest = rest[os.write(self._file, rest) :]
+            rest = rest[os.write(log, rest) :]
+        self._size += len(data)
+        os.pwrite(mark, f"{self._size:20d}\n".encode(), 0)
 
 
 def scan_rows(scan: RawScan) -> str:

@@ -181,12 +181,15 @@ def _messages(
     numbers, poses = log.scan.tolist(), pose.tolist()
 
     def one_by_one() -> Iterator[Message]:
-        sequence = 0
+        sequence, placed = 0, False
         for i in range(scans):
             for k in range(groups):
-                if k < len(poses[i]) and poses[i][k][0] == poses[i][k][0]:  # not NaN
-                    yield Pose(sequence % 2**32, time_us[i][k], *poses[i][k])
-                    sequence += 1
+                if k < len(poses[i]):
+                    known = poses[i][k][0] == poses[i][k][0]  # not NaN
+                    if known:
+                        yield Pose(sequence % 2**32, time_us[i][k], *poses[i][k])
+                    placed |= known
+                    sequence += placed  # an unknown pose counts as lost, so that no earlier one holds
                 part = echoes[start[i * groups + k] : start[i * groups + k + 1]]
                 yield Group(sequence % 2**32, time_us[i][k], numbers[i], k, groups, temperature, part)
                 sequence += 1
