@@ -56,6 +56,7 @@ class Reader:
         self._left = scans
         self._patient = patient
         self._began: tuple[float, float] | None = None
+        self._waited = 0.0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="jaxsonar reader", daemon=True)
 
@@ -139,9 +140,11 @@ class Reader:
             if self._recorder is not None:
                 self._recorder.scan(scan)
             wait = self._patient or (self._patient is None and self._played_back(scan))
+            before = time.monotonic()
             self._queue.put(scan, wait=self._stop if wait else None)
+            self._waited += time.monotonic() - before
 
     def _played_back(self, scan: RawScan) -> bool:
-        """Whether the device's clock runs far ahead of the host's."""
+        """Whether the device's clock runs far ahead of the host's, apart from the time that it was made to wait."""
         first_stamp, first_received = self._began = self._began or (scan.stamp, scan.received)
-        return scan.stamp - first_stamp > AHEAD * (scan.received - first_received) + 1.0
+        return scan.stamp - first_stamp > AHEAD * (scan.received - first_received - self._waited) + 1.0

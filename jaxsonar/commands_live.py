@@ -1,6 +1,7 @@
 """The commands ``stream`` and ``emulate``: what they can be told, and what they do."""
 
 import argparse
+import os
 import signal
 import sys
 import threading
@@ -47,6 +48,7 @@ def stream(options: argparse.Namespace) -> None:
         from .view import View
 
         view = View(ring, file=options.rrd, say=_say)
+    _use_compilation_cache()
     show = _StatusLine()
     with _stopped_by_signals() as stop:
         status = stream_scans(
@@ -232,3 +234,22 @@ def add_commands(
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
+
+
+def _use_compilation_cache() -> None:
+    """Keep compiled programs between runs, in a folder that only this user may write to, unless JAX was told where."""
+    import jax
+
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(home) / "jaxsonar" / "compiled"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        seen = folder.stat()
+        if seen.st_uid != os.getuid() or seen.st_mode & 0o022:
+            return  # what lies there is run: it must be nobody else's
+    except (OSError, RuntimeError):
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -216,7 +215,6 @@ class _Run:
 
     def until_end(self, stop: threading.Event, on_status: Callable[[Status], None] | None) -> None:
         """Compile while the first scans come, then take scan after scan."""
-        use_compilation_cache()
         with ThreadPoolExecutor(1, "jaxsonar warm-up") as pool:
             warming = pool.submit(self._live.warm_up)
             while not wait([warming], _LOOK).done:
@@ -294,22 +292,3 @@ class _Run:
         if self._timed:
             known = self._latency[: self._timed]
             status.p50, status.p99 = np.percentile(known, [50, 99]).tolist()
-
-
-def use_compilation_cache() -> None:
-    """Keep compiled programs between runs, in a folder that only this user may write to, unless JAX was told where."""
-    import jax
-
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
-        return
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "jaxsonar" / "compiled"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        seen = folder.stat()
-        if seen.st_uid != os.getuid() or seen.st_mode & 0o022:
-            return  # what lies there is run: it must be nobody else's
-    except (OSError, RuntimeError):
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -313,6 +313,25 @@ def test_a_patient_reader_drops_nothing_and_ends_after_so_many_scans():
     assert queue.dropped == 0
 
 
+@pytest.mark.parametrize("played_back", [True, False])
+def test_a_device_that_runs_ahead_of_its_clock_is_waited_for_and_a_live_one_is_not(played_back):
+    """Also once it has been made to wait for longer than its own clock is ahead."""
+    scans = 120
+    sent = list(messages(scans, groups=1))
+    for message in sent:  # a scan is 0.1 s, or as long as it takes to come
+        object.__setattr__(message, "time_us", message.time_us * (9 if played_back else 0) + message.sequence * 100)
+    queue: NewestQueue[RawScan] = NewestQueue(16)
+    reader = Reader(Given(map(encode, sent), pause=0.0002), queue, patient=None)
+    reader.start()
+    time.sleep(2.0)
+    taken = []
+    while not queue.ended:
+        taken += queue.get(0.2, most=1)
+        time.sleep(0.002)
+    assert (queue.dropped == 0) == played_back
+    assert len(taken) == scans - queue.dropped
+
+
 WRITER = """
 import sys, time
 sys.path.insert(0, {tests!r})

@@ -263,14 +263,14 @@ def moving_scans(sigma, count=12):
 
 
 def wall_errors(models, poses):
-    """Of each line found, how far it and its direction are from the nearest wall, metres and radians; and its cov."""
+    """How far each line and its direction are from the wall it is of, robot frame; and their covariances."""
     errors, covs = [], []
     for model, pose in zip(models, poses, strict=True):
         for line in model.lines:
-            theta = line.theta + pose[2]
-            rho = line.rho + pose[:2] @ [np.cos(theta), np.sin(theta)]
-            truth = [(1.4, -np.pi / 2), (2.0, 0.0), (1.3, np.pi / 2)]
-            misses = [(rho - r, (theta - t + np.pi) % (2 * np.pi) - np.pi) for r, t in truth]
+            misses = []
+            for rho, theta in ((1.4, -np.pi / 2), (2.0, 0.0), (1.3, np.pi / 2)):
+                there = rho - pose[:2] @ [np.cos(theta), np.sin(theta)], theta - pose[2]
+                misses.append((line.rho - there[0], (line.theta - there[1] + np.pi) % (2 * np.pi) - np.pi))
             errors.append(min(misses, key=lambda miss: abs(miss[1])))
             covs.append(line.cov)
     return np.array(errors), covs
@@ -349,17 +349,23 @@ def test_a_measured_temperature_changes_the_speed_and_not_the_range(temperature)
 
 # The commands
 
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
 COMMAND = [sys.executable, "-c", "import sys; from jaxsonar.cli import main; sys.exit(main())"]
 
 
-def command(*arguments, **choices):
+@pytest.fixture(scope="module")
+def command(tmp_path_factory):
+    """Starts the command line; compiled programs are kept between the processes of this file, and in no other place."""
+    own = {"PYTHONPATH": str(Path(__file__).parents[1]), "XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen([*COMMAND, *map(str, arguments)], env=ENVIRONMENT, **pipes, **choices)
+
+    def start(*arguments):
+        return subprocess.Popen([*COMMAND, *map(str, arguments)], env=os.environ | own, **pipes)
+
+    return start
 
 
 @pytest.fixture
-def device(log_file):
+def device(log_file, command):
     """A process that emulates the office; gives its URL."""
     running = []
 
@@ -377,7 +383,7 @@ def device(log_file):
         process.communicate(timeout=20)
 
 
-def test_emulate_and_stream_are_the_map_command(device, log_file, tmp_path):
+def test_emulate_and_stream_are_the_map_command(device, command, log_file, tmp_path):
     """Processes and a real link from end to end; the first line of the device is where it listens."""
     map_path, record = tmp_path / "map.geojson", tmp_path / "rec.parquet"
     url = device("tcp://127.0.0.1:0", "--speed", "0")
@@ -393,7 +399,7 @@ def test_emulate_and_stream_are_the_map_command(device, log_file, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_with_everything_written(number, device, tmp_path):
+def test_a_signal_ends_it_with_everything_written(number, device, command, tmp_path):
     record, map_path = tmp_path / "rec.csv", tmp_path / "map.geojson"
     url = device("tcp://127.0.0.1:0", "--speed", "8")  # four scans a second
     streaming = command("stream", url, "--ring", "faw", "--method", "hough", "--record", record, "--map", map_path)
@@ -449,6 +455,7 @@ def test_wrong_calls_are_answered_in_one_line(arguments, log_file, capsys):
 
 def test_a_view_as_a_file_and_a_clear_word_without_the_extra(office, log, log_file, tmp_path, monkeypatch, capsys):
     pytest.importorskip("rerun")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     file = tmp_path / "view.rrd"
     call = ["stream", f"file:{log_file}?speed=0", "--ring", "faw", "--method", "hough", "--rrd", str(file)]
     assert main(call) == 0
