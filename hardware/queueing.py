@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 Item = TypeVar("Item")
 
 CAPACITY = 512
-"""Scans, about 48 s of the paper's ring: what comes while something is compiled finds room."""
+"""Scans, about 48 s of the paper's ring."""
 
 
 class NewestQueue(Generic[Item]):
@@ -24,7 +24,8 @@ class NewestQueue(Generic[Item]):
             capacity: items it holds, at least 1.
         """
         self._items: deque[Item] = deque()
-        self._capacity = max(1, capacity)
+        self.capacity = max(1, capacity)
+        """Items it holds; what is there stays when it becomes less."""
         self._changed = threading.Condition()
         self._closed = False
         self._error: BaseException | None = None
@@ -39,11 +40,11 @@ class NewestQueue(Generic[Item]):
             wait: wait for room instead of dropping, until this event is set.
         """
         with self._changed:
-            while wait is not None and len(self._items) >= self._capacity and not (wait.is_set() or self._closed):
+            while wait is not None and len(self._items) >= self.capacity and not (wait.is_set() or self._closed):
                 self._changed.wait(0.1)
             if self._closed:
                 return
-            if len(self._items) >= self._capacity:
+            if len(self._items) >= self.capacity:
                 self._items.popleft()
                 self.dropped += 1
             self._items.append(item)

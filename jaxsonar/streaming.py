@@ -13,7 +13,7 @@ import numpy as np
 from jaxsonar import kernels
 from jaxsonar.hardware.assembly import RawScan
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.hardware.queueing import NewestQueue
+from jaxsonar.hardware.queueing import CAPACITY, NewestQueue
 from jaxsonar.hardware.reading import Reader
 from jaxsonar.hardware.transports import Event, open_source, parse_url, register
 
@@ -27,6 +27,8 @@ from .ring import Ring
 
 MAP_EVERY = 2.0
 """Seconds between two writings of the map."""
+WARMING_CAPACITY = 8192
+"""Scans that find room while things are compiled, 12 min of the paper's ring and some 30 MB."""
 _LOOK = 0.2
 _LATENCIES = 1 << 16  # the latest ones are kept
 
@@ -166,7 +168,7 @@ def stream(
             on_event(event)
 
     source = open_source(url, on_event=heard)
-    queue: NewestQueue[RawScan] = NewestQueue()
+    queue: NewestQueue[RawScan] = NewestQueue(WARMING_CAPACITY)
     try:
         recorder = None if record is None else open_record(record)
     except SonarError:
@@ -225,6 +227,7 @@ class _Run:
             self._take(self._queue.get(_LOOK, most=AT_ONCE))
             if not (len(self._queue) or np.isfinite(self._caught_up)):
                 self._caught_up = time.monotonic()  # what came while things were compiled has been worked off
+                self._queue.capacity = CAPACITY
             if not len(self._queue) or self._live.waiting >= AT_ONCE:
                 self._live.absorb()
             if time.monotonic() >= self._map_at:

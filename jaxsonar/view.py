@@ -8,7 +8,9 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,8 @@ from .poses import to_world
 from .ring import Ring
 
 HOST = "127.0.0.1"
+STARTS = 30.0
+"""Seconds that the viewer has to start."""
 MEMORY = "500MB"
 """What the viewer keeps before it forgets the oldest scans."""
 _RING, _DIRECT, _CROSS, _LINE, _WALL, _POINT = (
@@ -75,6 +79,7 @@ class View:
         none = subprocess.DEVNULL
         # A process group of its own: Ctrl-C ends the stream, and the window stays to be looked at.
         self._viewer = subprocess.Popen(call, stdin=none, stdout=none, stderr=none, start_new_session=True)
+        self._wait_for(port)
         self._stream.connect_grpc(f"rerun+http://{HOST}:{port}/proxy")
 
     @property
@@ -114,8 +119,21 @@ class View:
 
     def close(self) -> None:
         """Hand over what is left; the window stays open."""
-        self._stream.flush(timeout_sec=5.0)
+        with suppress(RuntimeError):  # the window was closed before
+            self._stream.flush(timeout_sec=5.0)
         self._stream.disconnect()
+
+    def _wait_for(self, port: int) -> None:
+        """Until the viewer listens: what is sent before that is lost."""
+        assert self._viewer is not None
+        end = time.monotonic() + STARTS
+        while self._viewer.poll() is None and time.monotonic() < end:
+            with suppress(OSError), socket.create_connection((HOST, port), timeout=1.0):
+                return
+            time.sleep(0.1)
+        self._viewer.kill()
+        self._viewer.wait()
+        raise SonarError("--view: the viewer does not start; allowed is a machine on which 'python -m rerun' does")
 
     def _arcs(self, path: np.ndarray, reach: np.ndarray) -> np.ndarray:
         room = room_for(len(path), least=64)  # few different shapes
