@@ -52,9 +52,7 @@ class Given(Source):
 
     def read(self, timeout: float) -> bytes | None:
         time.sleep(self.pause)
-        piece = next(self.pieces, EndOfStream)
-        if piece is EndOfStream:
-            raise EndOfStream("given: no more")
+        piece = next(self.pieces, EndOfStream("given: no more"))
         if isinstance(piece, BaseException):
             raise piece
         return piece
