@@ -11,6 +11,8 @@ from .incremental import Mapper as Mapper
 from .incremental import MapState as MapState
 from .incremental import StepInfo as StepInfo
 from .kernels.hough import HoughSettings as HoughSettings
+from .livemap import LiveMap as LiveMap
+from .livemap import LiveScan as LiveScan
 from .local import Line as Line
 from .local import Lines as Lines
 from .local import LocalModel as LocalModel
@@ -35,3 +37,5 @@ from .roomfile import save_room as save_room
 from .rooms import Room as Room
 from .simulate import Simulation as Simulation
 from .simulate import simulate as simulate
+from .streaming import Status as Status
+from .streaming import stream as stream

@@ -82,9 +82,14 @@ class Candidate(NamedTuple):
     """Columns of the step's row that hold its echoes."""
 
 
-def extract(ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings) -> Iterator[Extracted]:
-    """The paper's section 4 from echoes to lines, step by step over a batch of scans."""
-    arcs = arcs_of(ring, settings)
+def extract(
+    ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings, arcs: kernels.RingArcs | None = None
+) -> Iterator[Extracted]:
+    """The paper's section 4 from echoes to lines, step by step over a batch of scans.
+
+    ``arcs`` are given where they are not those of a ring at rest.
+    """
+    arcs = arcs_of(ring, settings) if arcs is None else arcs
     for step in echoes.steps(settings.cells):
         packed = step.packed
         # Echo arcs -> equidistant points -> tangent lines -> votes -> low pass -> threshold, in one compiled step.

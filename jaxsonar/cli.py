@@ -7,14 +7,17 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from importlib import import_module, metadata
 from pathlib import Path
 from typing import NoReturn
 
 from jaxsonar.hardware.errors import SonarError
 
+from .commands_live import add_commands as add_live_commands
 from .files import FIGURE_FORMATS as FIGURES
 
+SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for each scan)"
 SETTINGS_HELP = "accumulator and low pass, for hough also threshold, instead of the paper's"
 RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
 
@@ -73,7 +76,7 @@ def _choose_method(command: argparse.ArgumentParser) -> None:
         "--sigma",
         type=_finite(1e-4, 1),
         metavar="METRES",
-        help="standard deviation of the ranges, for ml (default: estimated for each scan)",
+        help=SIGMA_HELP,
     )
 
 
@@ -224,6 +227,10 @@ def parser() -> argparse.ArgumentParser:
     convert.add_argument("destination", metavar="OUT", help="scan log, .csv or .parquet")
     formats = ("corridor8", "scitos24", "sew-amr", "csv", "parquet")
     convert.add_argument("--from", dest="from_", choices=formats, help="format of IN (default: by its suffix)")
+
+    texts = {"ring": RING_HELP, "sigma": SIGMA_HELP, "settings": SETTINGS_HELP}
+    whole = partial(_number, int)
+    add_live_commands(command, whole=whole, number=_finite, ending_in=_ending_in, texts=texts)
     return top
 
 

@@ -495,3 +495,17 @@ def _progress(items: Iterable[Item], total: int | None, unit: str) -> Iterator[I
         for done, item in enumerate(items, start=1):
             yield item
             show(done)
+
+
+def stream(options: argparse.Namespace) -> None:
+    """``jaxsonar stream``."""
+    from .commands_live import stream
+
+    stream(options)
+
+
+def emulate(options: argparse.Namespace) -> None:
+    """``jaxsonar emulate``."""
+    from .commands_live import emulate
+
+    emulate(options)

@@ -58,6 +58,7 @@ def explained(
     echoes: FlatEchoes,
     settings: kernels.HoughSettings,
     sigma: float | None,
+    arcs: kernels.RingArcs | None = None,
 ) -> Iterator[Explained]:
     """The reflectors of every scan, step by step over a batch.
 
@@ -66,9 +67,10 @@ def explained(
         echoes: of single scans.
         settings: of the Hough step that gives the candidates.
         sigma: noise of the ranges, metres; estimated for each scan if None.
+        arcs: of the ring's paths, where they are not those of a ring at rest.
     """
     expected = kernels.Expectations()
-    arcs = arcs_of(ring, settings)
+    arcs = arcs_of(ring, settings) if arcs is None else arcs
     noise = jnp.asarray(np.nan if sigma is None else sigma, jnp.float32)
     for step in echoes.steps(settings.cells, dear=True):
         found = kernels.explain(arcs, step.packed, noise, settings=settings, expected=expected)

@@ -1,5 +1,6 @@
 """Maps that grow scan by scan: the robot keeps what the walls amount to, and forgets the scans (paper, section 5)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -98,6 +99,23 @@ class Mapper:
         state = replace(state, stretch=stretch, waiting=(*state.waiting, scan))
         return self._closed(state) if ends else (state, _nothing(""))
 
+    def including(self, state: MapState, scans: Sequence[Scan], models: Sequence[LocalModel]) -> MapState:
+        """Take in scans whose local models are known, in one step; those without a pose are left out. Not for windows.
+
+        Args:
+            state: is left as it was.
+            scans: with different numbers.
+            models: of these scans, in the same order.
+
+        Raises:
+            SonarError: a sensor number that the ring does not have.
+        """
+        placed = [(s, m) for s, m in zip(scans, models, strict=True) if np.isfinite(s.pose).all()]
+        if not placed:
+            return state
+        log = Log.from_scans([scan for scan, _ in placed])
+        return self._joined(state, gather_evidence(self.ring, log, [model for _, model in placed]))
+
     def finish(self, state: MapState) -> MapState:
         """Take in what is left of the last window."""
         return self._closed(state)[0]
@@ -117,10 +135,13 @@ class Mapper:
 
     def _with(self, state: MapState, model: LocalModel, log: Log) -> tuple[MapState, StepInfo]:
         new = gather_evidence(self.ring, log, [model])
+        return self._joined(state, new), StepInfo(model, new.pieces.segments, "")
+
+    def _joined(self, state: MapState, new: Evidence) -> MapState:
         evidence = state.evidence.joined(new)
         if self.merging != "paper":
             evidence = evidence.condensed()
-        return replace(state, evidence=evidence), StepInfo(model, new.pieces.segments, "")
+        return replace(state, evidence=evidence)
 
 
 def _nothing(why: str) -> StepInfo:

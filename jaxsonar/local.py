@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -188,9 +189,33 @@ def local_model(
     method: str = "ml",
     settings: kernels.HoughSettings | None = None,
     sigma: float | None = None,
+    path_pose: Float[np.ndarray, "paths 3"] | None = None,
 ) -> LocalModel:
-    """The walls around the robot from one scan of a log; arguments and errors as ``local_models``."""
-    return next(local_models(ring, scan.as_log(), method=method, settings=settings, sigma=sigma))
+    """The walls around the robot from one scan of a log.
+
+    Args:
+        ring: the sensors.
+        scan: what they heard.
+        method: as ``local_models``.
+        settings: as ``local_models``.
+        sigma: as ``local_models``.
+        path_pose: of a robot that moved during the scan, for each of the ring's ``paths`` where it was when the
+            transmitter fired, in the frame that the walls are wanted in: x, y (m), theta (rad). It stood still if left
+            out.
+
+    Raises:
+        SonarError: as ``local_models``.
+    """
+    if path_pose is None:
+        return next(local_models(ring, scan.as_log(), method=method, settings=settings, sigma=sigma))
+    check_method(method)
+    check_sigma(sigma)
+    log, settings = scan.as_log(), settings_for(ring, settings)
+    arcs = kernels.moved_arcs(arcs_of(ring, settings), jnp.asarray(path_pose, jnp.float32), settings=settings)
+    echoes, _ = FlatEchoes.from_log(ring, log)
+    if method == "ml":
+        return next(_explained_models(ring, log, echoes, settings, sigma, arcs))
+    return next(models_of(ring, log, Windows.of_scans(echoes), settings, arcs))
 
 
 def local_models(
@@ -237,10 +262,12 @@ def local_models(
     return models_of(ring, log, windows, settings)
 
 
-def models_of(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSettings) -> Iterator[LocalModel]:
+def models_of(
+    ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSettings, arcs: kernels.RingArcs | None = None
+) -> Iterator[LocalModel]:
     """A local model of every window of a log; windows of single scans are the scans themselves."""
     paths = ring.paths
-    for extracted in extract(ring, windows.echoes, settings):
+    for extracted in extract(ring, windows.echoes, settings, arcs):
         step = extracted.step
         walls = verified(ring, extracted, settings, gap=windows.gap) if windows.gap else extracted.candidates
         for row, index in enumerate(windows.last[step.scans]):
@@ -263,10 +290,15 @@ def models_of(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSet
 
 
 def _explained_models(
-    ring: Ring, log: Log, echoes: FlatEchoes, settings: kernels.HoughSettings, sigma: float | None
+    ring: Ring,
+    log: Log,
+    echoes: FlatEchoes,
+    settings: kernels.HoughSettings,
+    sigma: float | None,
+    arcs: kernels.RingArcs | None = None,
 ) -> Iterator[LocalModel]:
     """A local model of every scan of a log by maximum likelihood."""
-    for found in explained(ring, echoes, settings, sigma):
+    for found in explained(ring, echoes, settings, sigma, arcs=arcs):
         for row, index in enumerate(range(found.step.scans.start, found.step.scans.stop)):
             yield _explained_model(ring, found, row, int(log.scan[index]), float(log.stamp[index]))
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.hardware.recording import mark_of
 
 from .files import shown
 
@@ -266,13 +267,18 @@ def load_log(path: str | os.PathLike[str]) -> Log:
     """A scan log from a ``.csv`` or ``.parquet`` file.
 
     Args:
-        path: the file; its suffix, in either case, decides how it is read.
+        path: the file; its suffix, in either case, decides how it is read. Of a recording whose process was killed
+            (there is a ``.recording`` file beside it) everything that is whole, with a warning if anything is not.
 
     Raises:
         SonarError: the file cannot be read or holds what no log can; one line with file, row, column and what is
             allowed.
     """
     # The formats need Log, so they can only be imported once it exists.
+    if mark_of(path).exists():
+        from jaxsonar.journal import load_cut_short
+
+        return load_cut_short(path)
     if log_format(path) == "csv":
         from jaxsonar.logs_csv import read_csv
 

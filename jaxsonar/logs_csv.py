@@ -50,7 +50,12 @@ def read_csv(path: str | os.PathLike[str]) -> Log:
         SonarError: the file cannot be read or is no scan log; one line with file, row, column, value and what is
             allowed.
     """
-    text = read_bytes(path, what="a scan log (CSV)").removeprefix(b"\xef\xbb\xbf")
+    return read_csv_text(path, read_bytes(path, what="a scan log (CSV)"))
+
+
+def read_csv_text(path: str | os.PathLike[str], text: bytes) -> Log:
+    """As ``read_csv``, from what was read of the file already; ``path`` is for messages."""
+    text = text.removeprefix(b"\xef\xbb\xbf")
     if b"\r" in text:
         text = text.replace(b"\r\n", b"\n")
     header, _, body = text.partition(b"\n")

@@ -110,8 +110,8 @@ class Data:
         self.anchored[first : first + 1] = 1 / _ANCHOR**2
         if len(rows) < 2:
             return
-        step = relative(measured[rows[:-1]], measured[rows[1:]])
-        known = np.isfinite(step).all(axis=1)
+        step: np.ndarray = relative(measured[rows[:-1]], measured[rows[1:]])
+        known = np.all(np.isfinite(step), axis=1)
         way, turn = np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])
         off = np.stack([share * way + _SLIP[0]] * 2 + [share * (turn + _TURN * way) + _SLIP[1]], axis=-1)
         self.odometry[first : first + len(rows) - 1] = np.where(known[:, None], step, 0)

@@ -33,6 +33,7 @@ from .extraction import RingArcs as RingArcs
 from .extraction import accumulators as accumulators
 from .extraction import cluster_lines as cluster_lines
 from .extraction import lines_of_scan as lines_of_scan
+from .extraction import moved_arcs as moved_arcs
 from .extraction import occupied_cells as occupied_cells
 from .extraction import points_of_widest_arc as points_of_widest_arc
 from .extraction import ring_arcs as ring_arcs
@@ -57,6 +58,7 @@ from .merging import occupied_by_lines as occupied_by_lines
 from .paths import EchoPaths as EchoPaths
 from .paths import Sensors as Sensors
 from .paths import echo_paths as echo_paths
+from .paths import moved_path as moved_path
 from .scene import SECOND as SECOND
 from .scene import Reflection as Reflection
 from .scene import Scene as Scene

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from . import arcs, clusters, hough
 from .hough import HoughSettings
-from .paths import EchoPaths, Sensors, echo_paths
+from .paths import EchoPaths, Sensors, echo_paths, moved_path
 
 
 class Echoes(eqx.Module):
@@ -67,6 +67,22 @@ def ring_arcs(sensors: Sensors, *, settings: HoughSettings, points: int) -> Ring
         max_range=sensors.max_range,
         full_wall=hough.full_wall_paths(paths),
     )
+
+
+@partial(jax.jit, static_argnames="settings")
+def moved_arcs(ring: RingArcs, pose: Float[Array, "paths 3"], *, settings: HoughSettings) -> RingArcs:
+    """The arcs of a ring that moved while its groups fired, one after the other.
+
+    Args:
+        ring: arcs of the ring at rest.
+        pose: model_from_robot when the transmitter of each path fired: x, y (metres), theta (radians).
+        settings: those of ``ring``.
+    """
+    paths = jax.vmap(moved_path)(ring.paths, pose)
+    points = ring.arcs.theta.shape[-1]
+    arcs_of_paths = jax.vmap(partial(arcs.arc, pitch=settings.point_pitch, points=points))(paths)
+    rows = hough.theta_row(arcs_of_paths.theta, settings)
+    return eqx.tree_at(lambda r: (r.paths, r.arcs, r.rows), ring, (paths, arcs_of_paths, rows))
 
 
 def points_of_widest_arc(beam: Float[np.ndarray, " sensors"], settings: HoughSettings) -> int:

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .geometry import normal, wrap_angle
+from .geometry import normal, tangent, wrap_angle
 
 
 class Sensors(eqx.Module):
@@ -46,6 +46,24 @@ class EchoPaths(eqx.Module):
     """Unit vectors along which tx and rx look."""
     half_beam: Float[Array, "*paths 2"]
     """Half the cones of tx and rx, radians."""
+
+
+def moved_path(path: EchoPaths, pose: Float[Array, "3"]) -> EchoPaths:
+    """ONE echo path as seen from a frame in which the robot stands at the pose: x, y (metres), theta (radians)."""
+    along, across = normal(pose[2]), tangent(pose[2])
+
+    def turned(vector: Float[Array, "*any 2"]) -> Float[Array, "*any 2"]:
+        return vector[..., :1] * along + vector[..., 1:] * across
+
+    return EchoPaths(
+        midpoint=pose[:2] + turned(path.midpoint),
+        half_baseline=turned(path.half_baseline),
+        start=path.start + pose[2],
+        width=path.width,
+        range_offset=path.range_offset,
+        axes=jax.vmap(turned)(path.axes),
+        half_beam=path.half_beam,
+    )
 
 
 @jax.jit

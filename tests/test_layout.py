@@ -237,9 +237,9 @@ def test_help_needs_nothing_heavy():
     code = f"""
 import sys
 from jaxsonar.cli import main
-for call in ([], ["lines"], ["demo"], ["simulate"], ["convert"], ["map"], ["reference"], ["evaluate"]):
+for call in " lines demo simulate convert map reference evaluate stream emulate".split(" "):
     try:
-        main([*call, "--help"])
+        main([*call.split(), "--help"])
     except SystemExit as end:
         assert end.code == 0
 sys.stdout.write("".join(["\\nHEAVY", *(set({HEAVY}) & set(sys.modules))]))
