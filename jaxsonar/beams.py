@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from jaxsonar import kernels
+from jaxsonar.hardware.errors import SonarError
 
 from .echoes import room_for
 from .ring import Ring
@@ -23,6 +24,9 @@ def beam_centres(ring: Ring, data: Data, found: Settled) -> tuple[Ring, Float[np
 
     To be called with 64-bit floats enabled. Half width and softness of the cones and the share of echoes that arrive
     are estimated along, one for all sensors.
+
+    Raises:
+        SonarError: the scans do not show them.
     """
     around = found.state.around
     scene, candidates = (jax.tree.map(jnp.asarray, tree) for tree in (around.scene, around.candidates))
@@ -37,6 +41,11 @@ def beam_centres(ring: Ring, data: Data, found: Settled) -> tuple[Ring, Float[np
     heard[scan, candidate_of[scan, echo], data.path[scan, echo]] = True
     # Walls only: edges are faint, and of corners one cannot say from where they are heard.
     sure = np.isfinite(angle) & (np.asarray(candidates.reflection.kind) == kernels.PLANE)[None, :, None]
+    # An echo that two reflectors explain is neither heard nor silence.
+    open_ = np.zeros((len(data.path), ring.count), dtype=bool)
+    scan, echo = np.nonzero(np.isfinite(data.reported) & (data.path < ring.count) & ~found.used)
+    open_[scan, data.path[scan, echo]] = True
+    sure &= ~open_[:, None] | heard
     _, _, sensor = np.nonzero(sure)
     room = room_for(len(sensor), least=1024)
 
@@ -46,10 +55,12 @@ def beam_centres(ring: Ring, data: Data, found: Settled) -> tuple[Ring, Float[np
     sightings = (padded(sensor), padded(angle[sure]), padded(heard[sure]), padded(np.ones(len(sensor), bool)))
     half = float(np.median(ring.beam)) / 2
     start = kernels.Beams(jnp.zeros(ring.count), jnp.asarray(half), jnp.asarray(np.log(_SOFT)), jnp.asarray(_LIKELY))
-    solver = optx.BFGS(rtol=1e-8, atol=1e-8)
+    solver = optx.BFGS(rtol=1e-5, atol=1e-6)
     solved = optx.minimise(lambda beams, seen: kernels.beam_misfit(beams, *seen), solver, start, sightings, throw=False)
     flat, unravel = ravel_pytree(solved.value)
     bend = jax.hessian(lambda x: kernels.beam_misfit(unravel(x), *sightings))(flat)
+    if np.linalg.eigvalsh(np.asarray(bend)).min() <= 0:
+        raise SonarError("calibration: headings: what was heard does not show where the cones end; hold the headings")
     variance = np.diag(np.linalg.inv(np.asarray(bend)))[: ring.count]
     heading = np.asarray(ring.heading) + np.asarray(solved.value.centre)
-    return replace(ring, heading=heading), np.sqrt(np.maximum(variance, 0))
+    return replace(ring, heading=heading), np.sqrt(variance)

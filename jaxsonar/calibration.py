@@ -59,7 +59,7 @@ class Calibration:
     """Echoes that came."""
     scans: int
     """Scans that were used."""
-    poses: tuple[Float[np.ndarray, "scans 3"], ...]
+    poses: tuple[Float[np.ndarray, "_ 3"], ...]
     """world_from_robot of the scans of every world, given or estimated; NaN where a scan was not used. A log is a
     world; where poses were estimated, so is every part of a log that could not be laid on the others."""
     maps: tuple[GlobalMap, ...]

@@ -91,7 +91,7 @@ class Plan:
         assert best is not None
         return best
 
-    def _fitted(self, near: Ring, logs: list[Log], measured: list[Float[np.ndarray, "scans 3"]]) -> Fitted:
+    def _fitted(self, near: Ring, logs: list[Log], measured: list[Float[np.ndarray, "_ 3"]]) -> Fitted:
         """The map so far; echoes to its reflectors and least squares, closer and closer; the same with that ring."""
         data = Data.of(self.ring, logs, measured, self.odometry)
         state = State(_coordinates(self.held, _change(self.ring, near)), data.poses, surroundings([], tied=False))
@@ -124,9 +124,7 @@ class Plan:
         with jax.enable_x64(True):
             return settle(self.ring, data, modes, state, widest=widest, poses_free=self.estimate, sigma=self.sigma)
 
-    def _placed(
-        self, ring: Ring, logs: Sequence[Log], blur: float
-    ) -> tuple[list[Log], list[Float[np.ndarray, "scans 3"]]]:
+    def _placed(self, ring: Ring, logs: Sequence[Log], blur: float) -> tuple[list[Log], list[Float[np.ndarray, "_ 3"]]]:
         """Logs with poses from their local models, and their odometry; as they came where poses are given.
 
         What cannot be laid together becomes several logs, each with a world of its own. Where single scans are sparse,

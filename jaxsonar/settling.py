@@ -54,14 +54,12 @@ class Data:
     odometry: Float[np.ndarray, "scans 3"]
     linked: Float[np.ndarray, "scans 3"]
     """As in ``kernels.Problem``."""
-    rows: tuple[Int[np.ndarray, " scans"], ...]
+    rows: tuple[Int[np.ndarray, " _"], ...]
     """Of every log: its scans that are used, the first of them in row ``begin`` of the rectangle and so on."""
     begin: tuple[int, ...]
 
     @classmethod
-    def of(
-        cls, ring: Ring, logs: Sequence[Log], odometry: Sequence[Float[np.ndarray, "scans 3"]], share: float
-    ) -> "Data":
+    def of(cls, ring: Ring, logs: Sequence[Log], odometry: Sequence[Float[np.ndarray, "_ 3"]], share: float) -> "Data":
         """Scans with poses and echoes.
 
         Args:
@@ -155,7 +153,7 @@ class Settled(NamedTuple):
     """The last least squares."""
     adjusted: kernels.Adjusted
     used: Bool[np.ndarray, "scans echoes"]
-    """Echoes that a reflector explains."""
+    """Echoes that a reflector explains, and no other one nearly so."""
     candidate: Int[np.ndarray, "scans echoes"]
     """Row of the surroundings' candidates that each of them comes from."""
     residual: Float[np.ndarray, "scans echoes"]

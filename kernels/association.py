@@ -72,14 +72,14 @@ def associate(
         own = jax.tree.map(lambda leaf: leaf[path], paths)
         expected = each_candidate(pose, candidates.reflection, first, second, own)
         expected = jnp.where((candidates.world == here)[:, None], expected, jnp.inf)
-        off = jnp.abs(reported - expected)  # (candidates, echoes)
+        off = jnp.abs(reported[None] - expected)  # (candidates, echoes)
         off = jnp.where(jnp.isfinite(off), off, jnp.inf)
         best = off.argmin(axis=0)
         nearest = jnp.take_along_axis(expected, best[None], axis=0)[0]
         found = jnp.isfinite(off.min(axis=0))
         residual = reported - nearest
         other = candidates.group[:, None] != candidates.group[best][None]
-        apart = jnp.abs(expected - jnp.where(found, nearest, 0))
+        apart = jnp.abs(expected - jnp.where(found, nearest, 0)[None])
         rival = jnp.where(other, apart, jnp.inf).min(axis=0)
         return jnp.where(found, best, -1), jnp.where(found, residual, jnp.inf), rival
 

@@ -10,6 +10,7 @@ from .paths import Sensors, echo_paths
 from .scene import Scene, audible, take
 
 _CENTRE_SD = 0.2  # rad; what is expected of the directions of sensors
+_BORDER = (0.1, 0.3)  # rad and relative; how wide the border of a cone is, without which few sightings make it a cliff
 
 
 class Beams(eqx.Module):
@@ -71,4 +72,6 @@ def beam_misfit(
     log_heard = jax.nn.log_sigmoid(beams.share) + jax.nn.log_sigmoid(inside)
     log_not = jnp.log1p(-jnp.exp(jnp.minimum(log_heard, -1e-6)))
     log_likelihood = jnp.where(counts, jnp.where(heard, log_heard, log_not), 0).sum()
-    return 0.5 * (beams.centre**2).sum() / _CENTRE_SD**2 - log_likelihood
+    width, spread = _BORDER
+    expected = (beams.centre**2).sum() / _CENTRE_SD**2 + ((beams.softness - jnp.log(width)) / spread) ** 2
+    return 0.5 * expected - log_likelihood
