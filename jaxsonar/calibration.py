@@ -11,14 +11,14 @@ from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
 from .beams import beam_centres
-from .calibrationfit import Fitted, Plan, covariance, moved_ring
+from .calibrationfit import Fitted, Plan, check_poses, covariance, moved_ring
 from .focusing import focus
 from .local import check_sigma
 from .logs import Log
 from .mapping import build_map
 from .maps import GlobalMap
 from .ring import Ring
-from .ringmodes import DEFAULT_FREE, SPEED_SD, THERMOMETER_SD, RingModes, check_free, ring_modes
+from .ringmodes import DEFAULT_FREE, SPEED_SD, THERMOMETER_SD, RingModes, check_air, check_free, ring_modes
 from .settling import Settled
 from .windows import check_window
 
@@ -26,9 +26,8 @@ POSES = ("trust", "estimate")
 """What is made of a log's poses: they are right, or a start and odometry between scans."""
 ODOMETRY = 0.02
 """Share of the way and of the turn that odometry is wrong by."""
-AIR = (290.0, 380.0)
-"""Metres per second; sound in air from -60 to 85 deg C."""
 _MOST_SHIFT = 0.06  # of the speed of sound; beyond, the ranges are no half path lengths of this ring
+_MOST_OFFSET = 0.06  # m; beyond, scans were laid together wrongly
 _LEAST_EXPLAINED = 0.15  # of the echoes; below, there is no map to calibrate with
 _UNKNOWN = 0.7  # of what was expected; a parameter that stays as uncertain was not observed
 
@@ -214,6 +213,8 @@ def calibrate(
         began, speed_sd = replace(ring, speed_of_sound=speed_of_sound(temperature)), THERMOMETER_SD
     estimate = poses == "estimate"
     modes = ring_modes(began, free, poses_free=estimate, speed_sd=speed_sd)
+    if not estimate:
+        check_poses(logs)
     plan = Plan(began, modes, estimate, odometry, sigma, window, say)
 
     # 1. Sharpen: the smooth accumulator brings a ring that is far off near enough for echoes to find their walls.
@@ -298,11 +299,7 @@ def _check(
         raise SonarError(f"odometry {odometry:g}; allowed is 0.0001 to 1, the share of the way that it is wrong by")
     if temperature is not None and not -60 <= temperature <= 85:
         raise SonarError(f"temperature {temperature:g} deg C; allowed is -60 to 85")
-    speed, (low, high) = float(ring.speed_of_sound), AIR
-    if not low <= speed <= high:
-        raise SonarError(
-            f"ring {ring.name!r}: speed_of_sound {speed:g} m/s; allowed is that of air, {low:g} to {high:g}"
-        )
+    check_air(ring)
 
 
 def _check_result(fit: Fitted, modes: RingModes) -> None:
@@ -315,6 +312,13 @@ def _check_result(fit: Fitted, modes: RingModes) -> None:
         )
     sensors = (len(modes.columns) - 1) // 3
     shift = float((modes.columns @ fit.settled.state.coordinates)[sensors])
+    offset = (modes.columns @ fit.settled.state.coordinates)[:sensors]
+    worst = int(np.argmax(np.abs(offset)))
+    if abs(offset[worst]) > _MOST_OFFSET:
+        raise SonarError(
+            f"calibration: the range offset of sensor {worst} went off by {1e3 * offset[worst]:.0f} mm; allowed are "
+            f"{1e3 * _MOST_OFFSET:g} mm: these scans do not show the ring (try more of them, odometry or known poses)"
+        )
     if abs(shift) > _MOST_SHIFT:
         raise SonarError(
             f"calibration: the speed of sound went off by {100 * shift:.1f} %; allowed are {100 * _MOST_SHIFT:g} %: "

@@ -41,7 +41,7 @@ def as_table(calibration: Calibration) -> dict[str, Any]:
         "residual_rms_after": _short(calibration.rms),
     }
     if "offset" in calibration.free:
-        table["range_offset_sd"] = _list(calibration.range_offset_sd)  # relative to their mean
+        table["range_offset_sd"] = _list(calibration.range_offset_sd)  # relative to their mean, see README
         if "mean_offset" not in calibration.held:
             table["mean_offset_sd"] = _short(calibration.mean_offset_sd)
     if "speed" in calibration.free:

@@ -30,8 +30,8 @@ _WIDE, _WIDE_PLACED = 0.04, 0.08  # m; scale of the first association: poses giv
 _AGAIN = 0.01  # m; scale of the first one after the map was made anew
 _MAPS = 5  # made anew at most, as long as each explains more echoes
 _GROWN = 1.005  # by so much
-_BLURS = (1.0, 0.2, 0.5)  # of successive placings, until all scans are placed: the ring is known better and better
-_MARGIN = 0.5  # nats; a wrong place does little harm here, a scan that is left out tells nothing
+_PLACINGS = ((1.0, 4.0), (0.2, 2.0), (0.2, 1.0))  # blur and margin (nats), until all scans are placed: surely at first
+_NOISIER = 1.15  # a fit with so much more noise has laid scans together that do not belong together
 _LEAST_SECOND = 10  # wall to wall echoes
 _MISFIT = 1.5  # sigma; of wall to wall echoes where walls do meet as the map says
 _KEEPS = 0.97  # of the echoes that were explained with corners of their own
@@ -82,9 +82,9 @@ class Plan:
             logs: as they came.
         """
         best = None
-        for blur in _BLURS if self.estimate and self.window is None else _BLURS[:1]:
-            fit = self._fitted(near, *self._placed(near, logs, blur))
-            if best is None or fit.used > best.used:
+        for blur, margin in _PLACINGS if self.estimate and self.window is None else _PLACINGS[:1]:
+            fit = self._fitted(near, *self._placed(near, logs, blur, margin))
+            if best is None or _better(fit, best):
                 best, near = fit, moved_ring(self.ring, self.modes, fit.settled.state)
             if len(best.logs) == len(logs) and best.data.scans == sum(len(log) for log in logs):
                 break
@@ -124,7 +124,9 @@ class Plan:
         with jax.enable_x64(True):
             return settle(self.ring, data, modes, state, widest=widest, poses_free=self.estimate, sigma=self.sigma)
 
-    def _placed(self, ring: Ring, logs: Sequence[Log], blur: float) -> tuple[list[Log], list[Float[np.ndarray, "_ 3"]]]:
+    def _placed(
+        self, ring: Ring, logs: Sequence[Log], blur: float, margin: float
+    ) -> tuple[list[Log], list[Float[np.ndarray, "_ 3"]]]:
         """Logs with poses from their local models, and their odometry; as they came where poses are given.
 
         What cannot be laid together becomes several logs, each with a world of its own. Where single scans are sparse,
@@ -137,18 +139,21 @@ class Plan:
             for log in logs:
                 odometry = log.pose if np.isfinite(log.pose).any() else None
                 models = list(local_models(ring, log))
-                parts = place_parts(models, odometry, slip=self.odometry, margin=_MARGIN, blur=blur)
+                parts = place_parts(models, odometry, slip=self.odometry, margin=margin, blur=blur)
                 enough = [part for part in parts if np.isfinite(part[:, 0]).sum() >= LEAST_SCANS]
                 placed += [replace(log, pose=part) for part in enough]
                 measured += [log.pose] * len(enough)
-        _check_poses(placed)
+        check_poses(placed)
         return placed, measured
 
     def pinned(self, alone: Fitted) -> tuple[Fitted, str]:
         """The same with the mean offset free, where wall to wall echoes pin it; or as it is, and why."""
         around = surroundings(alone.worlds, tied=True)
         if not (np.asarray(around.candidates.reflection.kind) == kernels.SECOND).any():
-            return alone, "no walls that meet at a right angle, so no wall to wall echoes"
+            return (
+                alone,
+                "no two walls of the map end at a common right-angled corner",
+            )
         state = alone.settled.state._replace(around=around)
         tied = self.settle(alone.data, state, self.modes, 2 * _AGAIN)
         second = tied.used & (np.asarray(tied.problem.heard.reflection.kind) == kernels.SECOND)
@@ -174,6 +179,11 @@ class Plan:
             )
             fitted = kernels.adjust(problem, start, poses_free=self.estimate)
             return np.asarray(kernels.residuals(problem, fitted.unknowns))
+
+
+def _better(fit: Fitted, best: Fitted) -> bool:
+    """Whether more echoes are explained, and not by taking more for noise."""
+    return fit.used > best.used and fit.settled.sigma < _NOISIER * best.settled.sigma
 
 
 def covariance(found: Settled) -> Float[np.ndarray, "ring ring"]:
@@ -209,7 +219,8 @@ def _coordinates(modes: RingModes, change: Float[np.ndarray, " ring"]) -> Float[
     return np.linalg.lstsq(modes.columns, change, rcond=1e-9)[0]
 
 
-def _check_poses(logs: Sequence[Log]) -> None:
+def check_poses(logs: Sequence[Log]) -> None:
+    """Raise a SonarError where too few scans have a pose."""
     if not logs:
         raise SonarError(
             f"calibration: no {LEAST_SCANS} scans could be laid on one another; allowed are scans that see the same "
@@ -220,5 +231,5 @@ def _check_poses(logs: Sequence[Log]) -> None:
         if count < LEAST_SCANS:
             raise SonarError(
                 f"calibration: {count} of {len(log)} scans have a pose; allowed are {LEAST_SCANS} or more in every "
-                "log, or poses to be estimated from scans that see walls in two directions"
+                "log, or poses to be estimated (--poses estimate)"
             )

@@ -55,7 +55,11 @@ def _offsets(axes: Axes, calibration: Calibration) -> None:
     axes.vlines(sensors, 0, 1e3 * values, color=FAINT, lw=3)
     axes.errorbar(sensors, 1e3 * values, 1e3 * spread, fmt="o", color=DIRECT, ms=3.5, lw=1, capsize=2)
     what = "Effective range correction" if moved else "Range offset against the nominal ring"
-    mean = f"; their mean ± {1e3 * calibration.mean_offset_sd:.1f} mm" if calibration.mean_offset_sd else "; mean held"
+    mean = (
+        f"; their mean ± {1e3 * calibration.mean_offset_sd:.1f} mm"
+        if "mean_offset" not in calibration.held
+        else "; mean held"
+    )
     title = f"{what}, ± 1 sigma" if moved else f"{what}, ± 1 sigma{mean if 'offset' in calibration.free else ''}"
     axes.set(title=title, xlabel="sensor", ylabel="mm", xlim=(-1, ring.count))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -10,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxsonar.hardware.errors import SonarError
+
 from .echoes import FlatEchoes
 from .explained import check_sigma
 from .health_cones import cones, each_cone, fitted_cone
@@ -21,6 +23,7 @@ from .health_scene import Scene, evenly, scene_of_map, scene_of_scans, thinned
 from .health_swaps import exchanged
 from .logs import Log
 from .ring import Ring
+from .ringmodes import check_air
 
 MOST_SCANS = 1000
 """Of longer logs so many scans are explained, evenly spread over it."""
@@ -47,9 +50,13 @@ def check(
         on_left_out: told once how many echoes are of pairs (tx, rx) that this ring does not listen to.
 
     Raises:
-        SonarError: a sensor number that the ring does not have, or a sigma out of range.
+        SonarError: a log without scans, a sensor number that the ring does not have, a speed of sound that no air has,
+            or a sigma out of range.
     """
     check_sigma(sigma)
+    check_air(ring)
+    if not len(log):
+        raise SonarError("check: the log holds no scan; allowed are one or more")
     _, left_out = FlatEchoes.from_log(ring, log)
     if left_out and on_left_out is not None:
         on_left_out(left_out)
@@ -134,7 +141,8 @@ def _walls(
     if scene.solid.sum() >= max(5, len(part) // 10):
         return part, scene, "scans", ""
     if not (np.asarray(ring.corrected(part.range, part.tx, part.rx)) < ring.max_range).any():
-        return part, scene, "", "no echo within the maximum range"
+        reach = f"none of the {len(log.range)} echoes is within the maximum range, {ring.max_range:g} m"
+        return part, scene, "", f"{reach}: are ranges half path lengths in metres?"
     if np.isfinite(part.pose).all(axis=1).sum() < 2:
         return part, scene, "", "single scans carry too few walls, and the log has no poses to gather them by"
     scene = scene_of_map(ring, log)

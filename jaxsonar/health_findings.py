@@ -10,6 +10,8 @@ from .health_report import Health
 
 LEAST_OFFSET = 0.002
 """Metres; smaller offsets are never suspicious."""
+HARDLY = 0.3
+"""Share of the echoes of a sensor that walls, corners and edges explain; below, something is wrong altogether."""
 FROM_A_MAP = 0.015
 """Metres; the same where walls come from a map: poses and delays of a driving robot err as well."""
 
@@ -159,6 +161,12 @@ def _weak_or_turned(health: Health) -> Iterator[Finding]:
 
 def _of_the_ring(health: Health) -> Iterator[str]:
     """Findings about no sensor alone."""
+    fits = health.fits[:, 1][np.isfinite(health.fits[:, 1])]
+    if health.source == "scans" and len(fits) and np.median(fits) < HARDLY:
+        yield (
+            f"walls explain {100 * np.median(fits):.0f} % of the echoes: is it the right ring, are ranges half path "
+            "lengths in metres?"
+        )
     width, error, nominal = np.degrees([*health.beam, health.nominal])
     if abs(width - nominal) > max(5.0, 3 * error):
         yield f"cones look {width:.0f} ± {error:.0f} deg wide, the ring says {nominal:.0f} deg"

@@ -13,6 +13,8 @@ from .ring import Ring
 FREE = ("offset", "speed", "position", "radius", "heading")
 """What can be estimated of a ring."""
 DEFAULT_FREE = ("offset", "speed")
+AIR = (290.0, 380.0)
+"""Metres per second; sound in air from -60 to 85 deg C."""
 OFFSET_SD = 0.03
 """Metres; range offsets before calibration: delays of detectors, a few wavelengths."""
 SPEED_SD = 0.015
@@ -96,5 +98,16 @@ def check_free(free: Sequence[str]) -> None:
     for name in free:
         if name not in FREE:
             raise SonarError(f"free {name!r}; allowed are {', '.join(FREE)}")
+    if len(set(free)) < len(free):
+        raise SonarError(f"free {', '.join(free)}: one came twice; allowed is each of {', '.join(FREE)} once")
     if not free:
         raise SonarError(f"free: nothing came; allowed are one or more of {', '.join(FREE)}")
+
+
+def check_air(ring: Ring) -> None:
+    """Raise a SonarError for a speed of sound that no air has."""
+    speed, (low, high) = float(ring.speed_of_sound), AIR
+    if not low <= speed <= high:
+        raise SonarError(
+            f"ring {ring.name!r}: speed_of_sound {speed:g} m/s; allowed is that of air, {low:g} to {high:g}"
+        )

@@ -35,6 +35,7 @@ _SLIP = (0.0005, 0.001)  # m, rad; of odometry even where the robot stands
 _TURN = 0.5  # rad; turn in which odometry slips as much as over a metre
 _HALVINGS = 12
 _LAST_ROUNDS = 3
+_JUDGED, _MISFIT = 8, 1.1  # echoes and share; from there on a point must fit as well as the walls do
 _OTHER_KIND = 0.97  # of the sum of squares; a corner that is an edge, or the other way round
 
 
@@ -191,7 +192,7 @@ def settle(
         left = int(found.used.sum()) - 2 * reflectors - known - 3 * data.scans * poses_free
         if sigma is None and left > 0:
             noise = max(float(np.sqrt((found.residual**2).sum() / left)), LEAST_SIGMA)
-        state = _of_better_kind(found)
+        state = _without_misfits(_of_better_kind(found), found)
     return _round(ring, data, modes, state, noise, poses_free)
 
 
@@ -344,6 +345,31 @@ def _of_better_kind(found: Settled) -> State:
     of_candidate = np.where(alone, now[np.asarray(around.candidates.reflection.first)], of_candidate).astype(np.int32)
     candidates = eqx.tree_at(lambda c: c.reflection.kind, around.candidates, of_candidate)
     return state._replace(around=around._replace(scene=scene, candidates=candidates))
+
+
+def _without_misfits(state: State, found: Settled) -> State:
+    """The points whose echoes fit neither a corner nor an edge are none: two walls at another angle, for instance.
+
+    Their echoes would be taken for noise, and the gate would open for more of them.
+    """
+    around = state.around
+    kind = np.asarray(found.problem.heard.reflection.kind)
+    first = np.asarray(found.problem.heard.reflection.first)
+    walls = found.used & (kind == kernels.PLANE)
+    if not walls.any():
+        return state
+    variance = float(np.mean(found.residual[walls] ** 2))
+    points = found.used & ((kind == kernels.CORNER) | (kind == kernels.EDGE))
+    count = np.bincount(first[points], minlength=len(around.world))
+    sums = np.bincount(first[points], weights=found.residual[points] ** 2, minlength=len(around.world))
+    most = _MISFIT * count * variance * (1 + 4 * np.sqrt(2 / np.maximum(count, 1)))
+    bad = (count >= _JUDGED) & (sums > most)
+    of_bad = bad[np.asarray(around.candidates.reflection.first)]
+    now = np.asarray(around.candidates.reflection.kind)
+    now = np.where(of_bad & (now != kernels.SECOND), -1, now).astype(np.int32)
+    return state._replace(
+        around=around._replace(candidates=eqx.tree_at(lambda c: c.reflection.kind, around.candidates, now))
+    )
 
 
 def _residual(
