@@ -141,6 +141,8 @@ def _walls(
     if scene.solid.sum() >= max(5, len(part) // 10):
         return part, scene, "scans", ""
     if not (np.asarray(ring.corrected(part.range, part.tx, part.rx)) < ring.max_range).any():
+        if not len(log.range):
+            return part, scene, "", "no scan heard anything"
         reach = f"none of the {len(log.range)} echoes is within the maximum range, {ring.max_range:g} m"
         return part, scene, "", f"{reach}: are ranges half path lengths in metres?"
     if np.isfinite(part.pose).all(axis=1).sum() < 2:

@@ -160,7 +160,8 @@ def test_a_stuck_sensor_is_named(log):
 def test_no_echo_and_no_wall_say_why(log, rng):
     silent = check(RING, only(log, log.tx < 0))
     far = check(RING, dataclasses.replace(log, range=log.range + 3))
-    assert silent.empty == far.empty == "no echo within the maximum range"
+    assert silent.empty == "no scan heard anything"
+    assert "within the maximum range, 2 m: are ranges half path lengths in metres?" in far.empty
     fullest = only(log, log.echo_scan == np.bincount(log.echo_scan).argmax())
     few = check(RING, dataclasses.replace(fullest, range=rng.uniform(0.3, 2, len(fullest.range))))
     assert few.empty.startswith("single scans carry too few walls")
