@@ -53,7 +53,8 @@ class Calibration:
     residuals: Float[np.ndarray, " echoes"]
     """Reported minus expected range of the echoes that reflectors explain, metres."""
     residuals_before: Float[np.ndarray, " echoes"]
-    """The same echoes with the nominal ring, walls and free poses fitted to it as well as it can be."""
+    """The same echoes with the ring to start from (at the measured temperature, if there is one), walls and free poses
+    fitted to it as well as it can be."""
     echoes: int
     """Echoes that came."""
     scans: int
