@@ -549,19 +549,19 @@ def write(found: dict[str, Any], output: Path, settings: dict[str, Any]) -> dict
     counts = {"clear_echoes": CLEAR_ECHOES, "clear_reflector": CLEAR_REFLECTOR, "ranges_m": RANGES}
     told = {"versions": versions(), "settings": settings | counts, "paper": PAPER, **summary(found)}
     with atomic_write(output / "accuracy.json") as file:
-        json.dump(_without_nan(told), file, indent=1, allow_nan=False)
+        json.dump(without_nan(told), file, indent=1, allow_nan=False)
     for name, figure in figures_of(found).items():
         for suffix in ("svg", "png"):
             figures.save(figure, output / f"{name}.{suffix}")
     return told
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     """NaN as null, which JSON has."""
     if isinstance(value, dict):
-        return {key: _without_nan(one) for key, one in value.items()}
+        return {key: without_nan(one) for key, one in value.items()}
     if isinstance(value, list):
-        return [_without_nan(one) for one in value]
+        return [without_nan(one) for one in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 

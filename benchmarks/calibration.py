@@ -28,7 +28,7 @@ from jaxsonar.poses import composed, relative, wrap_angle
 from jaxsonar.rooms import point_to_walls
 from jaxsonar.simulate import Kind, Simulation
 
-from .accuracy import versions
+from .accuracy import versions, without_nan
 
 SIGMA = 0.001
 """Metres; noise of the ranges."""
@@ -522,19 +522,10 @@ def _percent(value: float | None) -> str:
 def write(found: dict[str, Any], output: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """calibration.json in a folder; what the file holds."""
     make_folder(output)
-    told = _without_nan({"versions": versions(), "settings": settings, **found})
+    told = without_nan({"versions": versions(), "settings": settings, **found})
     with atomic_write(output / "calibration.json") as file:
         json.dump(told, file, indent=1, allow_nan=False)
     return told
-
-
-def _without_nan(value: Any) -> Any:
-    """NaN as null, which JSON has."""
-    if isinstance(value, dict):
-        return {key: _without_nan(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def main() -> None:

@@ -35,10 +35,9 @@ def beam_centres(ring: Ring, data: Data, found: Settled) -> tuple[Ring, Float[np
             ring.sensors, scene, candidates, jnp.asarray(found.state.poses), jnp.asarray(data.world)
         )
     )
-    candidate_of = found.candidate
     heard = np.zeros(angle.shape, dtype=bool)
     scan, echo = np.nonzero(found.used & (data.path < ring.count))
-    heard[scan, candidate_of[scan, echo], data.path[scan, echo]] = True
+    heard[scan, found.candidate[scan, echo], data.path[scan, echo]] = True
     # Walls only: edges are faint, and of corners one cannot say from where they are heard.
     sure = np.isfinite(angle) & (np.asarray(candidates.reflection.kind) == kernels.PLANE)[None, :, None]
     # An echo that two reflectors explain is neither heard nor silence.

@@ -17,8 +17,10 @@ from .local import check_sigma
 from .logs import Log
 from .mapping import build_map
 from .maps import GlobalMap
+from .poses import unit
 from .ring import Ring
-from .ringmodes import DEFAULT_FREE, SPEED_SD, THERMOMETER_SD, RingModes, check_air, check_free, ring_modes
+from .ring import speed_of_sound as speed_of_sound
+from .ringmodes import DEFAULT_FREE, FREE, SPEED_SD, THERMOMETER_SD, RingModes, check_air, check_free, ring_modes
 from .settling import Settled
 from .windows import check_window
 
@@ -113,7 +115,7 @@ class Calibration:
         as much less. Where both are free only this is well known.
         """
         count = self.ring.count
-        ahead = np.stack([np.cos(self.ring.heading), np.sin(self.ring.heading)], axis=-1)
+        ahead = unit(np.asarray(self.ring.heading))
         moved = np.asarray(self.ring.position) - np.asarray(self.nominal.position)
         change = np.asarray(self.ring.range_offset) - np.asarray(self.nominal.range_offset) - (ahead * moved).sum(-1)
         along = np.zeros((count, len(self.covariance)))
@@ -257,14 +259,9 @@ def calibrate(
     )
 
 
-def speed_of_sound(temperature: float) -> float:
-    """Metres per second in dry air of this temperature, deg C."""
-    return 331.3 * float(np.sqrt(1 + temperature / 273.15))
-
-
 def _held(free: Sequence[str], mean: str, speed_sd: float, temperature: float | None, found: Settled) -> dict[str, str]:
     """What was not estimated, and why."""
-    held = {name: "not asked for" for name in ("offset", "speed", "position", "radius", "heading") if name not in free}
+    held = {name: "not asked for" for name in FREE if name not in free}
     if "heading" in held:
         held["heading"] = "not asked for; ranges do not depend on it"
     if mean:

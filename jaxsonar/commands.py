@@ -197,7 +197,8 @@ def reference(options: argparse.Namespace) -> None:
     from .files import check_outputs, shown
     from .hardware.errors import SonarError
     from .hardware.lasers import read_corridor8_laser
-    from .polygonal import polygonal_model, unit
+    from .polygonal import polygonal_model
+    from .poses import unit
     from .reference import laser_points, reference_map, save_reference
 
     check_outputs({"-o": options.output, "--figure": options.figure}, _laser_files(options.recording))

@@ -13,8 +13,8 @@ from .local import LocalModel
 from .logs import Log
 from .maps import GlobalMap
 from .office import Office
-from .polygonal import polygonal_model, unit
-from .poses import to_world
+from .polygonal import polygonal_model
+from .poses import to_world, unit
 from .report import Column, Picture, Section, Table, save_report
 from .rooms import ranges_in
 from .tables import LINE_COLUMNS, MAP_COLUMNS

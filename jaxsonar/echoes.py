@@ -29,6 +29,11 @@ def room_for(count: int, *, least: int) -> int:
     return room
 
 
+def power_of_two(count: int, *, least: int) -> int:
+    """Room for count things in even fewer shapes: ``least``, a power of two, or the first such that holds them."""
+    return max(least, 1 << max(count - 1, 0).bit_length())
+
+
 class Step(NamedTuple):
     """Scans that one compiled step takes, and their echoes: real ones first, then padding, likewise for the scans."""
 
@@ -143,7 +148,7 @@ class FlatEchoes:
             most = int(column.max(initial=-1)) + 1
             columns = room_for(most, least=64 if self.pose is None else 256)
             if dear:
-                columns = 1 << (columns - 1).bit_length()
+                columns = power_of_two(columns, least=1)
             path = np.zeros((step, columns), np.int32)
             reported = np.full((step, columns), np.nan, np.float32)
             path[row, column] = self.path[begin:end]

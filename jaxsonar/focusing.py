@@ -21,11 +21,10 @@ from .kernels.paths import Sensors
 from .kernels.sharpness import ring_sharpness
 from .logs import Log
 from .ring import Ring
+from .ringmodes import SPEED_SD
 
 OFFSET_SD = 0.015
 """Metres; prior of a sensor's relative range offset around the given one."""
-SPEED_SD = 0.015
-"""Prior of the logarithm of the speed of sound around the given one."""
 MOST_OFFSET, MOST_SPEED = 0.050, 0.04
 """Metres, and share of the speed: no result is farther from the given ring."""
 WORLD = 8.0

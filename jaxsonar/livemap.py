@@ -17,7 +17,7 @@ from .local import LocalModel, check_method, local_model, local_models
 from .logs import Log, Scan
 from .maps import GlobalMap
 from .poses import relative
-from .ring import Ring
+from .ring import Ring, speed_of_sound
 
 AT_ONCE = 16
 """Scans taken together where so many wait."""
@@ -180,7 +180,6 @@ class LiveMap:
         if not measured or abs(measured[-1] - self._temperature) < DEGREE:
             return
         self._temperature = measured[-1]
-        speed = 331.3 * np.sqrt(1 + self._temperature / 273.15)
-        self.ring = replace(self.ring, speed_of_sound=float(speed))
+        self.ring = replace(self.ring, speed_of_sound=speed_of_sound(self._temperature))
         if self._mapper is not None:
             self._mapper = replace(self._mapper, ring=self.ring)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .local import LocalModel
-from .poses import inverse, to_world, wrap_angle
+from .poses import inverse, to_world, unit, wrap_angle
 from .rooms import point_to_walls
 
 LINE_FLOOR, POINT_FLOOR = (0.02, np.radians(1.0)), 0.03
@@ -78,7 +78,7 @@ def _where_two_meet(point: Float[np.ndarray, "2"], model: LocalModel) -> bool:
     """Whether two of the scan's own lines say already that there is a corner."""
     theta = np.array([line.theta for line in model.lines], dtype=np.float64)
     rho = np.array([line.rho for line in model.lines], dtype=np.float64)
-    on = theta[np.abs(normal_of(theta) @ point - rho) < SAME_PLACE]
+    on = theta[np.abs(unit(theta) @ point - rho) < SAME_PLACE]
     return bool((np.abs(np.sin(on[:, None] - on)) > NOT_PARALLEL).any())
 
 
@@ -99,7 +99,7 @@ class Places:
     @property
     def normal(self) -> Float[np.ndarray, "walls 2"]:
         """Away from the robot."""
-        return normal_of(self.theta)
+        return unit(self.theta)
 
     @property
     def tangent(self) -> Float[np.ndarray, "walls 2"]:
@@ -190,7 +190,7 @@ class Places:
         from_reference = segment - self.reference[wall]
         middle = from_reference.mean(axis=0)
         along = float(middle @ tangent_of(self.theta[wall]))
-        across = middle @ normal_of(self.theta[wall]) - self.offset[wall]
+        across = middle @ unit(self.theta[wall]) - self.offset[wall]
         surprise = np.array([across, wrap_angle(float(theta - self.theta[wall]))])
         design = np.array([[1.0, along], [0.0, 1.0]])
         gain = self.cov[wall] @ design.T @ np.linalg.inv(design @ self.cov[wall] @ design.T + np.diag(sigma**2))
@@ -201,11 +201,6 @@ class Places:
         reached = from_reference @ tangent_of(self.theta[wall])
         self.extent[wall] = min(self.extent[wall, 0], reached.min()), max(self.extent[wall, 1], reached.max())
         self.sightings[wall] += 1
-
-
-def normal_of(theta: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, "*batch 2"]:
-    """Unit vectors of these directions."""
-    return np.stack([np.cos(theta), np.sin(theta)], axis=-1)
 
 
 def tangent_of(theta: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, "*batch 2"]:

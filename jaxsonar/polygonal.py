@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.hardware.errors import SonarError
 
-from .poses import to_world
+from .poses import to_world, unit
 from .rooms import cross, crossings
 
 JOIN = 0.2
@@ -139,11 +139,6 @@ def check_scan(bearing: Float[np.ndarray, " beams"], ranges: Float[np.ndarray, "
         raise SonarError("laser: bearings that do not ascend came; allowed are finite radians, each above the last")
     if (ranges < 0).any() or np.isinf(ranges).any():
         raise SonarError("laser: a range below 0 or infinite came; allowed are metres, NaN = nothing came back")
-
-
-def unit(angle: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, "*batch 2"]:
-    """Unit vectors in these directions, radians."""
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def lengths(segments: Float[np.ndarray, "segments 2 2"]) -> Float[np.ndarray, " segments"]:

@@ -10,6 +10,11 @@ def wrap_angle(angle: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, 
     return np.where(wrapped >= np.pi, -np.pi, wrapped)  # the modulo may round up to pi
 
 
+def unit(angle: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, "*batch 2"]:
+    """Unit vectors in these directions, radians."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
 def rotation(theta: float) -> Float[np.ndarray, "2 2"]:
     """Matrix that turns counter-clockwise by theta radians."""
     c, s = np.cos(theta), np.sin(theta)

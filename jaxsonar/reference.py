@@ -12,8 +12,8 @@ from jaxsonar.hardware.lasers import LaserRecording
 
 from .evaluation import evaluate
 from .geojson import feature, write_features
-from .polygonal import PolygonalModel, check_scan, fitted, joined, lengths, split, unit
-from .poses import rotation, to_world
+from .polygonal import PolygonalModel, check_scan, fitted, joined, lengths, split
+from .poses import rotation, to_world, unit
 from .rooms import cross
 
 _BIN = 0.05  # m; pitch of the cells that vote, and at which the profile of a wall is sampled

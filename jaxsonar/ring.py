@@ -238,6 +238,11 @@ class Ring(eqx.Module):
         return (reported - offset) * (self.speed_of_sound / REFERENCE_SPEED_OF_SOUND)
 
 
+def speed_of_sound(temperature: float) -> float:
+    """Metres per second in dry air of this temperature, deg C."""
+    return 331.3 * float(np.sqrt(1 + temperature / 273.15))
+
+
 def _one_each(
     value: Float[AnyArray, " sensors"] | Sequence[float] | float, count: int, field: str
 ) -> Float[np.ndarray, " sensors"]:

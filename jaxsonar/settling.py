@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 
-from .echoes import FlatEchoes
+from .echoes import FlatEchoes, power_of_two
 from .logs import Log
 from .poses import relative
 from .ring import Ring
@@ -70,16 +70,16 @@ class Data:
             share: of the way and the turn between scans that odometry is wrong by.
         """
         flats = [FlatEchoes.from_log(ring, log)[0] for log in logs]
+        fresh = [renewed(flat) for flat in flats]  # a reading that was not renewed is the one before, not one more
         used, counts = [], []
-        for log, flat in zip(logs, flats, strict=True):
-            # A reading that was not renewed is the one before, not one more.
-            count = np.bincount(flat.scan[renewed(flat)], minlength=len(log))
+        for log, flat, new in zip(logs, flats, fresh, strict=True):
+            count = np.bincount(flat.scan[new], minlength=len(log))
             rows = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1) & (count > 0))
             used.append(rows)
             counts.append(count[rows])
         begin = np.cumsum([0, *(len(rows) for rows in used)])
         most = max((int(count.max(initial=1)) for count in counts), default=1)
-        scans, columns = (1 << max(int(n) - 1, 0).bit_length() for n in (max(begin[-1], 8), max(most, 16)))
+        scans, columns = power_of_two(int(begin[-1]), least=8), power_of_two(most, least=16)
         data = cls(
             path=np.zeros((scans, columns), np.int32),
             reported=np.full((scans, columns), np.nan),
@@ -91,16 +91,25 @@ class Data:
             rows=tuple(used),
             begin=tuple(begin[:-1].tolist()),
         )
-        for number, (log, flat, rows, measured) in enumerate(zip(logs, flats, used, odometry, strict=True)):
-            data._fill(number, log, flat, rows, measured, share)
+        for number, columns_of in enumerate(zip(logs, flats, fresh, used, odometry, strict=True)):
+            data._fill(number, *columns_of, share)
         return data
 
-    def _fill(self, number, log: Log, flat: FlatEchoes, rows: np.ndarray, measured: np.ndarray, share: float) -> None:
+    def _fill(
+        self,
+        number: int,
+        log: Log,
+        flat: FlatEchoes,
+        new: np.ndarray,
+        rows: np.ndarray,
+        measured: np.ndarray,
+        share: float,
+    ) -> None:
         first = self.begin[number]
         here = slice(first, first + len(rows))
         place = np.full(len(log), -1)
         place[rows] = np.arange(first, first + len(rows))
-        echo = np.flatnonzero(renewed(flat) & (place[flat.scan] >= 0))
+        echo = np.flatnonzero(new & (place[flat.scan] >= 0))
         row = place[flat.scan[echo]]
         column = np.arange(len(echo)) - np.searchsorted(row, row)
         self.path[row, column] = flat.path[echo]

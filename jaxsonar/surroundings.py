@@ -9,11 +9,13 @@ from jaxtyping import Bool, Int
 
 from jaxsonar import kernels
 
+from .echoes import power_of_two
 from .local import local_models
 from .logs import Log
 from .mapping import assemble, build_map, gather_evidence
 from .maps import GlobalMap
 from .points import cluster, condense
+from .poses import unit
 from .ring import Ring
 
 _MEETS = 0.3  # m; walls that end this near to where their lines cross make a corner
@@ -70,7 +72,7 @@ def surroundings(worlds: Sequence[GlobalMap], *, tied: bool) -> Surroundings:
         first = sum(len(part) for part in kind)
         middle = map_.segments.mean(axis=1)
         half = np.linalg.norm(map_.segments[:, 1] - map_.segments[:, 0], axis=1) / 2
-        normal = np.stack([np.cos(map_.theta), np.sin(map_.theta)], axis=-1)
+        normal = unit(map_.theta)
         kept = ~own if tied else np.ones(len(own), bool)
         points = map_.points[kept]
         of_points = np.array([name == "corner" for name in map_.point_kinds], dtype=bool)[kept]
@@ -93,7 +95,7 @@ def _meetings(map_: GlobalMap) -> tuple[list[tuple[int, int]], Bool[np.ndarray, 
     turn = np.abs(np.sin(map_.theta[a] - map_.theta[b]))
     square = turn > np.cos(_SQUARE)
     a, b = a[square], b[square]
-    normal = np.stack([np.cos(map_.theta), np.sin(map_.theta)], axis=-1)
+    normal = unit(map_.theta)
     both = np.stack([normal[a], normal[b]], axis=1)
     cross = np.linalg.solve(both, np.stack([map_.rho[a], map_.rho[b]], axis=-1)[..., None])[..., 0]
     near = np.ones(len(a), dtype=bool)
@@ -110,7 +112,7 @@ def _padded(
 ) -> Surroundings:
     """With room for a power of two of reflectors, and of candidates, so that few shapes are compiled."""
     count = len(world)
-    room = _power_of_two(count)
+    room = power_of_two(count, least=_ROOM)
     more = room - count
 
     def pad(array: np.ndarray, filler: float | int = 0) -> np.ndarray:
@@ -124,7 +126,7 @@ def _padded(
     )
     first, second, of_world = np.array(meetings, dtype=np.int32).reshape(-1, 3).T
     pairs = len(first)
-    size = _power_of_two(count + 2 * pairs)
+    size = power_of_two(count + 2 * pairs, least=_ROOM)
     rest = size - count - 2 * pairs
     alone = np.arange(count, dtype=np.int32)
     candidates = kernels.Candidates(
@@ -141,7 +143,3 @@ def _padded(
         ),
     )
     return Surroundings(scene, pad(world.astype(np.int32), -1), candidates)
-
-
-def _power_of_two(count: int) -> int:
-    return max(_ROOM, 1 << max(count - 1, 0).bit_length())
