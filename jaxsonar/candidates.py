@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -90,7 +89,7 @@ def extract(
     ``arcs`` are given where they are not those of a ring at rest.
     """
     arcs = arcs_of(ring, settings) if arcs is None else arcs
-    for step in echoes.steps(settings.cells):
+    for step in echoes.steps(settings.cells, pieces=pieces_of(ring, settings)):
         packed = step.packed
         # Echo arcs -> equidistant points -> tangent lines -> votes -> low pass -> threshold, in one compiled step.
         occupied = kernels.occupied_cells(arcs, packed, settings=settings)
@@ -98,8 +97,8 @@ def extract(
         labels, counts = label_components(np.asarray(occupied))
         # Centres of gravity of the points in each cluster, and from the sensors involved the extent of each line.
         size = room_for(int(counts.max(initial=0)), least=16)
-        clusters, segments = kernels.cluster_lines(arcs, packed, jnp.asarray(labels), settings=settings, size=size)
-        real = slice(0, step.scans.stop - step.scans.start)  # the rest is padding
+        clusters, segments = kernels.cluster_lines(arcs, packed, labels, settings=settings, size=size)
+        real = slice(0, len(step.scans))  # the rest is padding
         columns = (clusters.rho, clusters.theta, clusters.votes, segments, clusters.involved)
         lines, involved = _sift(*(np.asarray(column)[real] for column in columns), min_echoes=settings.min_echoes)
         yield Extracted(step, lines, involved, counts[real])
@@ -163,15 +162,25 @@ def settings_for(
     return settings
 
 
-_latest: list[tuple[Ring, kernels.HoughSettings, kernels.RingArcs]] = []
+_latest: list[tuple[Ring, kernels.HoughSettings, kernels.RingArcs, Int[np.ndarray, " paths"]]] = []
 
 
 def arcs_of(ring: Ring, settings: kernels.HoughSettings) -> kernels.RingArcs:
     """Arcs of all paths of a ring; the latest ones are kept, so that a stream of single scans makes them once."""
-    for known_ring, known_settings, arcs in tuple(_latest):
+    return _known(ring, settings)[0]
+
+
+def pieces_of(ring: Ring, settings: kernels.HoughSettings) -> Int[np.ndarray, " paths"]:
+    """Into how many pieces of ``kernels.PIECE`` points the arc of each path is cut; turning a path changes none."""
+    return _known(ring, settings)[1]
+
+
+def _known(ring: Ring, settings: kernels.HoughSettings) -> tuple[kernels.RingArcs, Int[np.ndarray, " paths"]]:
+    for known_ring, known_settings, arcs, pieces in tuple(_latest):
         if known_ring is ring and known_settings == settings:
-            return arcs
+            return arcs, pieces
     points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
     arcs = kernels.ring_arcs(ring.sensors, settings=settings, points=points)
-    _latest[:] = [(ring, settings, arcs)]
-    return arcs
+    pieces = -(-np.asarray(arcs.arcs.counts).sum(axis=1) // kernels.PIECE)
+    _latest[:] = [(ring, settings, arcs, pieces)]
+    return arcs, pieces

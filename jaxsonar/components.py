@@ -6,6 +6,8 @@ from jaxtyping import Bool, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as graph_components
 
+_SHORT = 1 << 16  # cells that have less than 2^15 components
+
 
 def label_components(
     occupied: Bool[np.ndarray, "scans theta rho"],
@@ -26,7 +28,7 @@ def label_components(
     """
     scans, rows, columns = occupied.shape
     if scans == 0:
-        return np.zeros(occupied.shape, np.int32), np.zeros(0, np.int64)
+        return np.zeros(occupied.shape, np.int16), np.zeros(0, np.int64)
     image = np.zeros((scans, rows + 1, columns), np.uint8)  # an empty row keeps scans apart
     image[:, :rows] = occupied
     total, stacked = cv2.connectedComponents(image.reshape(-1, columns), connectivity=8, ltype=cv2.CV_32S)
@@ -35,8 +37,7 @@ def label_components(
     theta_seam = _touching(flat[:, 0], flat[:, -1], wrap=False)
     rho_seam = _touching(flat[:, :, 0], np.roll(flat[:, :, 0], rows // 2, axis=1), wrap=True)
     pairs = np.concatenate([theta_seam, rho_seam])
-    cell = np.flatnonzero(flat)
-    component = flat.ravel()[cell]
+    cell, component = np.flatnonzero(occupied), flat[occupied]  # few of all cells
     if len(pairs):
         graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(total, total))
         component = graph_components(graph, directed=False)[1][component]
@@ -47,10 +48,10 @@ def label_components(
     number = np.empty(len(order), np.int64)
     number[order] = np.arange(len(order)) - (np.cumsum(counts) - counts)[scan_of_component[order]] + 1
 
-    labels = np.zeros(flat.size, np.int32)
+    labels = np.zeros(occupied.size, np.int16 if rows * columns <= _SHORT else np.int32)
     labels[cell] = number[component]
     if len(rho_seam):
-        across = np.isin(component, component[np.isin(flat.ravel()[cell], rho_seam)])
+        across = np.isin(component, component[np.isin(flat[occupied], rho_seam)])
         turn = (cell // columns % rows - (cell[first] // columns % rows)[component]) % rows
         far = across & (np.minimum(turn, rows - turn) > rows // 4)
         labels[cell[far]] *= -1

@@ -1,9 +1,8 @@
 """Packing: from dense arrays or a log to the rectangles of real echoes that the compiled kernels take."""
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple, TypeVar
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -13,12 +12,16 @@ from jaxsonar.hardware.errors import SonarError
 from .logs import Log
 from .ring import Ring
 
-SCANS_PER_STEP = (1, 16, 256)
-"""Numbers of scans that a compiled step takes; what remains of a batch is padded with scans without echoes."""
-DEAR_SCANS_PER_STEP = (1, 32, 32)
+SCANS_PER_STEP = (256, 64, 16)
+"""Numbers of scans that a compiled step takes, besides one; what remains is padded with scans without echoes."""
+DEAR_SCANS_PER_STEP = (32,)
 """The same where a scan takes milliseconds and a compilation many seconds."""
+BLOCK = 4096
+"""Scans among which those are sought that need the same room."""
 _FARTHEST = 1e6  # m; beyond all rings, and within single precision
 _FEW_CELLS = 50_000  # accumulators larger than this are not stacked by the hundred
+_WORTH_A_SHAPE = 64  # scans
+_SLACK = 1.1
 
 
 def room_for(count: int, *, least: int) -> int:
@@ -37,8 +40,8 @@ def power_of_two(count: int, *, least: int) -> int:
 class Step(NamedTuple):
     """Scans that one compiled step takes, and their echoes: real ones first, then padding, likewise for the scans."""
 
-    scans: slice
-    """Which scans of the batch these are."""
+    scans: Int[np.ndarray, " scans"]
+    """Which scans of the batch these are, ascending; rows beyond them are padding."""
     path: Int[np.ndarray, "rows columns"]
     """Row of the ring's ``paths``; 0 where there is no echo."""
     reported: Float[np.ndarray, "rows columns"]
@@ -49,13 +52,16 @@ class Step(NamedTuple):
     """model_from_robot of each echo: x, y (m), theta (rad); None: all at the origin."""
     gathered: Float[np.ndarray, " rows"] | None
     """How many scans each row was gathered from; None: one."""
+    piece: Int[np.ndarray, "rows pieces"] | None
+    """Arcs in pieces (``kernels.Echoes``)."""
+    owner: Int[np.ndarray, "rows pieces"] | None
+    """Echo of each piece."""
 
     @property
     def packed(self) -> kernels.Echoes:
         """The echoes as the kernels take them."""
-        pose = None if self.pose is None else jnp.asarray(self.pose)
-        gathered = None if self.gathered is None else jnp.asarray(self.gathered)
-        return kernels.Echoes(jnp.asarray(self.path), jnp.asarray(self.reported), pose, gathered)
+        arrays: Any = (self.path, self.reported, self.pose, self.gathered, self.piece, self.owner)
+        return kernels.Echoes(*arrays)  # NumPy arrays: a compiled step takes them to where it runs
 
 
 class FlatEchoes:
@@ -129,37 +135,124 @@ class FlatEchoes:
         heard = path >= 0
         return cls(len(log), log.echo_scan[heard], path[heard], log.range[heard]), int((~heard).sum())
 
-    def steps(self, cells: int, *, dear: bool = False) -> Iterator["Step"]:
+    def steps(
+        self, cells: int, *, pieces: Int[np.ndarray, " paths"] | None = None, dear: bool = False
+    ) -> Iterator["Step"]:
         """The scans in rectangles of few different shapes, fewer scans at once if the accumulator has many cells.
+
+        Scans are taken in blocks; those of a block that need the same room go together. What a scan gives depends on
+        neither its room nor its company.
 
         Args:
             cells: of the accumulator.
+            pieces: into how many pieces of ``kernels.PIECE`` points the arc of each path is cut; each echo has the
+                points of the widest arc if left out.
             dear: compiling another shape is dear, a scan too: even fewer shapes, with fewer scans.
         """
-        one, some, many = DEAR_SCANS_PER_STEP if dear else SCANS_PER_STEP
-        last = 0
-        while last < self.scans:
-            first, left = last, self.scans - last
-            step = one if left == 1 else some if left <= 4 * some or cells > _FEW_CELLS else many
-            last = min(first + step, self.scans)
-            begin, end = self.start[first], self.start[last]
-            row = self.scan[begin:end] - first
-            column = np.arange(begin, end) - self.start[first + row]
-            most = int(column.max(initial=-1)) + 1
-            columns = room_for(most, least=64 if self.pose is None else 256)
-            if dear:
-                columns = power_of_two(columns, least=1)
-            path = np.zeros((step, columns), np.int32)
-            reported = np.full((step, columns), np.nan, np.float32)
-            path[row, column] = self.path[begin:end]
-            reported[row, column] = np.minimum(self.reported[begin:end], _FARTHEST)
-            echo = np.zeros((step, columns), np.int64)
-            echo[row, column] = np.arange(begin, end)
-            pose = gathered = None
-            if self.pose is not None:
-                pose = np.zeros((step, columns, 3), np.float32)
-                pose[row, column] = self.pose[begin:end]
-            if self.gathered is not None:
-                gathered = np.ones(step, np.float32)
-                gathered[: last - first] = self.gathered[first:last]
-            yield Step(slice(first, last), path, reported, echo, pose, gathered)
+        if self.scans == 0:
+            return
+        density = _density(pieces)
+        need = self._need(pieces, density)
+        for first in range(0, self.scans, BLOCK):
+            block = np.arange(first, min(first + BLOCK, self.scans))
+            for scans, columns in self._groups(block, need[block], dear=dear):
+                last = 0
+                while last < len(scans):
+                    rows = self._rows(len(scans) - last, cells, dear=dear)
+                    yield self._step(scans[last : last + rows], rows, columns, pieces, density)
+                    last += rows
+
+    def _rows(self, left: int, cells: int, *, dear: bool) -> int:
+        """Number of scans that the next step takes."""
+        if self.scans == 1:
+            return 1
+        sizes = DEAR_SCANS_PER_STEP if dear else SCANS_PER_STEP if cells <= _FEW_CELLS else SCANS_PER_STEP[-1:]
+        return next((size for size in sizes if size <= left), sizes[-1])
+
+    def _need(self, pieces: Int[np.ndarray, " paths"] | None, density: float) -> Int[np.ndarray, " scans"]:
+        """Columns that each scan needs for its echoes, and for their pieces."""
+        count = np.diff(self.start)
+        if pieces is None:
+            return count
+        total = np.concatenate([[0], np.cumsum(pieces[self.path])])
+        of_scan = total[self.start[1:]] - total[self.start[:-1]]
+        return np.maximum(count, np.ceil(of_scan / density).astype(np.int64))
+
+    def _groups(
+        self, block: Int[np.ndarray, " scans"], need: Int[np.ndarray, " scans"], *, dear: bool
+    ) -> Iterator[tuple[Int[np.ndarray, " some"], int]]:
+        """Scans that go together, and their columns.
+
+        Where scans are dear each has the room that it needs by itself, so that even the last digits do not depend on
+        the others. Else groups too small to be worth a shape join the next larger one: votes are whole numbers.
+        """
+        least = 64 if self.pose is None else 256
+        fit, floor, worth = (power_of_two, least, 0) if dear else (room_for, least // 2, _WORTH_A_SHAPE)
+        columns = np.array([fit(count, least=floor) for count in range(int(need.max()) + 1)])[need]
+        waiting = block[:0]
+        rooms = np.unique(columns)
+        for room in rooms:
+            waiting = np.sort(np.concatenate([waiting, block[columns == room]]))
+            if len(waiting) >= worth or room == rooms[-1]:
+                yield waiting, max(int(room), least if len(block) < worth else 0)
+                waiting = block[:0]
+
+    def _step(
+        self,
+        scans: Int[np.ndarray, " scans"],
+        rows: int,
+        columns: int,
+        pieces: Int[np.ndarray, " paths"] | None,
+        density: float,
+    ) -> "Step":
+        count = self.start[scans + 1] - self.start[scans]
+        row = np.repeat(np.arange(len(scans)), count)
+        column = _counting(count)
+        own = np.repeat(self.start[scans], count) + column
+        path, reported = np.zeros((rows, columns), np.int32), np.full((rows, columns), np.nan, np.float32)
+        path[row, column] = self.path[own]
+        reported[row, column] = np.minimum(self.reported[own], _FARTHEST)
+        echo = np.zeros((rows, columns), np.int64)
+        echo[row, column] = own
+        pose = gathered = piece = owner = None
+        if self.pose is not None:
+            pose = np.zeros((rows, columns, 3), np.float32)
+            pose[row, column] = self.pose[own]
+        if self.gathered is not None:
+            gathered = np.ones(rows, np.float32)
+            gathered[: len(scans)] = self.gathered[scans]
+        if pieces is not None:
+            of_echo = pieces[self.path[own]]
+            at = _counting(np.bincount(row, of_echo, minlength=len(scans)).astype(np.int64))
+            at = np.repeat(row, of_echo), at
+            piece, owner = np.full((2, rows, int(np.ceil(columns * density))), -1, np.int32)
+            piece[at], owner[at] = _counting(of_echo), np.repeat(column, of_echo)
+            owner = np.maximum(owner, 0)
+        return Step(scans, path, reported, echo, pose, gathered, piece, owner)
+
+
+def _density(pieces: Int[np.ndarray, " paths"] | None) -> float:
+    """Room for pieces per column: somewhat more than a scan has on average that hears all paths alike."""
+    if pieces is None or not pieces.any():
+        return 1.0
+    return min(_SLACK * float(pieces.mean()), float(pieces.max()))
+
+
+def _counting(counts: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " all"]:
+    """0, 1, 2, ... for each of some groups of these sizes, one after the other."""
+    end = np.cumsum(counts)
+    return np.arange(end[-1] if len(end) else 0) - np.repeat(end - counts, counts)
+
+
+Item = TypeVar("Item")
+
+
+def in_order(items: Iterable[tuple[int, Item]]) -> Iterator[Item]:
+    """What belongs to scans 0, 1, 2, ..., from what comes in another order with its number."""
+    early: dict[int, Item] = {}
+    last = 0
+    for index, item in items:
+        early[index] = item
+        while last in early:
+            yield early.pop(last)
+            last += 1

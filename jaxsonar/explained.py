@@ -4,13 +4,12 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
-from .candidates import Lines, arcs_of
+from .candidates import Lines, arcs_of, pieces_of
 from .echoes import FlatEchoes, Step
 from .ring import Ring
 
@@ -71,10 +70,10 @@ def explained(
     """
     expected = kernels.Expectations()
     arcs = arcs_of(ring, settings) if arcs is None else arcs
-    noise = jnp.asarray(np.nan if sigma is None else sigma, jnp.float32)
-    for step in echoes.steps(settings.cells, dear=True):
+    noise = np.float32(np.nan if sigma is None else sigma)
+    for step in echoes.steps(settings.cells, pieces=pieces_of(ring, settings), dear=True):
         found = kernels.explain(arcs, step.packed, noise, settings=settings, expected=expected)
-        real = slice(0, step.scans.stop - step.scans.start)  # the rest is padding
+        real = slice(0, len(step.scans))  # the rest is padding
         found = jax.tree.map(lambda leaf, rows=real: np.asarray(leaf)[rows], found)
         sure = (found.kind >= 0) & (found.probability.max(axis=-1) >= DECIDED)
         # The kind that explains most must be the likeliest one, too: its parameters are those that were fitted.

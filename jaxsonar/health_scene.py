@@ -63,7 +63,7 @@ def thinned(log: Log, rows: Int[np.ndarray, " rows"]) -> Log:
 def scene_of_scans(ring: Ring, log: Log, sigma: float | None, progress: Callable[[int, int], None] | None) -> Scene:
     """What explains each scan for itself."""
     flat, _ = FlatEchoes.from_log(ring, log)
-    parts = []
+    parts, order = [], []
     for found in explained(ring, flat, settings_for(ring, None), sigma) if len(flat.scan) else ():
         best: Any = found.found  # NumPy arrays by now
         kind, involved = best.kind, best.involved
@@ -77,11 +77,13 @@ def scene_of_scans(ring: Ring, log: Log, sigma: float | None, progress: Callable
         solid = (found.decided == kernels.PLANE) & (support >= SUPPORT) & ((own > 0).sum(axis=-1) >= 3)
         ends = _along(theta, best.segment)
         parts.append(Scene(kind, best.parameters, solid, ends, support, own, best.sigma, False))
+        order.append(found.step.scans)
         if progress is not None:
-            progress(found.step.scans.stop, len(log))
+            progress(sum(map(len, order)), len(log))
     if not parts:
         return nowhere(ring, len(log))
-    return Scene(*(np.concatenate(column) for column in list(zip(*parts, strict=True))[:-1]), fixed=False)
+    back = np.argsort(np.concatenate(order))
+    return Scene(*(np.concatenate(column)[back] for column in list(zip(*parts, strict=True))[:-1]), fixed=False)
 
 
 def nowhere(ring: Ring, scans: int) -> Scene:

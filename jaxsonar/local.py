@@ -1,7 +1,7 @@
 """Local models: the straight walls around the robot, from one scan (paper, section 4)."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,11 +11,11 @@ from jaxtyping import Float, Int
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
+from .candidates import Candidate, Extracted, extract
 from .candidates import Lines as Lines
 from .candidates import arcs_of as arcs_of
-from .candidates import extract
 from .candidates import settings_for as settings_for
-from .echoes import FlatEchoes, Step
+from .echoes import FlatEchoes, Step, in_order
 from .explained import KINDS, Explained, check_sigma, explained
 from .logs import Log, Scan
 from .poses import wrap_angle
@@ -178,8 +178,7 @@ def extract_lines(
     check_sigma(sigma)
     echoes, settings = FlatEchoes.from_dense(ring, ranges), settings_for(ring, settings)
     found = extract(ring, echoes, settings) if method == "hough" else explained(ring, echoes, settings, sigma)
-    steps = [step.lines for step in found]
-    return _concatenate(steps)
+    return _together(echoes.scans, [(step.step.scans, step.lines) for step in found])
 
 
 def local_model(
@@ -266,27 +265,43 @@ def models_of(
     ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSettings, arcs: kernels.RingArcs | None = None
 ) -> Iterator[LocalModel]:
     """A local model of every window of a log; windows of single scans are the scans themselves."""
-    paths = ring.paths
-    for extracted in extract(ring, windows.echoes, settings, arcs):
-        step = extracted.step
-        walls = verified(ring, extracted, settings, gap=windows.gap) if windows.gap else extracted.candidates
-        for row, index in enumerate(windows.last[step.scans]):
-            lines = tuple(
-                Line(
-                    rho=wall.rho,
-                    theta=wall.theta,
-                    segment=wall.segment,
-                    votes=wall.votes,
-                    echoes=len(wall.echoes),
-                    paths=paths[np.unique(step.path[row, wall.echoes])],
-                    scans=tuple(log.scan[np.unique(windows.scan[step.echo[row, wall.echoes]])].tolist()),
-                )
-                for wall in walls[row]
-            )
-            empty = ""
-            if not lines:
-                empty = _why_empty(_heard(ring, step, row), int(extracted.components[row]), settings.min_echoes)
-            yield LocalModel(int(log.scan[index]), float(log.stamp[index]), lines, empty)
+
+    def models() -> Iterator[tuple[int, LocalModel]]:
+        for extracted in extract(ring, windows.echoes, settings, arcs):
+            walls = verified(ring, extracted, settings, gap=windows.gap) if windows.gap else extracted.candidates
+            for row, window in enumerate(extracted.step.scans.tolist()):
+                yield window, _extracted_model(ring, log, windows, extracted, row, walls[row], settings)
+
+    return in_order(models())
+
+
+def _extracted_model(
+    ring: Ring,
+    log: Log,
+    windows: Windows,
+    extracted: Extracted,
+    row: int,
+    walls: list[Candidate],
+    settings: kernels.HoughSettings,
+) -> LocalModel:
+    step = extracted.step
+    index = windows.last[step.scans[row]]
+    lines = tuple(
+        Line(
+            rho=wall.rho,
+            theta=wall.theta,
+            segment=wall.segment,
+            votes=wall.votes,
+            echoes=len(wall.echoes),
+            paths=ring.paths[np.unique(step.path[row, wall.echoes])],
+            scans=tuple(log.scan[np.unique(windows.scan[step.echo[row, wall.echoes]])].tolist()),
+        )
+        for wall in walls
+    )
+    empty = ""
+    if not lines:
+        empty = _why_empty(_heard(ring, step, row), int(extracted.components[row]), settings.min_echoes)
+    return LocalModel(int(log.scan[index]), float(log.stamp[index]), lines, empty)
 
 
 def _explained_models(
@@ -298,9 +313,13 @@ def _explained_models(
     arcs: kernels.RingArcs | None = None,
 ) -> Iterator[LocalModel]:
     """A local model of every scan of a log by maximum likelihood."""
-    for found in explained(ring, echoes, settings, sigma, arcs=arcs):
-        for row, index in enumerate(range(found.step.scans.start, found.step.scans.stop)):
-            yield _explained_model(ring, found, row, int(log.scan[index]), float(log.stamp[index]))
+
+    def models() -> Iterator[tuple[int, LocalModel]]:
+        for found in explained(ring, echoes, settings, sigma, arcs=arcs):
+            for row, scan in enumerate(found.step.scans.tolist()):
+                yield scan, _explained_model(ring, found, row, int(log.scan[scan]), float(log.stamp[scan]))
+
+    return in_order(models())
 
 
 def _explained_model(ring: Ring, explained: Explained, row: int, scan: int, stamp: float) -> LocalModel:
@@ -357,18 +376,22 @@ def _why_empty(heard: int, components: int, min_echoes: int) -> str:
     return f"no component with {min_echoes} echoes"
 
 
-def _concatenate(steps: list[Lines]) -> Lines:
+def _together(scans: int, steps: list[tuple[Int[np.ndarray, " _"], Lines]]) -> Lines:
     """One batch from several, with room for as many lines as the scan with the most, at least one."""
-    none, pair = np.zeros((0, 1), np.float32), np.zeros((0, 1, 2, 2), np.float32)
-    nothing = Lines(none, none, none.astype(np.float64), none.astype(np.int64), segments=pair, cov=pair)
-    steps = [nothing, *steps]
-    most = max(step.rho.shape[1] for step in steps)
+    most = max([1, *(lines.rho.shape[1] for _, lines in steps)])
 
-    def column(name: str) -> np.ndarray:
-        parts = [getattr(step, name) for step in steps]
-        filler = 0 if parts[0].dtype.kind == "i" else np.nan
-        room = [[(0, 0), (0, most - part.shape[1]), *[(0, 0)] * (part.ndim - 2)] for part in parts]
-        wide = [np.pad(part, pad, constant_values=filler) for part, pad in zip(parts, room, strict=True)]
-        return np.concatenate(wide)
+    def column(name: str, dtype: type, *shape: int) -> np.ndarray:
+        whole = np.full((scans, most, *shape), 0 if dtype is np.int64 else np.nan, dtype)
+        for rows, lines in steps:
+            part = getattr(lines, name)
+            whole[rows, : part.shape[1]] = part
+        return whole
 
-    return Lines(**{field.name: column(field.name) for field in fields(Lines)})
+    return Lines(
+        rho=column("rho", np.float32),
+        theta=column("theta", np.float32),
+        votes=column("votes", np.float64),
+        echoes=column("echoes", np.int64),
+        segments=column("segments", np.float32, 2, 2),
+        cov=column("cov", np.float32, 2, 2),
+    )

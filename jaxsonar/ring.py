@@ -1,6 +1,7 @@
 """The ring: where the sensors sit, which of them hear each other, and in which directions (paper, section 3)."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from operator import index
 
 import equinox as eqx
@@ -168,19 +169,12 @@ class Ring(eqx.Module):
 
         An offset that leads to the receivers of an earlier one (as +2 and -2 in a ring of four) is listed once.
         """
-        offsets = [0] + [sign * k for k in range(1, self.neighbors + 1) for sign in (1, -1)]
-        distinct = list(dict.fromkeys(offset % self.count for offset in offsets))
-        tx = np.tile(np.arange(self.count), len(distinct))
-        rx = (tx + np.repeat(distinct, self.count)) % self.count
-        return np.stack([tx, rx], axis=-1)
+        return _paths(self.count, self.neighbors)
 
     @property
     def path_index(self) -> Int[np.ndarray, "sensors sensors"]:
         """Row of ``paths`` that holds (tx, rx), or -1 where that pair is no echo path of this ring."""
-        index = np.full((self.count, self.count), -1)
-        paths = self.paths
-        index[paths[:, 0], paths[:, 1]] = np.arange(len(paths))
-        return index
+        return _path_index(self.count, self.neighbors)
 
     @property
     def sensors(self) -> kernels.Sensors:
@@ -257,3 +251,23 @@ def _whole(value: int, field: str) -> int:
         return index(value)
     except TypeError:
         raise SonarError(f"ring: {field} {value!r}; allowed is a whole number") from None
+
+
+@lru_cache(maxsize=8)
+def _paths(count: int, neighbors: int) -> Int[np.ndarray, "paths 2"]:
+    """``Ring.paths``, read-only; asked for with every scan."""
+    offsets = [0] + [sign * k for k in range(1, neighbors + 1) for sign in (1, -1)]
+    distinct = list(dict.fromkeys(offset % count for offset in offsets))
+    tx = np.tile(np.arange(count), len(distinct))
+    paths = np.stack([tx, (tx + np.repeat(distinct, count)) % count], axis=-1)
+    paths.setflags(write=False)
+    return paths
+
+
+@lru_cache(maxsize=8)
+def _path_index(count: int, neighbors: int) -> Int[np.ndarray, "sensors sensors"]:
+    """``Ring.path_index``, read-only."""
+    paths, index = _paths(count, neighbors), np.full((count, count), -1)
+    index[paths[:, 0], paths[:, 1]] = np.arange(len(paths))
+    index.setflags(write=False)
+    return index

@@ -28,6 +28,7 @@ from .explanation import PLANE as PLANE
 from .explanation import Expectations as Expectations
 from .explanation import Explanation as Explanation
 from .explanation import explain as explain
+from .extraction import PIECE as PIECE
 from .extraction import Echoes as Echoes
 from .extraction import RingArcs as RingArcs
 from .extraction import accumulators as accumulators
@@ -37,6 +38,7 @@ from .extraction import moved_arcs as moved_arcs
 from .extraction import occupied_cells as occupied_cells
 from .extraction import points_of_widest_arc as points_of_widest_arc
 from .extraction import ring_arcs as ring_arcs
+from .extraction import sensors_of as sensors_of
 from .fitting import Fits as Fits
 from .fitting import fit_candidates as fit_candidates
 from .geometry import edge_range as edge_range

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .paths import EchoPaths, Sensors, echo_paths
+from .paths import EchoPaths, Sensors, chord_squared, echo_paths
 from .scene import AnyArray, Reflection, Scene, audible, expected_report, take
 
 _WIDER = 1.2  # cones, for sensors that look a little elsewhere than they should
@@ -56,7 +56,8 @@ def associate(
         reported: half path lengths as reported, metres; NaN where there is no echo.
     """
     paths = echo_paths(sensors)
-    paths = eqx.tree_at(lambda p: p.half_beam, paths, jnp.minimum(_WIDER * paths.half_beam, jnp.pi / 2))
+    half_beam = jnp.minimum(_WIDER * 2 * jnp.arcsin(jnp.sqrt(paths.cone) / 2), jnp.pi / 2)
+    paths = eqx.tree_at(lambda p: p.cone, paths, chord_squared(half_beam))
     first, second = take(scene, candidates.reflection.first), take(scene, candidates.reflection.second)
 
     def report(pose, reflection, first, second, path: EchoPaths):

@@ -37,7 +37,7 @@ def off_axis_angles(
     """
     count = sensors.heading.shape[0]
     paths = jax.tree.map(lambda leaf: leaf[:count], echo_paths(sensors))
-    wide = eqx.tree_at(lambda p: p.half_beam, paths, jnp.full_like(paths.half_beam, jnp.pi / 2))
+    wide = eqx.tree_at(lambda p: p.cone, paths, jnp.full_like(paths.cone, 2))  # half the plane
 
     def one(pose, here, reflection, own, first, second, path):
         reach, share, arrival = audible(pose, reflection, first, second, path)

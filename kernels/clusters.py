@@ -22,12 +22,14 @@ class Clusters(eqx.Module):
 
 
 def centres_of_gravity(
-    rho: Float[Array, "echoes points"],
-    normal_x: Float[Array, "echoes points"],
-    normal_y: Float[Array, "echoes points"],
-    label: Int[Array, "echoes points"],
+    rho: Float[Array, "arcs points"],
+    normal_x: Float[Array, "arcs points"],
+    normal_y: Float[Array, "arcs points"],
+    label: Int[Array, "arcs points"],
+    owner: Int[Array, " arcs"],
     *,
     clusters: int,
+    echoes: int,
 ) -> Clusters:
     """Centre of gravity of the POINTS of each component (paper, section 4), the mean of theta taken on the circle.
 
@@ -38,27 +40,46 @@ def centres_of_gravity(
         label: component of the cell that each point fell into: 0 for none, k or -k for component k. Minus marks cells
             that joined across rho = 0: their points enter as the same lines seen from the other side, so that a
             component around rho = 0 has one centre.
+        owner: echo that each arc, or piece of one, belongs to.
         clusters: how many components the result has room for.
+        echoes: number of echoes.
     """
     flip = jnp.where(rho < 0, -1, 1) * jnp.sign(label)  # 0 for the points in no component
     flip = flip.astype(rho.dtype)
-    moments = jnp.stack([jnp.abs(flip), flip * rho, flip * normal_x, flip * normal_y], axis=-1)
-    per_echo = jax.vmap(lambda member, values: jnp.zeros((clusters + 1, 4), rho.dtype).at[member].add(values))
-    of_echo = per_echo(jnp.abs(label), moments)[:, 1:]
-    involved = (of_echo[..., 0] > 0).T
-    sums = of_echo.sum(axis=0)
-    votes = sums[:, 0].astype(jnp.int32)  # exact: far below 2**24 points
-    sums, empty = sums[:, 1:], votes == 0
+    member = jnp.abs(label)
+    counts = _counted(owner[:, None] * (clusters + 1) + member, (clusters + 1) * echoes).reshape(echoes, -1)[:, 1:]
+    involved, votes = (counts > 0).T, counts.sum(axis=0)
+    sums = _summed(member, jnp.stack([flip * rho, flip * normal_x, flip * normal_y]), clusters + 1)[:, 1:]
+    empty = votes == 0
     count = jnp.where(empty, 1, votes).astype(rho.dtype)
-    nowhere = (sums[:, 1] == 0) & (sums[:, 2] == 0)
-    east = jnp.where(nowhere, 1, sums[:, 1])  # atan2(0, 0) has no gradient
-    mean_rho, mean_theta = fold_line(sums[:, 0] / count, jnp.arctan2(sums[:, 2], east))
+    nowhere = (sums[1] == 0) & (sums[2] == 0)
+    east = jnp.where(nowhere, 1, sums[1])  # atan2(0, 0) has no gradient
+    mean_rho, mean_theta = fold_line(sums[0] / count, jnp.arctan2(sums[2], east))
     return Clusters(
         rho=jnp.where(empty, jnp.nan, mean_rho),
         theta=jnp.where(empty, jnp.nan, mean_theta),
         votes=votes,
         involved=involved,
     )
+
+
+def _counted(index: Int[Array, "arcs points"], size: int) -> Int[Array, " size"]:
+    return jnp.zeros(size, jnp.int32).at[index.ravel()].add(1, mode="promise_in_bounds")
+
+
+def _summed(member: Int[Array, "arcs points"], values: Float[Array, "columns arcs points"], size: int):
+    """Sums over the points of each component, (columns, size): one after the other on a CPU, else without atomics."""
+
+    def scattered(member, values):
+        one = jnp.zeros(size, values.dtype)
+        return jax.vmap(lambda column: one.at[member].add(column, mode="promise_in_bounds"))(values)
+
+    def multiplied(member, values):
+        own = member[None] == jnp.arange(size)[:, None]
+        return jnp.where(own[None], values[:, None], 0).sum(axis=-1)
+
+    flat = member.ravel(), values.reshape(len(values), -1)
+    return jax.lax.platform_dependent(*flat, cpu=scattered, default=multiplied)
 
 
 def extent(

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from . import arcs, clusters, hough, reflectors
 from .extraction import Echoes, RingArcs, lines_of_scan, over_scans
-from .fitting import corner, edge, fit, heard, plane
+from .fitting import edge, fit, heard, plane
 from .geometry import fold_line, normal, tangent, wrap_angle
 from .hough import HoughSettings
 from .paths import EchoPaths
@@ -34,8 +34,9 @@ from .reflectors import Sighting
 
 PLANE, CORNER, EDGE = 0, 1, 2
 """Kinds of reflectors, in the order of ``Explanation.probability``."""
+_DIFFRACTS = (0.0, 1.0)  # corner, edge
 _PASSES = 4
-_STEPS = 3  # of the fit in each pass
+_STEPS = 2  # of the fit in each pass
 _SECOND_ORDER_WALLS = 7  # of a scan's reflectors, those with the most evidence, between which sound is followed
 
 
@@ -138,9 +139,9 @@ class _Scan(NamedTuple):
     """ONE scan, ready to be explained."""
 
     paths: EchoPaths
-    """All paths of the ring."""
+    """All paths of the ring, their axis last: loops over them run along the memory."""
     echo: EchoPaths
-    """The path of each echo."""
+    """The path of each echo, their axis last."""
     path: Array
     """(echoes,) its row."""
     reach: Array
@@ -186,7 +187,6 @@ class _Support(NamedTuple):
 
 
 Model = Callable[[Float[Array, "2"], EchoPaths], Sighting]
-_MODELS: tuple[Model, ...] = (reflectors.plane, reflectors.corner, reflectors.edge)
 
 
 @partial(jax.jit, static_argnames=("settings", "expected"))
@@ -220,7 +220,8 @@ def explain(
             packed.range, echo.range_offset
         )
         valid = (reach > 0) & (reach < ring.max_range)
-        scan = _Scan(ring.paths, echo, packed.path, reach, valid, ring.max_range, ring.full_wall)
+        paths, own = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (ring.paths, echo))
+        scan = _Scan(paths, own, packed.path, reach, valid, ring.max_range, ring.full_wall)
         known = jnp.isfinite(sigma)
         first = jnp.where(known, jnp.maximum(sigma, expected.least_sigma), expected.sigma)
         start, here = _fitted(ring, packed, rho, theta, first, expected)
@@ -234,12 +235,13 @@ def explain(
             scene, start = state
             supports = _weighed(scan, start, scene, expected)
             chosen = _chosen(scan, supports, here, expected)
-            found = _taken(supports, chosen[0])
+            found = _taken(supports, chosen.hypothesis)
             scene = _learned(scan, found, chosen, scene, sigma, expected)
             return (scene, supports.parameters.reshape(start.shape)), (found, chosen, scene.sigma)
 
         _, passes = jax.lax.scan(look, (scene, start), None, length=_PASSES)
-        found, (_, kind, evidence, involved, probability), noise = jax.tree.map(lambda leaf: leaf[-1], passes)
+        found, chosen, noise = jax.tree.map(lambda leaf: leaf[-1], passes)
+        _, kind, evidence, involved, probability = chosen
         is_plane = kind == PLANE
         rho, theta = fold_line(found.parameters[:, 0], found.parameters[:, 1])
         flipped = is_plane & (found.parameters[:, 0] < 0)
@@ -303,33 +305,49 @@ def _fitted(
     total = jnp.where((near & better).any(axis=1), -1, total)
     total, best = jax.lax.top_k(total, expected.hypotheses)
 
-    def points(line: Float[Array, "2"], score: Float[Array, " echoes"]) -> Float[Array, "2 2"]:
-        # They begin in the middle of what the plane explains.
-        foot = (echo.tx + echo.rx) / 2 @ tangent(line[1])
+    def point(diffracts: Float[Array, ""], line: Float[Array, "2"], score: Float[Array, " echoes"]):
+        # It begins in the middle of what the plane explains. A corner sends and hears as if from the virtual sensor.
+        middle, half = (echo.tx + echo.rx) / 2, (echo.rx - echo.tx) / 2 * diffracts
+        foot = middle @ tangent(line[1])
         place = line[0] * normal(line[1]) + (score * foot).sum() / jnp.maximum(score.sum(), 1e-6) * tangent(line[1])
-        return jnp.stack(
-            [fit(model, place, echo, tolerance=tolerance, widest=tolerance)[0] for model in (corner, edge)]
-        )
+        legs = eqx.tree_at(lambda e: (e.tx, e.rx), echo, (middle - half, middle + half))
+        return fit(edge, place, legs, tolerance=tolerance, widest=tolerance)[0]
 
-    both = jax.vmap(points)(lines[best], scores[best])
-    return jnp.concatenate([lines[best][None], jnp.moveaxis(both, 1, 0)]), total > 0
+    points = jax.vmap(jax.vmap(point, in_axes=(None, 0, 0)), in_axes=(0, None, None))
+    both = points(jnp.asarray(_DIFFRACTS, rho.dtype), lines[best], scores[best])
+    return jnp.concatenate([lines[best][None], both]), total > 0
 
 
 def _weighed(scan: _Scan, start: Float[Array, "3 k 2"], scene: _Scene, expected: Expectations) -> _Support:
     """The support of every candidate as every kind, (3 k, ...), planes first."""
     clutter = jnp.log(expected.clutter + _second_order(scan, scene))
-    priors = (_plane_prior, partial(_point_prior, kind=CORNER), partial(_point_prior, kind=EDGE))
 
-    def one(kind: int, x: Float[Array, "2"]) -> _Support:
-        support = _refined(scan, _MODELS[kind], x, scene, clutter)
-        silence = _silence(scan, kind, support, scene, expected)
-        weight = expected.silence_plane if kind == PLANE else expected.silence_point
-        prior = priors[kind](scan, support, scene, expected)
-        volume = jnp.log(2 * jnp.pi) - 0.5 * jnp.log(_determinant(support.information) + 1)
-        return support._replace(base=weight * silence + prior + volume)
+    def support(model: Model, x: Float[Array, "2"]) -> _Support:
+        return _refined(scan, model, x, scene, clutter)
 
-    kinds = [jax.vmap(partial(one, kind))(start[kind]) for kind in (PLANE, CORNER, EDGE)]
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *kinds)
+    def with_base(found: _Support, silence: Float[Array, ""], prior: Float[Array, ""]) -> _Support:
+        volume = jnp.log(2 * jnp.pi) - 0.5 * jnp.log(_determinant(found.information) + 1)
+        return found._replace(base=silence + expected.prior * prior + volume)
+
+    def plane(x: Float[Array, "2"]) -> _Support:
+        found = support(reflectors.plane, x)
+        silence = expected.silence_plane * _silence_of_plane(scan, found, scene, expected)
+        return with_base(found, silence, _plane_prior(scan, found, scene, expected))
+
+    def point(diffracts: Float[Array, ""], x: Float[Array, "2"]) -> _Support:
+        model = partial(_point, diffracts)
+        found = support(model, x)
+        silence = expected.silence_point * _silence_of_point(scan, model, diffracts, found, scene, expected)
+        return with_base(found, silence, _point_prior(scan, diffracts, found, scene, expected))
+
+    planes = jax.vmap(plane)(start[PLANE])
+    points = jax.vmap(point)(jnp.repeat(jnp.asarray(_DIFFRACTS, start.dtype), start.shape[1]), start[1:].reshape(-1, 2))
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), planes, points)
+
+
+def _point(diffracts: Float[Array, ""], place: Float[Array, "2"], path: EchoPaths) -> Sighting:
+    """A corner (0), which sends and hears as if from the virtual sensor, or an edge (1), each leg for itself."""
+    return reflectors.edge(place, eqx.tree_at(lambda p: p.half_baseline, path, diffracts * path.half_baseline))
 
 
 def _refined(
@@ -337,15 +355,20 @@ def _refined(
 ) -> _Support:
     """Maximum likelihood over the ranges: each echo weighs as much as it is likely to come from this reflector."""
 
+    def look(x: Float[Array, "2"], echo: EchoPaths):
+        sighting = model(x, echo)
+        return sighting, reflectors.heard_share(sighting, echo)
+
     def step(x: Float[Array, "2"], _: None):
-        sighting = jax.vmap(model, in_axes=(None, 0))(x, scan.echo)
-        share = scene.share * jax.vmap(reflectors.heard_share)(sighting, scan.echo)
-        residual, slope = scan.reach - sighting.range, sighting.slope
+        sighting, share = jax.vmap(look, in_axes=(None, -1), out_axes=-1)(x, scan.echo)
+        share, residual, (a, b) = scene.share * share, scan.reach - sighting.range, sighting.slope
         odds = jnp.log(share / (1 - share) + 1e-9) + _gauss(residual, scene.sigma) - clutter
         gain = jnp.where(scan.valid, odds, -jnp.inf)
         weight = jax.nn.sigmoid(gain) / scene.sigma**2
-        information = jnp.einsum("e,ei,ej->ij", weight, slope, slope)
-        x = x + jnp.clip(_inverse(information) @ ((weight * residual) @ slope), -0.05, 0.05)
+        aa, ab, bb = (weight * a * a).sum(), (weight * a * b).sum(), (weight * b * b).sum()
+        information = jnp.stack([jnp.stack([aa, ab]), jnp.stack([ab, bb])])
+        pull = jnp.stack([(weight * residual * a).sum(), (weight * residual * b).sum()])
+        x = x + jnp.clip(_inverse(information) @ pull, -0.05, 0.05)
         return x, (information, gain, sighting.foot, residual)
 
     x, looks = jax.lax.scan(step, x, None, length=_STEPS)
@@ -353,48 +376,77 @@ def _refined(
     return _Support(x, information, gain, foot, residual, jnp.zeros(()))
 
 
-def _silence(scan: _Scan, kind: int, support: _Support, scene: _Scene, expected: Expectations) -> Float[Array, ""]:
-    """Nats, at most 0, that the paths cost which should have heard the reflector and did not.
+class _Silence(NamedTuple):
+    """What all paths should have heard of a reflector, and the echoes that excuse some of them."""
 
-    A path that heard something so little before that its blanking hides the reflector is excused.
-    """
+    foot: Array
+    """(paths,) as ``Sighting``."""
+    share: Array
+    """(paths,) how far it lies within the cones and the maximum range."""
+    off_axis: Array
+    """(paths,)"""
+    cost: Array
+    """(paths,) nats that each path costs if it heard nothing."""
+    echo_foot: Array
+    """(echoes,)"""
+    echo_off_axis: Array
+    """(echoes,)"""
+    excuse: Array
+    """(echoes,) nats by which each echo excuses its path: it is heard, or its blanking hides the reflector."""
+
+    def total(self, paths: Bool[Array, " paths"], echoes: Bool[Array, " echoes"]) -> Float[Array, ""]:
+        """Nats, at most 0, that some of the paths cost."""
+        return jnp.minimum(jnp.where(paths, self.cost, 0).sum() - jnp.where(echoes, self.excuse, 0).sum(), 0)
+
+
+def _silence(scan: _Scan, model: Model, support: _Support, scene: _Scene, expected: Expectations) -> _Silence:
+    """What the paths should have heard of a reflector."""
 
     def look(path: EchoPaths):
-        sighting = _MODELS[kind](support.parameters, path)
+        sighting = model(support.parameters, path)
         near = sighting.range < scan.max_range - 1e-3 - 2 * scene.sigma
         share = jnp.where(near, reflectors.heard_share(sighting, path), 0)
-        return sighting, share, jnp.log1p(-scene.share * share), reflectors.off_axis(sighting, path)
+        cost = jnp.log(1 - scene.share * share)
+        return sighting.range, sighting.foot, share, reflectors.off_axis(sighting, path), cost
 
-    sighting, share, cost, off_axis = jax.vmap(look)(scan.paths)
-    foot, reach = sighting.foot, sighting.range
-    by_echo, expected_reach, excuse, echo_off_axis = (leaf[scan.path] for leaf in (foot, reach, cost, off_axis))
-    behind = scan.reach - expected_reach
+    looks = jax.vmap(look, in_axes=-1, out_axes=-1)
+    _, foot, share, off_axis, cost = looks(scan.paths)
+    reach, echo_foot, _, echo_off_axis, excuse = looks(scan.echo)
+    behind = scan.reach - reach
     excused = scan.valid & (behind < 4 * scene.sigma) & (behind > -expected.blanking - 4 * scene.sigma)
-    excuse = jnp.where(excused, excuse, 0)
+    return _Silence(foot, share, off_axis, cost, echo_foot, echo_off_axis, jnp.where(excused, excuse, 0))
 
-    def total(paths: Bool[Array, " paths"], echoes: Bool[Array, " echoes"]) -> Float[Array, ""]:
-        return jnp.minimum(jnp.where(paths, cost, 0).sum() - jnp.where(echoes, excuse, 0).sum(), 0)
 
-    mine = support.gain > 0
-    if kind == CORNER:
-        return jnp.maximum(total(share >= 0, scan.valid), -expected.hidden)
-    if kind == EDGE:  # a faint one is heard near the axes only
-        border = jnp.where(mine, echo_off_axis, 0).max() + 1e-3
-        inside = total(off_axis < border, echo_off_axis < border)
-        outside = total(off_axis >= border, echo_off_axis >= border)
-        return jnp.maximum(inside, -expected.hidden) + jnp.maximum(outside, -expected.faint)
-    # A wall may end beyond its outermost feet: somewhere between them and the next path that is silent.
+def _silence_of_point(
+    scan: _Scan,
+    model: Model,
+    diffracts: Float[Array, ""],
+    support: _Support,
+    scene: _Scene,
+    expected: Expectations,
+) -> Float[Array, ""]:
+    """Nats, at most 0, that the paths cost which should have heard a corner or an edge and did not."""
+    silence = _silence(scan, model, support, scene, expected)
+    # A faint edge is heard near the axes only.
+    border = jnp.where(support.gain > 0, silence.echo_off_axis, 0).max() + 1e-3
+    border = jnp.where(diffracts > 0, border, jnp.inf)
+    inside = silence.total(silence.off_axis < border, silence.echo_off_axis < border)
+    outside = silence.total(silence.off_axis >= border, silence.echo_off_axis >= border)
+    return jnp.maximum(inside, -expected.hidden) + jnp.maximum(outside, -expected.faint)
+
+
+def _silence_of_plane(scan: _Scan, support: _Support, scene: _Scene, expected: Expectations) -> Float[Array, ""]:
+    """The same of a wall, which may end beyond its outermost feet: somewhere before the next path that is silent."""
+    silence = _silence(scan, reflectors.plane, support, scene, expected)
+    foot, echo_foot, mine = silence.foot, silence.echo_foot, support.gain > 0
     low, high = jnp.where(mine, support.foot, jnp.inf).min(), jnp.where(mine, support.foot, -jnp.inf).max()
-    inside = total((foot >= low) & (foot <= high), (by_echo >= low) & (by_echo <= high))
-    silence = jnp.maximum(inside, -expected.hidden)
-    for beyond, echoes_beyond, gap in (
-        (foot < low, by_echo < low, low - foot),
-        (foot > high, by_echo > high, foot - high),
-    ):
-        next_silent = jnp.where(beyond & (share > 0.4) & (gap > 1e-3), gap, jnp.inf).min()
+    inside = silence.total((foot >= low) & (foot <= high), (echo_foot >= low) & (echo_foot <= high))
+    nats = jnp.maximum(inside, -expected.hidden)
+    for gap, echo_gap in ((low - foot, low - echo_foot), (foot - high, echo_foot - high)):
+        next_silent = jnp.where((silence.share > 0.4) & (gap > 1e-3), gap, jnp.inf).min()
         ends = jnp.log(jnp.clip(next_silent, 0.02, expected.wall) / expected.wall)
-        silence += jnp.where(jnp.isfinite(next_silent), jnp.maximum(total(beyond, echoes_beyond), ends), 0)
-    return silence
+        nats += jnp.where(jnp.isfinite(next_silent), jnp.maximum(silence.total(gap > 0, echo_gap > 0), ends), 0)
+    return nats
 
 
 def _plane_prior(scan: _Scan, support: _Support, scene: _Scene, expected: Expectations) -> Float[Array, ""]:
@@ -408,7 +460,7 @@ def _plane_prior(scan: _Scan, support: _Support, scene: _Scene, expected: Expect
     direction = jnp.log(1 - scene.square + scene.square * square)
     density += direction - jnp.where(crossing, expected.crossing, 0)
     share = _count(support.gain > 0) / scan.full_wall
-    return expected.prior * density + expected.full * (share - expected.usual)
+    return density + expected.full / expected.prior * (share - expected.usual)
 
 
 def _squareness(line: Float[Array, "2"], variance: Float[Array, ""], scene: _Scene) -> Float[Array, ""]:
@@ -423,7 +475,7 @@ def _squareness(line: Float[Array, "2"], variance: Float[Array, ""], scene: _Sce
 
 
 def _point_prior(
-    scan: _Scan, support: _Support, scene: _Scene, expected: Expectations, *, kind: int
+    scan: _Scan, diffracts: Float[Array, ""], support: _Support, scene: _Scene, expected: Expectations
 ) -> Float[Array, ""]:
     """Nats before any echo: corners are where walls meet, edges where they end; both also where no wall is seen."""
     place = support.parameters
@@ -437,15 +489,13 @@ def _point_prior(
     on_wall = jnp.where(beside, jnp.exp(_gauss(off, jnp.sqrt(own + lever + scene.sigma**2))), 0)
     anywhere = 1 / (jnp.pi * scan.max_range**2)
     along_one = on_wall.sum() / (2 * scan.max_range)
-    if kind == EDGE:
-        beside_walls = along_one / jnp.maximum(_count(scene.known), 1)
-        density = expected.edge_alone * anywhere + (1 - expected.edge_alone) * beside_walls
-        return expected.prior * jnp.log(expected.edges * density)
+    beside_walls = along_one / jnp.maximum(_count(scene.known), 1)
+    edges = expected.edges * (expected.edge_alone * anywhere + (1 - expected.edge_alone) * beside_walls)
     angle = jnp.abs(wrap_angle(scene.wall[:, None, 1] - scene.wall[None, :, 1])) - jnp.pi / 2
     right = angle**2 < 9 * (c[:, None, 1, 1] + c[None, :, 1, 1] + np.radians(0.5) ** 2)
     at_two = jnp.triu(jnp.where(right, on_wall[:, None] * on_wall[None, :], 0), 1).sum()
-    density = expected.corner_alone * anywhere + expected.corner_of_one * along_one + expected.corner_of_two * at_two
-    return expected.prior * jnp.log(expected.corners * density)
+    corners = expected.corner_alone * anywhere + expected.corner_of_one * along_one + expected.corner_of_two * at_two
+    return jnp.log(jnp.where(diffracts > 0, edges, expected.corners * corners))
 
 
 def _second_order(scan: _Scan, scene: _Scene) -> Float[Array, " echoes"]:
@@ -459,47 +509,57 @@ def _second_order(scan: _Scan, scene: _Scene) -> Float[Array, " echoes"]:
             spread = 2 * scene.sigma + 0.002
             return reflectors.heard_share(sighting, path) * jnp.exp(_gauss(reach - sighting.range, spread))
 
-        return jnp.where(known, scene.share * jax.vmap(one)(scan.echo, scan.reach), 0)
+        return jnp.where(known, scene.share * jax.vmap(one, in_axes=-1)(scan.echo, scan.reach), 0)
 
     known = scene.known[first] & scene.known[second]
     densities = jax.vmap(pair)(scene.wall[first], scene.wall[second], known)
     return jnp.where(scan.valid, densities.max(axis=0), 0)
 
 
-def _chosen(
-    scan: _Scan, supports: _Support, here: Bool[Array, " k"], expected: Expectations
-) -> tuple[
-    Int[Array, " reflectors"],
-    Int[Array, " reflectors"],
-    Float[Array, " reflectors"],
-    Bool[Array, "reflectors echoes"],
-    Float[Array, "reflectors 3"],
-]:
-    """Reflectors in the order of their evidence, each with the echoes that are left when its turn comes.
+class _Chosen(NamedTuple):
+    """Reflectors in the order of their evidence."""
 
-    Returns:
-        Index of the hypothesis, its kind, evidence (-inf where no reflector has enough), echoes, and the probabilities
-        of the three kinds for these echoes.
-    """
-    kinds = jnp.repeat(jnp.arange(3), len(here))
-    gain = jnp.maximum(supports.gain, 0)
+    hypothesis: Array
+    """(reflectors,) its row."""
+    kind: Array
+    """(reflectors,) PLANE, CORNER or EDGE."""
+    evidence: Array
+    """(reflectors,) nats; -inf where no reflector has enough."""
+    involved: Array
+    """(reflectors, echoes) those that were left when its turn came."""
+    probability: Array
+    """(reflectors, 3) of the kinds, for these echoes."""
+
+
+def _chosen(scan: _Scan, supports: _Support, here: Bool[Array, " k"], expected: Expectations) -> _Chosen:
+    """Reflectors in the order of their evidence, each with the echoes that are left when its turn comes."""
+    positive = supports.gain > 0
+    counted, exact = positive.astype(supports.base.dtype), jax.lax.Precision.HIGHEST
+    worth = jnp.concatenate([jnp.where(positive, supports.gain, 0), counted])
     open_ = jnp.tile(here, 3) & jnp.isfinite(supports.base)
 
     def take(free: Bool[Array, " echoes"], _: None):
-        several = ((supports.gain > 0) & free[None]).sum(axis=1) >= 2  # fewer determine nothing
-        score = jnp.where(free[None], gain, 0).sum(axis=1) + supports.base
-        score = jnp.where(open_ & several, score, -jnp.inf)
+        gain, several = jnp.dot(worth, free.astype(worth.dtype), precision=exact).reshape(2, -1)
+        score = jnp.where(open_ & (several > 1.5), gain + supports.base, -jnp.inf)  # fewer than two determine nothing
         best = score.argmax()
-        enough = score[best] > expected.least
-        own = free & (supports.gain[best] > 0) & enough
-        rivals = 2 * ((supports.gain > 0) & own[None]).sum(axis=1) >= own.sum()
-        of_kind = jnp.where(rivals[None] & (kinds[None] == jnp.arange(3)[:, None]), score[None], -jnp.inf).max(axis=1)
-        odds = expected.temper * (of_kind - jnp.asarray([expected.doubt, 0, 0], of_kind.dtype))
-        probability = jax.nn.softmax(jnp.where(jnp.isfinite(odds).any(), odds, 0))
-        return free & ~own, (best, kinds[best], jnp.where(enough, score[best], -jnp.inf), own, probability)
+        own = free & positive[best] & (score[best] > expected.least)
+        return free & ~own, (best, score, own)
 
-    _, chosen = jax.lax.scan(take, scan.valid, None, length=expected.reflectors)
-    return chosen
+    _, (best, score, own) = jax.lax.scan(take, scan.valid, None, length=expected.reflectors)
+    evidence = jnp.take_along_axis(score, best[:, None], axis=1)[:, 0]
+    # Its rivals are hypotheses of any kind that explain at least half of its echoes.
+    shared = jnp.dot(own.astype(counted.dtype), counted.T, precision=exact)
+    rivals = jnp.where(2 * shared >= own.sum(axis=1, dtype=shared.dtype)[:, None], score, -jnp.inf)
+    of_kind = rivals.reshape(len(best), 3, -1).max(axis=2)
+    odds = expected.temper * (of_kind - jnp.asarray([expected.doubt, 0, 0], of_kind.dtype)[None])
+    odds = jnp.where(jnp.isfinite(odds).any(axis=1, keepdims=True), odds, 0)
+    return _Chosen(
+        hypothesis=best,
+        kind=best // len(here),
+        evidence=jnp.where(evidence > expected.least, evidence, -jnp.inf),
+        involved=own,
+        probability=jax.nn.softmax(odds, axis=1),
+    )
 
 
 def _taken(supports: _Support, index: Int[Array, " reflectors"]) -> _Support:
@@ -507,7 +567,7 @@ def _taken(supports: _Support, index: Int[Array, " reflectors"]) -> _Support:
 
 
 def _learned(
-    scan: _Scan, found: _Support, chosen: tuple, scene: _Scene, sigma: Float[Array, ""], expected: Expectations
+    scan: _Scan, found: _Support, chosen: _Chosen, scene: _Scene, sigma: Float[Array, ""], expected: Expectations
 ) -> _Scene:
     """What the reflectors of a pass tell the next one."""
     _, kind, evidence, involved, _ = chosen
@@ -523,7 +583,7 @@ def _learned(
         between = (sighting.foot > low) & (sighting.foot < high)
         return near & between & (reflectors.heard_share(sighting, path) > 0.95)
 
-    each_path = jax.vmap(jax.vmap(certain, in_axes=(None, None, None, 0)), in_axes=(0, 0, 0, None))
+    each_path = jax.vmap(jax.vmap(certain, in_axes=(None, None, None, -1)), in_axes=(0, 0, 0, None))
     sure = each_path(found.parameters, low, high, scan.paths) & wall[:, None]
     asked, answered = _count(sure), _count(sure[:, scan.path] & involved)
     weight = expected.heard_weight

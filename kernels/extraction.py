@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -10,22 +11,35 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from . import arcs, clusters, hough
+from .geometry import normal, tangent
 from .hough import HoughSettings
 from .paths import EchoPaths, Sensors, echo_paths, moved_path
+
+if TYPE_CHECKING:
+    AnyArray = Array  # what kernels see
+else:
+    AnyArray = np.ndarray | Array  # a compiled step takes NumPy arrays to where it runs
+PIECE = 16
+"""Points in a piece of an arc."""
 
 
 class Echoes(eqx.Module):
     """Echoes of scans, packed: real ones first, then padding."""
 
-    path: Int[Array, "*scans echoes"]
+    path: Int[AnyArray, "*scans echoes"]
     """Row of the ring's ``paths``; 0 where there is no echo."""
-    range: Float[Array, "*scans echoes"]
+    range: Float[AnyArray, "*scans echoes"]
     """Half path length as reported, metres; NaN where there is no echo."""
-    pose: Float[Array, "*scans echoes 3"] | None = None
+    pose: Float[AnyArray, "*scans echoes 3"] | None = None
     """model_from_robot: where the robot stood when each echo was taken, in the frame of the lines: x, y (metres), theta
     (radians). None: all were taken where that frame is."""
-    gathered: Float[Array, "*scans"] | None = None
+    gathered: Float[AnyArray, "*scans"] | None = None
     """How many scans were gathered, the measure of the votes that a wall can collect. None: one."""
+    piece: Int[AnyArray, "*scans pieces"] | None = None
+    """Arcs in pieces of ``PIECE`` points: which piece of its arc each is; -1 where there is none. So arcs of narrow
+    detection ranges take less room than wide ones. None: every echo has the points of the widest arc."""
+    owner: Int[AnyArray, "*scans pieces"] | None = None
+    """The echo that each piece belongs to, with ``piece``."""
 
 
 class RingArcs(eqx.Module):
@@ -86,46 +100,70 @@ def moved_arcs(ring: RingArcs, pose: Float[Array, "paths 3"], *, settings: Hough
 
 
 def points_of_widest_arc(beam: Float[np.ndarray, " sensors"], settings: HoughSettings) -> int:
-    """Points that the widest arc of a ring needs: that of the direct path of the sensor with the widest cone."""
-    return max(1, int(np.ceil(np.max(beam) / settings.point_pitch - 1e-6)))
+    """Room for the widest arc of a ring, that of the direct path of the sensor with the widest cone: whole pieces."""
+    return PIECE * max(1, int(np.ceil((np.max(beam) / settings.point_pitch - 1e-6) / PIECE)))
 
 
 class TangentLines(eqx.Module):
-    """Tangent lines at the points of echo arcs: of one echo, or of all echoes of ONE scan."""
+    """Tangent lines at the points of echo arcs: of one echo or piece, or of all of ONE scan."""
 
-    rho: Float[Array, "*echoes points"]
+    rho: Float[Array, "*arcs points"]
     """Distances, metres, any sign."""
-    normal_x: Float[Array, "*echoes points"]
+    normal_x: Float[Array, "*arcs points"]
     """Cosines of the normals."""
-    normal_y: Float[Array, "*echoes points"]
+    normal_y: Float[Array, "*arcs points"]
     """Sines of the normals."""
-    cell: Int[Array, "*echoes points"]
+    cell: Int[Array, "*arcs points"]
     """Cells of the accumulator (``hough.cell_of``)."""
-    sensor: Float[Array, "*echoes 2"]
-    """Real or virtual sensor of each echo, metres."""
 
 
 def lines_of_scan(ring: RingArcs, echoes: Echoes, settings: HoughSettings) -> TangentLines:
     """The tangent line at every point of every echo's arc, for ONE scan, or several gathered in one frame."""
 
-    def one_echo(path: Int[Array, ""], reported: Float[Array, ""], pose: Float[Array, "3"] | None):
-        arc, row = jax.tree.map(lambda leaf: leaf[path], (ring.arcs, ring.rows))
+    def one_arc(arc: arcs.Arc, row: Int[Array, " points"], path: Int[Array, ""], echo: Int[Array, ""]) -> TangentLines:
         offset = ring.paths.range_offset[path]
-        reach = arcs.corrected_range(reported, range_offset=offset, range_scale=ring.range_scale)
+        reach = arcs.corrected_range(echoes.range[echo], range_offset=offset, range_scale=ring.range_scale)
         rho, counts = arcs.tangent_rho(arc, reach, max_range=ring.max_range)
-        normal_x, normal_y, sensor = arc.normal_x, arc.normal_y, ring.paths.midpoint[path]
-        if pose is not None:  # the line n . p = rho, seen from a frame in which the robot stands at the pose
+        normal_x, normal_y = arc.normal_x, arc.normal_y
+        if echoes.pose is not None:  # the line n . p = rho, seen from a frame in which the robot stands at the pose
+            pose = echoes.pose[echo]
             turn_x, turn_y = jnp.cos(pose[2]), jnp.sin(pose[2])
             normal_x, normal_y = turn_x * normal_x - turn_y * normal_y, turn_y * normal_x + turn_x * normal_y
             rho = rho + pose[0] * normal_x + pose[1] * normal_y
             row = hough.theta_row(arc.theta + pose[2], settings)
-            sensor = pose[:2] + jnp.stack(
-                [turn_x * sensor[0] - turn_y * sensor[1], turn_y * sensor[0] + turn_x * sensor[1]]
-            )
-        return TangentLines(rho, normal_x, normal_y, hough.cell_of(rho, row, counts, settings), sensor)
+        return TangentLines(rho, normal_x, normal_y, hough.cell_of(rho, row, counts, settings))
 
-    poses = None if echoes.pose is None else 0
-    return jax.vmap(one_echo, in_axes=(0, 0, poses))(echoes.path, echoes.range, echoes.pose)
+    def whole(echo: Int[Array, ""]) -> TangentLines:
+        path = echoes.path[echo]
+        arc, row = jax.tree.map(lambda leaf: leaf[path], (ring.arcs, ring.rows))
+        return one_arc(arc, row, path, echo)
+
+    if echoes.piece is None or echoes.owner is None:
+        return jax.vmap(whole)(jnp.arange(len(echoes.path)))
+    pieces = ring.rows.shape[-1] // PIECE
+
+    def cut(leaf: Array) -> Array:
+        return leaf if leaf.ndim == 1 else leaf.reshape(-1, PIECE)
+
+    of_pieces = jax.tree.map(cut, (ring.arcs, ring.rows))
+
+    def part(piece: Int[Array, ""], echo: Int[Array, ""]) -> TangentLines:
+        path = echoes.path[echo]
+        at = path * pieces + jnp.maximum(piece, 0)
+        arc, row = jax.tree.map(lambda leaf: leaf[path if leaf.ndim == 1 else at], of_pieces)
+        arc = eqx.tree_at(lambda a: a.counts, arc, arc.counts & (piece >= 0))
+        return one_arc(arc, row, path, echo)
+
+    return jax.vmap(part)(echoes.piece, echoes.owner)
+
+
+def sensors_of(ring: RingArcs, echoes: Echoes) -> Float[Array, "echoes 2"]:
+    """Real or virtual sensor of every echo of ONE scan, in the frame of its lines, metres."""
+    sensor = ring.paths.midpoint[echoes.path]
+    if echoes.pose is None:
+        return sensor
+    forward, left = normal(echoes.pose[:, 2]), tangent(echoes.pose[:, 2])
+    return echoes.pose[:, :2] + sensor[:, :1] * forward + sensor[:, 1:] * left
 
 
 def over_scans(one_scan: Callable, *scans):
@@ -198,11 +236,18 @@ def cluster_lines(
     def one_scan(scan: Echoes, label: Int[Array, "theta rho"]):
         voting = lines_of_scan(ring, scan, settings)
         label_of_cell = jnp.append(label.ravel(), jnp.zeros(1, label.dtype))  # the last one: no cell, no component
+        count = len(scan.path)
         lines = clusters.centres_of_gravity(
-            voting.rho, voting.normal_x, voting.normal_y, label_of_cell[voting.cell], clusters=size
+            voting.rho,
+            voting.normal_x,
+            voting.normal_y,
+            label_of_cell[voting.cell].astype(jnp.int32),
+            jnp.arange(count) if scan.owner is None else scan.owner,
+            clusters=size,
+            echoes=count,
         )
         segments = jax.vmap(clusters.extent, in_axes=(0, 0, None, 0))(
-            lines.rho, lines.theta, voting.sensor, lines.involved
+            lines.rho, lines.theta, sensors_of(ring, scan), lines.involved
         )
         return lines, segments
 

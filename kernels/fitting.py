@@ -16,12 +16,16 @@ from jaxtyping import Array, Bool, Float
 
 from . import arcs
 from .extraction import Echoes, RingArcs
-from .geometry import edge_range, fold_line, normal, plane_range, point_range, tangent, wrap_angle
+from .geometry import dot, fold_line, normal, safe_sqrt, tangent, towards
 
-_STEPS = 12
+_STEPS = 8
 _WIDEST = 4.0  # the loss starts this many tolerances wide
 _SLACK = 0.05  # rad; how far beyond its nominal cone a sensor may have heard something
 _LONGEST_STEP = 0.1  # m and rad
+
+
+Seen = tuple[Float[Array, ""], Float[Array, "2"], Float[Array, "2"]]
+"""Range of a reflector (metres), its derivatives by the two parameters, and the unit vector it is heard from."""
 
 
 class Heard(eqx.Module):
@@ -76,7 +80,7 @@ def heard(ring: RingArcs, echoes: Echoes) -> Heard:
 
 
 def fit(
-    model: Callable[[Float[Array, "2"], Heard], tuple[Float[Array, ""], Float[Array, ""]]],
+    model: Callable[[Float[Array, "2"], Heard], Seen],
     start: Float[Array, "2"],
     echoes: Heard,
     *,
@@ -86,7 +90,7 @@ def fit(
     """Robust Gauss-Newton fit of ONE reflector with two parameters to the echoes of ONE model.
 
     Args:
-        model: range (metres) and direction (radians) from which an echo hears the reflector.
+        model: how an echo hears the reflector.
         start: first guess.
         echoes: all echoes, those of other reflectors included.
         tolerance: residual up to which an echo counts as explained, metres.
@@ -95,55 +99,58 @@ def fit(
     Returns:
         The parameters, and how well they explain every echo: 1 - (residual / tolerance)^2, at least 0.
     """
+    last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), echoes)  # loops over the echoes run along the memory
+    middle, border = normal(echoes.start + echoes.width / 2).T, jnp.cos(jnp.minimum(echoes.width / 2 + _SLACK, jnp.pi))
 
     def look(x):
-        def one(echo: Heard):
-            (predicted, direction), slope = jax.value_and_grad(model, has_aux=True)(x, echo)
-            off_axis = jnp.abs(wrap_angle(direction - echo.start - echo.width / 2))
-            audible = (echo.reach > 0) & (off_axis <= echo.width / 2 + _SLACK)
-            return jnp.where(audible, echo.reach - predicted, jnp.inf), slope
+        def one(echo: Heard, middle, border):
+            predicted, slope, direction = model(x, echo)
+            audible = (echo.reach > 0) & (dot(direction, middle) >= border)
+            return audible, echo.reach - predicted, slope
 
-        return jax.vmap(one)(echoes)
+        return jax.vmap(one, in_axes=-1, out_axes=-1)(last, middle, border)
 
     def step(x, scale):
-        residual, slope = look(x)
-        square = jnp.where(jnp.isfinite(residual), (residual / scale) ** 2, jnp.inf)
-        weight = 1 / (1 + square) ** 2
-        pull = jnp.where(weight > 0, weight * jnp.where(jnp.isfinite(residual), residual, 0), 0)
-        xx, xy, yy = ((weight * a * b).sum() for a, b in ((slope[:, 0],) * 2, slope.T, (slope[:, 1],) * 2))
+        audible, residual, (along, across) = look(x)
+        root = jnp.where(audible, 1 / (1 + (residual / scale) ** 2), 0)
+        weight = root * root
+        pull = weight * residual
+        xx, xy, yy = ((weight * a * b).sum() for a, b in ((along, along), (along, across), (across, across)))
+        gx, gy = (along * pull).sum(), (across * pull).sum()
         damping = 1e-4 * (xx + yy) + 1e-9
         xx, yy = xx + damping, yy + damping
-        gx, gy = slope.T @ pull
         move = jnp.stack([yy * gx - xy * gy, xx * gy - xy * gx]) / (xx * yy - xy * xy)
         return x + jnp.clip(move, -_LONGEST_STEP, _LONGEST_STEP), None
 
     widest = _WIDEST * tolerance if widest is None else widest
     scales = tolerance * (widest / tolerance) ** jnp.linspace(1, 0, _STEPS, dtype=start.dtype)
     x, _ = jax.lax.scan(step, start, scales)
-    residual, _ = look(x)
-    return x, jnp.maximum(1 - (residual / tolerance) ** 2, 0)
+    audible, residual, _ = look(x)
+    return x, jnp.where(audible, jnp.maximum(1 - (residual / tolerance) ** 2, 0), 0)
 
 
-def plane(line: Float[Array, "2"], echo: Heard) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Range of a wall (rho, theta), and the direction it is heard from: a robot that has passed it hears its back."""
-    ahead = line[0] - (echo.tx + echo.rx) / 2 @ normal(line[1])
-    return plane_range(line[0], line[1], echo.tx, echo.rx), jnp.where(ahead >= 0, line[1], line[1] + jnp.pi)
+def plane(line: Float[Array, "2"], echo: Heard) -> Seen:
+    """A wall (rho, theta), by the image source; a robot that has passed it hears its back."""
+    n, t = normal(line[1]), tangent(line[1])
+    middle, half = (echo.tx + echo.rx) / 2, (echo.rx - echo.tx) / 2
+    height, across = line[0] - dot(middle, n), dot(half, t)
+    reach = safe_sqrt(height * height + across * across)
+    inverse = 1 / jnp.where(reach > 0, reach, 1)
+    turn = -(height * dot(middle, t) + across * dot(half, n))
+    return reach, jnp.stack([height * inverse, turn * inverse]), jnp.where(height >= 0, n, -n)
 
 
-def corner(place: Float[Array, "2"], echo: Heard) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Range of a right-angled corner, and the direction it is heard from."""
-    return point_range(place, echo.tx, echo.rx), _bearing(place, echo)
+def corner(place: Float[Array, "2"], echo: Heard) -> Seen:
+    """A right-angled corner."""
+    reach, direction = towards(place - (echo.tx + echo.rx) / 2)
+    return reach, direction, direction
 
 
-def edge(place: Float[Array, "2"], echo: Heard) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Range of an edge or a thin pole, and the direction it is heard from."""
-    return edge_range(place, echo.tx, echo.rx), _bearing(place, echo)
-
-
-def _bearing(place: Float[Array, "2"], echo: Heard) -> Float[Array, ""]:
-    offset = place - (echo.tx + echo.rx) / 2
-    here = (offset == 0).all()
-    return jnp.arctan2(offset[1], jnp.where(here, 1, offset[0]))
+def edge(place: Float[Array, "2"], echo: Heard) -> Seen:
+    """An edge or a thin pole."""
+    (out, departure), (back, arrival) = towards(place - echo.tx), towards(place - echo.rx)
+    _, direction = towards(place - (echo.tx + echo.rx) / 2)
+    return (out + back) / 2, (departure + arrival) / 2, direction
 
 
 @partial(jax.jit, static_argnames="tolerance")

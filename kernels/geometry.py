@@ -24,6 +24,22 @@ def tangent(theta: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
     return jnp.stack([-jnp.sin(theta), jnp.cos(theta)], axis=-1)
 
 
+def dot(a: Float[Array, "2"], b: Float[Array, "2"]) -> Float[Array, ""]:
+    """Inner product of two vectors; written out, because compilers make loops of single operations of it, not calls."""
+    return a[0] * b[0] + a[1] * b[1]
+
+
+def length(vector: Float[Array, "2"]) -> Float[Array, ""]:
+    """Length of a vector, with a finite gradient at zero."""
+    return safe_sqrt(dot(vector, vector))
+
+
+def towards(offset: Float[Array, "2"]) -> tuple[Float[Array, ""], Float[Array, "2"]]:
+    """Length and direction of a vector, with finite gradients at zero."""
+    way = length(offset)
+    return way, offset / jnp.where(way > 0, way, 1)
+
+
 def fold_line(
     rho: Float[Array, "*batch"], theta: Float[Array, "*batch"]
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
@@ -50,22 +66,21 @@ def plane_range(
         rx: position of the receiver, metres, on the same side of the wall.
     """
     midpoint, half_baseline = (tx + rx) / 2, (rx - tx) / 2
-    return jnp.hypot(rho - midpoint @ normal(theta), half_baseline @ tangent(theta))
+    height, across = rho - dot(midpoint, normal(theta)), dot(half_baseline, tangent(theta))
+    return safe_sqrt(height * height + across * across)
 
 
 def point_range(corner: Float[Array, "2"], tx: Float[Array, "2"], rx: Float[Array, "2"]) -> Float[Array, ""]:
     """Range in metres of the double reflection in a right-angled corner: its distance from the virtual sensor."""
-    offset = corner - (tx + rx) / 2
-    return safe_sqrt(offset @ offset)
+    return length(corner - (tx + rx) / 2)
 
 
 def edge_range(edge: Float[Array, "2"], tx: Float[Array, "2"], rx: Float[Array, "2"]) -> Float[Array, ""]:
     """Range in metres of the diffraction at an edge or a thin pole: half the way to it and on to the receiver."""
-    out, back = edge - tx, edge - rx
-    return (safe_sqrt(out @ out) + safe_sqrt(back @ back)) / 2
+    return (length(edge - tx) + length(edge - rx)) / 2
 
 
 def mirrored(point: Float[Array, "2"], line: Float[Array, "2"]) -> Float[Array, "2"]:
     """A point's image behind a line (rho, theta), metres: where its sound seems to come from."""
     n = normal(line[1])
-    return point + 2 * (line[0] - point @ n) * n
+    return point + 2 * (line[0] - dot(point, n)) * n

@@ -5,7 +5,7 @@ before rho = 0 is the first column half a turn further, because (-rho, theta) is
 """
 
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
@@ -148,15 +148,24 @@ def lowpass(votes: Num[Array, "theta rho"], settings: HoughSettings) -> Float[Ar
     """Two-dimensional low pass, to balance between neighbor cells; beyond the last column there are no votes."""
     taps = np.asarray(settings.smoothing) / np.sum(settings.smoothing)
     half = len(taps) // 2
-    smooth = jnp.asarray(votes, jnp.float32)
-    smooth = sum((float(tap) * jnp.roll(smooth, k - half, axis=0) for k, tap in enumerate(taps)), start=jnp.zeros(()))
-    if half == 0:
-        return smooth * float(taps[0])
-    before = jnp.roll(smooth[:, :half][:, ::-1], settings.theta_cells // 2, axis=0)
-    beyond = jnp.zeros((settings.theta_cells, half), smooth.dtype)
-    wide = jnp.concatenate([before, smooth, beyond], axis=1)
-    columns = settings.rho_cells
-    return sum((float(tap) * wide[:, k : k + columns] for k, tap in enumerate(taps)), start=jnp.zeros(()))
+    wide = bordered(jnp.asarray(votes, jnp.float32), half)
+    rows, columns = votes.shape
+    smooth = sum((float(tap) * wide[k : k + rows] for k, tap in enumerate(taps)), start=jnp.zeros(()))
+    return sum((float(tap) * smooth[:, k : k + columns] for k, tap in enumerate(taps)), start=jnp.zeros(()))
+
+
+def bordered(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "rows columns"]:
+    """An accumulator with this many more cells on every side: what touches across both seams; 0 beyond the last column.
+
+    One array in memory, so that what reads it with all its neighbors is one loop.
+    """
+    if width == 0:
+        return cells
+    rows, columns = cells.shape
+    before = jnp.roll(cells[:, :width][:, ::-1], rows // 2, axis=0)  # (-rho, theta) is (rho, theta + pi)
+    wide = jnp.zeros((rows + 2 * width, columns + 2 * width), cells.dtype)
+    wide = wide.at[width:-width, width:-width].set(cells).at[width:-width, :width].set(before)
+    return wide.at[:width].set(wide[rows : rows + width]).at[rows + width :].set(wide[width : 2 * width])
 
 
 @partial(jax.jit, static_argnames="settings")
@@ -198,19 +207,19 @@ def peaks(
         rho, theta: centres of gravity of the occupancy around each maximum, metres and radians.
     """
     rows, columns = smooth.shape
-    before = jnp.roll(smooth[:, :1], rows // 2, axis=0)  # before rho = 0 the same line lies half a turn further
-    wide = jnp.concatenate([before, smooth, jnp.zeros_like(before)], axis=1)
+    wide = bordered(smooth, 1)
     steps = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
-    around = [jnp.roll(wide, -down, axis=0)[:, 1 + right : 1 + right + columns] for down, right in steps]
-    highest = smooth > level
-    for step, neighbor in zip(steps, around, strict=True):
-        if step != (0, 0):  # of equal neighbors one is the maximum
-            highest &= smooth > neighbor if step > (0, 0) else smooth >= neighbor
-        if step == (0, -1):  # across rho = 0 both are before each other: the later half turn gives way
-            highest &= (smooth > neighbor) | (jnp.arange(rows) < rows // 2)[:, None] | (jnp.arange(columns) > 0)[None]
-    height, cell = jax.lax.top_k(jnp.where(highest, smooth, 0).ravel(), size)
-    mass = jnp.stack([neighbor.ravel()[cell] for neighbor in around])
+    around = [wide[1 + down : 1 + down + rows, 1 + right : 1 + right + columns] for down, right in steps]
+    earlier, later = (reduce(jnp.maximum, neighbors) for neighbors in (around[:4], around[5:]))
+    # Of equal neighbors one is the maximum.
+    peak = jnp.where((smooth > jnp.maximum(later, level)) & (smooth >= earlier), smooth, 0)
+    # Across rho = 0 both are before each other: the later half turn gives way.
+    first, across = peak[rows // 2 :, 0], wide[1 + rows // 2 : 1 + rows, 0]
+    peak = peak.at[rows // 2 :, 0].set(jnp.where(first > across, first, 0))
+    height, cell = jax.lax.top_k(peak.ravel(), size)
+    row, column = cell // columns, cell % columns
+    mass = jnp.stack([wide[row + 1 + down, column + 1 + right] for down, right in steps])
     off = jnp.asarray(steps, smooth.dtype).T @ (mass / jnp.maximum(mass.sum(axis=0), 1e-6)[None])
-    row, column = (index.astype(smooth.dtype) + 0.5 for index in (cell // columns, cell % columns))
+    row, column = (index.astype(smooth.dtype) + 0.5 for index in (row, column))
     theta, rho = (row + off[0]) * settings.theta_cell - jnp.pi, (column + off[1]) * settings.rho_cell
     return jnp.where(height > 0, rho, jnp.nan), jnp.where(height > 0, theta, jnp.nan)

@@ -66,9 +66,11 @@ def merged_lines(
     def one_cluster(one):
         rho, theta, label = one
         label_of_cell = jnp.append(label.ravel(), jnp.zeros(1, label.dtype))
-        of_line = label_of_cell[cells_of_lines(rho, theta, settings)]
+        of_line = label_of_cell[cells_of_lines(rho, theta, settings)].astype(jnp.int32)
         rho, n = jnp.where(of_line == 0, 0, rho), normal(jnp.where(of_line == 0, 0, theta))
-        lines = clusters.centres_of_gravity(rho[:, None], n[:, :1], n[:, 1:], of_line[:, None], clusters=size)
+        count = len(rho)
+        points = (rho[:, None], n[:, :1], n[:, 1:], of_line[:, None])
+        lines = clusters.centres_of_gravity(*points, jnp.arange(count), clusters=size, echoes=count)
         return lines.rho, lines.theta, jnp.abs(of_line)
 
     return jax.lax.map(one_cluster, (rho, theta, labels))

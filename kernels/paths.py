@@ -44,8 +44,13 @@ class EchoPaths(eqx.Module):
     """Metres that the path reports too much: the mean of its two sensors."""
     axes: Float[Array, "*paths 2 2"]
     """Unit vectors along which tx and rx look."""
-    half_beam: Float[Array, "*paths 2"]
-    """Half the cones of tx and rx, radians."""
+    cone: Float[Array, "*paths 2"]
+    """Squared chord between the axis and the border of the cones of tx and rx: 4 sin(beam / 4)^2, 0 to 4."""
+
+
+def chord_squared(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Squared distance of two unit vectors this angle apart (radians, at most pi counts), without cancellation."""
+    return 4 * jnp.sin(jnp.minimum(angle, jnp.pi) / 2) ** 2
 
 
 def moved_path(path: EchoPaths, pose: Float[Array, "3"]) -> EchoPaths:
@@ -62,7 +67,7 @@ def moved_path(path: EchoPaths, pose: Float[Array, "3"]) -> EchoPaths:
         width=path.width,
         range_offset=path.range_offset,
         axes=jax.vmap(turned)(path.axes),
-        half_beam=path.half_beam,
+        cone=path.cone,
     )
 
 
@@ -83,7 +88,7 @@ def echo_paths(sensors: Sensors) -> EchoPaths:
             width=jnp.maximum(last - first, 0),
             range_offset=(sensors.range_offset[tx] + sensors.range_offset[rx]) / 2,
             axes=normal(jnp.stack([sensors.heading[tx], sensors.heading[rx]])),
-            half_beam=jnp.stack([half_tx, half_rx]),
+            cone=chord_squared(jnp.stack([half_tx, half_rx])),
         )
 
     return jax.vmap(one_path)(sensors.tx, sensors.rx)

@@ -165,7 +165,7 @@ def searched(pose, path):
         for sensor, at, towards in zip((tx, rx), place, found[1:], strict=True):
             axis, way = unit(RING.heading[sensor] + pose[2]), towards - at
             angle = abs(math.atan2(axis[0] * way[1] - axis[1] * way[0], axis @ way))
-            inside &= angle < WIDE * (1 + SOFT) * RING.beam[sensor] / 2
+            inside &= math.sin(angle / 2) < (1 + SOFT) * math.sin(WIDE * RING.beam[sensor] / 4)  # chords
         if inside:
             out[candidate] = found[0]
     return out

@@ -241,7 +241,7 @@ def test_centres_of_gravity(rng, run):
     other_side = rng.random(rho.shape) < 0.3  # (rho, n) and (-rho, -n) are one line
     side = np.where(other_side, -1, 1).astype(np.float32)
     points = (side * rho, side * np.cos(theta), side * np.sin(theta))
-    came = run(partial(kernels.centres_of_gravity, clusters=5), *points, label)
+    came = run(partial(kernels.centres_of_gravity, clusters=5, echoes=3), *points, label, np.arange(3))
     np.testing.assert_array_equal(came.votes, [35, 40, 0, 40, 0])
     np.testing.assert_array_equal(np.isnan(came.rho), [False, False, True, False, True])
     np.testing.assert_array_equal(came.involved[:, :], np.eye(5, 3, dtype=bool)[[0, 1, 4, 2, 4]])

@@ -53,7 +53,7 @@ def paths_between(tx, rx, *, heading=None, half_beam=0.5, dtype=jnp.float32):
         "width": np.zeros(len(tx)),
         "range_offset": np.zeros(len(tx)),
         "axes": unit(heading),
-        "half_beam": np.full((len(tx), 2), half_beam),
+        "cone": np.full((len(tx), 2), 4 * np.sin(half_beam / 2) ** 2),
     }
     return EchoPaths(**{name: jnp.asarray(value, dtype) for name, value in fields.items()})
 

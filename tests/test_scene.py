@@ -73,7 +73,7 @@ def paths_between(tx, rx, heading, half_beam=0.5):
         "width": np.zeros(len(tx)),
         "range_offset": np.zeros(len(tx)),
         "axes": unit(heading),
-        "half_beam": np.full((len(tx), 2), half_beam),
+        "cone": np.full((len(tx), 2), 4 * np.sin(half_beam / 2) ** 2),
     }
     return EchoPaths(**{name: jnp.asarray(value) for name, value in arrays.items()})
 
