@@ -19,6 +19,8 @@ MOST_GROUPS = 256
 """Groups of one scan; a sender that claims more is not believed."""
 WAITED = 0.5
 """Seconds without a word after which an incomplete scan is handed on."""
+MOST_ECHOES = 1 << 14
+"""Echoes of one scan, likewise."""
 _LATE = 64  # messages; older ones come from a sender that started anew, or are lost
 _LATE_US = 2_000_000  # device time, likewise
 _REMEMBERED = 256  # messages, to tell repeated ones and gaps
@@ -73,7 +75,7 @@ class AssemblyCounts:
     restarts: int = 0
     """Times that the sender started anew."""
     impossible: int = 0
-    """Groups that do not fit their scan, or claim more than ``MOST_GROUPS``."""
+    """Groups that do not fit their scan, or claim more than ``MOST_GROUPS`` or ``MOST_ECHOES``."""
     lost: int = 0
     """Sequence numbers that never came, of messages that were lost, damaged or unknown."""
 
@@ -87,6 +89,8 @@ class _Open:
     """Sequence number and group, by number of the group."""
     last: float = 0.0
     """Host clock of the latest group."""
+    echoes: int = 0
+    """Of all parts."""
 
     @property
     def complete(self) -> bool:
@@ -229,7 +233,11 @@ class Assembler:
         if group.group in scan.parts:
             self.counts.repeated += 1
             return closed
+        if scan.echoes + len(group.echoes) > MOST_ECHOES:
+            self.counts.impossible += 1
+            return closed
         self._open[number] = scan
+        scan.echoes += len(group.echoes)
         scan.parts[group.group] = (sequence, group)
         scan.last = self._last_received = received
         self._newest_scan = max(self._newest_scan, number)

@@ -34,7 +34,7 @@ typedef struct {
 typedef struct {
     uint32_t sequence;
     uint64_t time_us;
-    double x, y, theta;  /* odometry: metres, radians counter-clockwise */
+    double x, y, theta;  /* odometry: metres, radians counter-clockwise; three NAN if it is not known any more */
 } jaxsonar_pose;
 
 typedef struct {

@@ -41,7 +41,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Pose:
-    """Odometry of the robot: the pose of the groups that follow, until the next one."""
+    """Odometry of the robot: the pose of the groups that follow, until the next one; three NaN: not known any more."""
 
     sequence: int
     """As in ``Group``: both kinds count together."""

@@ -78,7 +78,7 @@ def encode(message: Message) -> bytes:
     if isinstance(message, Pose):
         pose = (message.x, message.y, message.theta)
         if not _possible_pose(*pose):
-            allowed = f"finite numbers, x and y up to {FARTHEST:g} m, theta up to {LARGEST_ANGLE:g} rad"
+            allowed = f"x and y up to {FARTHEST:g} m, theta up to {LARGEST_ANGLE:g} rad, or NaN for all three"
             raise SonarError(f"pose message: {pose} came; allowed are {allowed}")
         return frame(_POSE.pack(MAJOR, MINOR, POSE, 0, message.sequence, message.time_us, *pose))
     _check_group(message)
@@ -229,7 +229,9 @@ class Decoder:
 
 
 def _possible_pose(x: float, y: float, theta: float) -> bool:
-    return abs(x) <= FARTHEST and abs(y) <= FARTHEST and abs(theta) <= LARGEST_ANGLE  # NaN is not
+    if x != x and y != y and theta != theta:  # NaN, all of them: not known
+        return True
+    return abs(x) <= FARTHEST and abs(y) <= FARTHEST and abs(theta) <= LARGEST_ANGLE
 
 
 def _possible_echoes(echoes: np.ndarray) -> bool:

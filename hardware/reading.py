@@ -82,8 +82,10 @@ class Reader:
     @property
     def counts(self) -> dict[str, int]:
         """What decoder, assembler and queue met, by name."""
-        rejected = asdict(self.decoder.counts) | {"rejected": self.decoder.counts.rejected}
-        return rejected | asdict(self.assembler.counts) | {"dropped": self._queue.dropped, "gaps": self.gaps}
+        frames, groups = self.decoder.counts, self.assembler.counts
+        both = {"impossible": frames.impossible + groups.impossible, "rejected": frames.rejected + groups.impossible}
+        own = {"dropped": self._queue.dropped, "gaps": self.gaps}
+        return asdict(frames) | asdict(groups) | both | own
 
     def _run(self) -> None:
         error: BaseException | None = None

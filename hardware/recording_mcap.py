@@ -106,10 +106,9 @@ def read_mcap(path: str | os.PathLike[str]) -> Iterator[tuple[str, float, bytes]
                         yield topics[record.channel_id], record.log_time * 1e-9, record.data
             except OSError:
                 raise
-            except Exception as failure:  # whatever a library says of bytes that stop in the middle
+            except Exception:  # whatever a library says of bytes that stop in the middle
                 if not began:
-                    what = str(failure).splitlines()[0] if str(failure) else type(failure).__name__
-                    raise SonarError(f"{shown(path)}: {shown(what)}; needed is a record (MCAP)") from None
+                    raise SonarError(f"{shown(path)}: this is no MCAP file; needed is a record (MCAP)") from None
     except OSError as failure:
         raise SonarError(f"{shown(path)}: {failure.strerror}; needed is a readable file with a record (MCAP)") from None
 

@@ -202,9 +202,13 @@ def parse_url(text: str) -> Url:
         raise SonarError(f"'{shown(text)}' came; allowed is a URL: {', '.join(EXAMPLES.values())}")
     rest, question, query = rest.partition("?")
     try:
-        options = dict(parse_qsl(query, keep_blank_values=True, strict_parsing=True)) if question else {}
+        given = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if question else []
+        options = dict(given)
+        if len(options) < len(given):
+            raise ValueError
     except ValueError:
-        raise SonarError(f"{shown(text)}: '?{shown(query)}' came; allowed is ?NAME=VALUE&NAME=VALUE") from None
+        allowed = "?NAME=VALUE&NAME=VALUE, each name once"
+        raise SonarError(f"{shown(text)}: '?{shown(query)}' came; allowed is {allowed}") from None
     place, path = "", rest
     if rest.startswith("//"):
         place, slash, path = rest[2:].partition("/")

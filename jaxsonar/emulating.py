@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.messages import ECHO, Group, Message, Pose
-from jaxsonar.hardware.protocol import LONGEST_TIME_US
+from jaxsonar.hardware.protocol import FARTHEST, LARGEST_ANGLE, LONGEST_TIME_US
 
 from .logs import Log
 from .poses import wrap_angle
@@ -106,6 +106,11 @@ def _check_log(log: Log, ring: Ring) -> None:
     if wrong.any():
         allowed = f"0 to {LARGEST['scan'] - 1}"
         raise SonarError(f"log: scan {log.scan[wrong][0]} came; allowed for a device is {allowed}")
+    far = (np.abs(log.pose) > [FARTHEST, FARTHEST, LARGEST_ANGLE]).any(axis=1)
+    if far.any():
+        came = f"scan {log.scan[far][0]}: pose {tuple(log.pose[far][0].tolist())}"
+        allowed = f"x and y up to {FARTHEST:g} m, theta up to {LARGEST_ANGLE:g} rad"
+        raise SonarError(f"log: {came} came; allowed for a device are {allowed}")
 
 
 def _group_times(ring: Ring, stamps: Float[np.ndarray, " scans"]) -> Float[np.ndarray, "scans groups"]:
@@ -186,10 +191,10 @@ def _messages(
             for k in range(groups):
                 if k < len(poses[i]):
                     known = poses[i][k][0] == poses[i][k][0]  # not NaN
-                    if known:
+                    if known or placed:  # an unknown one is sent once, so that no earlier one holds
                         yield Pose(sequence % 2**32, time_us[i][k], *poses[i][k])
-                    placed |= known
-                    sequence += placed  # an unknown pose counts as lost, so that no earlier one holds
+                        sequence += 1
+                    placed = known
                 part = echoes[start[i * groups + k] : start[i * groups + k + 1]]
                 yield Group(sequence % 2**32, time_us[i][k], numbers[i], k, groups, temperature, part)
                 sequence += 1

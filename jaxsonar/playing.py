@@ -4,6 +4,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 from jaxsonar.hardware.errors import SonarError
@@ -33,7 +34,9 @@ def messages_of(path: str | os.PathLike[str], ring: Ring) -> Iterator[Message]:
         SonarError: the file cannot be read, or holds what no device can say.
     """
     if Path(path).suffix.lower() == ".mcap":
-        return _recorded(path, ring)
+        recorded = _recorded(path, ring)
+        first = next(recorded, None)  # so that a file that is none is refused here
+        return recorded if first is None else chain([first], recorded)
     try:
         log = load_log(path)
         return log_messages(log, ring)
@@ -47,6 +50,10 @@ def _recorded(path: str | os.PathLike[str], ring: Ring) -> Iterator[Message]:
     for topic, _, frame in read_mcap(path):
         if topic == MESSAGES:
             yield from decoder.feed(frame)
+            if decoder.counts.out_of_ring:
+                raise SonarError(
+                    f"{shown(path)}: a sensor beyond the ring came; allowed with it is 0 to {ring.count - 1}"
+                )
 
 
 def file_opener(ring: Ring):

@@ -4,7 +4,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -74,6 +74,8 @@ class Status:
     """The latest word about the link; empty while it is well."""
     warm: bool = False
     """Everything is compiled."""
+    ending: bool = False
+    """Told to end while things are compiled: what is in the record already is still to go into the map."""
 
     def line(self) -> str:
         """All of it that matters, on one line."""
@@ -95,7 +97,8 @@ class Status:
             said.append(f"{self.unplaced} without a pose")
         if self.waiting > 1:
             said.append(f"{self.waiting} waiting")
-        return ", ".join(said) + (f"; {self.event}" if self.event else "")
+        ending = "; ending once the map has them (again Ctrl-C: at once)" if self.ending else ""
+        return ", ".join(said) + (f"; {self.event}" if self.event else "") + ending
 
     def _kinds(self) -> str:
         names = ("oversized", "impossible", "out_of_ring", "unknown", "newer", "refused")
@@ -147,7 +150,8 @@ def stream(
         on_scan: told of every scan with its model.
         on_status: told how it goes, several times a second.
         on_event: told what becomes of the link, in the thread that reads.
-        stop: set it, from any thread or signal handler, to end: what came so far is still written.
+        stop: set it, from any thread or signal handler, to end: what came so far is still written. Where only a record
+            is, the compiler is not waited for: a daemon thread is then left, and ``Status.warm`` is False.
 
     Returns:
         How it went.
@@ -168,7 +172,7 @@ def stream(
             on_event(event)
 
     source = open_source(url, on_event=heard)
-    queue: NewestQueue[RawScan] = NewestQueue(WARMING_CAPACITY)
+    queue = NewestQueue[RawScan](WARMING_CAPACITY, size=lambda scan: len(scan.echoes))
     try:
         recorder = None if record is None else open_record(record)
     except SonarError:
@@ -184,7 +188,7 @@ def stream(
         run.until_end(stop, on_status)
     finally:
         reader.stop()
-        run.finish()
+        run.finish(on_status)
     if on_status is not None:
         on_status(run.status)
     return run.status
@@ -214,14 +218,15 @@ class _Run:
         self._map_at = time.monotonic() + map_every
         self._mapped = -1
         self._ticks: list[tuple[float, int]] = []
+        self._warming = _in_background(live.warm_up)
 
     def until_end(self, stop: threading.Event, on_status: Callable[[Status], None] | None) -> None:
         """Compile while the first scans come, then take scan after scan."""
-        with ThreadPoolExecutor(1, "jaxsonar warm-up") as pool:
-            warming = pool.submit(self._live.warm_up)
-            while not wait([warming], _LOOK).done:
-                self._tell(on_status)
-            warming.result()
+        while not wait([self._warming], _LOOK).done:
+            if stop.is_set():
+                return
+            self._tell(on_status)
+        self._warming.result()
         self.status.warm = True
         while not (stop.is_set() or self._queue.ended):
             self._take(self._queue.get(_LOOK, most=AT_ONCE))
@@ -234,8 +239,18 @@ class _Run:
                 self._write_map()
             self._tell(on_status)
 
-    def finish(self) -> None:
+    def finish(self, on_status: Callable[[Status], None] | None) -> None:
         """What is left: scans in the queue, the last map, what went wrong."""
+        if not self._warming.done():
+            if self._map_path is None and self._view is None and self._on_scan is None:
+                self._note()
+                while not self._queue.ended:
+                    self._queue.get(0.0, most=AT_ONCE)  # nobody asks for lines, but for what went wrong
+                return
+            self.status.ending = len(self._queue) > 0
+            while self.status.ending and not wait([self._warming], _LOOK).done:
+                self._tell(on_status)
+            self.status.warm, self.status.ending = self._warming.done(), False
         error: BaseException | None = None
         while error is None and not self._queue.ended:
             try:
@@ -295,3 +310,17 @@ class _Run:
         if self._timed:
             known = self._latency[: self._timed]
             status.p50, status.p99 = np.percentile(known, [50, 99]).tolist()
+
+
+def _in_background(work: Callable[[], None]) -> Future[None]:
+    """Work in a thread that no process waits for: a compiler cannot be told to stop."""
+    future: Future[None] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as failure:
+            future.set_exception(failure)
+
+    threading.Thread(target=run, name="jaxsonar warm-up", daemon=True).start()
+    return future

@@ -1,11 +1,13 @@
 """Groups to scans: whatever a link does to messages, what comes out is what was sent, or less, never anything else."""
 
+import threading
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsonar.hardware.assembly import MOST_GROUPS, REFERENCE_SPEED_OF_SOUND, Assembler
+from jaxsonar.hardware.assembly import MOST_ECHOES, MOST_GROUPS, REFERENCE_SPEED_OF_SOUND, Assembler
 from jaxsonar.hardware.messages import ECHO, Group, Pose
 from jaxsonar.hardware.queueing import NewestQueue
 from jaxsonar.ring import REFERENCE_SPEED_OF_SOUND as RING_REFERENCE
@@ -202,6 +204,16 @@ def test_hostile_groups_need_no_room():
     assert len(assembler._seen) <= 256
 
 
+def test_a_scan_of_too_many_echoes_keeps_those_that_came_first():
+    assembler = Assembler()
+    echoes = np.zeros(4096, ECHO)
+    for k in range(8):
+        assembler.push(Group(k, k, 0, k, 8, float("nan"), echoes), 0.0)
+    (scan,) = assembler.flush()
+    assert len(scan.echoes) == MOST_ECHOES == 4 * 4096
+    assert (scan.missing, assembler.counts.impossible) == (4, 4)
+
+
 def test_scans_without_echoes_temperatures_and_ranges():
     sent = device(2, temperature=21.5)
     for message in sent:
@@ -223,6 +235,29 @@ def test_echoes_stand_in_the_order_of_the_paths(faw_ring):
     path = faw_ring.path_index[scan.echoes["tx"], scan.echoes["rx"]]
     key = list(zip(path.tolist(), scan.echoes["time_us"].tolist(), strict=True))
     assert key == sorted(key)
+
+
+def test_a_pose_that_is_not_known_any_more_ends_the_one_before():
+    echoes = np.zeros(1, ECHO)
+    nowhere = Pose(2, 2, *[float("nan")] * 3)
+    sent = [Pose(0, 0, 1.0, 2.0, 0.1), Group(1, 1, 0, 0, 1, 20.0, echoes), nowhere, Group(3, 3, 1, 0, 1, 20.0, echoes)]
+    (known, unknown), counts = assembled(sent)
+    assert known.pose.tolist() == [1.0, 2.0, 0.1]
+    assert np.isnan(unknown.pose).all()
+    assert counts.lost == 0
+
+
+def test_large_items_make_room_as_many_small_ones_do():
+    queue = NewestQueue[int](100, size=lambda item: item, room=10)
+    for item in (4, 4, 4, 1, 30, 2, 3):  # one that is too large alone stays until the next one comes
+        queue.put(item)
+    assert queue.dropped == 5
+    assert queue.get(0.0, most=9) == [2, 3]
+    queue.put(8)
+    stop = threading.Event()
+    stop.set()
+    queue.put(9, wait=stop)
+    assert queue.get(0.0, most=9) == [9]
 
 
 def test_the_newest_win_and_are_counted():

@@ -151,6 +151,8 @@ WRONG = {
     "range 200 m, .* came": {"range": np.array([200.0])},
     "range 1e-80 m, .* came": {"range": np.array([1e-80])},
     "amplitude 1e.300 came": {"amplitude": np.array([1e300])},
+    r"scan 0: pose \(1e.300, 0.0, 0.0\) came": {"pose": np.array([[1e300, 0.0, 0.0]])},
+    r"pose \(0.0, 0.0, -10000000.0\) came": {"pose": np.array([[0.0, 0.0, -1e7]])},
 }
 
 
@@ -207,7 +209,19 @@ def test_a_pose_that_is_missing_on_the_way(office):
     scans = Counter(
         round(m.time_us / 1e6 - 0.05) for m in log_messages(log, office.ring, moving=True) if isinstance(m, Pose)
     )
-    assert scans == {0: 8, 2: 8, 3: 8}
+    assert scans == {0: 8, 1: 1, 2: 8, 3: 8}  # said once, that it is not known
+
+
+def test_a_pose_that_is_missing_is_no_lost_message(office, log):
+    """The numbers have no gap, and the log comes back without the poses that it lacks."""
+    pose = log.pose.copy()
+    pose[[0, 3, 4, 9]] = np.nan
+    part = Log.from_echoes(
+        log.echo_scan, log.tx, log.rx, log.range, amplitude=log.amplitude, stamp=log.stamp, pose=pose, scan=log.scan
+    )
+    sent = list(log_messages(part, office.ring))
+    assert [message.sequence for message in sent] == list(range(len(sent)))
+    assert_same(log_of(sent), part)
 
 
 def test_a_robot_at_rest_hears_in_a_room_what_a_scan_hears(office):

@@ -75,6 +75,14 @@ def test_what_goes_in_comes_out(sent):
     assert asdict(decoder.counts) == asdict(protocol.Counts(frames=len(sent)))
 
 
+def test_a_pose_may_be_not_known_any_more():
+    decoder = Decoder()
+    (pose,) = decoder.feed(encode(Pose(1, 2, *[float("nan")] * 3)))
+    assert isinstance(pose, Pose)
+    assert np.isnan([pose.x, pose.y, pose.theta]).all()
+    assert decoder.counts == protocol.Counts(frames=1)
+
+
 @given(messages)
 def test_a_frame_ends_with_its_only_zero(message):
     data = encode(message)

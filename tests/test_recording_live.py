@@ -4,6 +4,7 @@ import os
 import random
 import select
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -13,16 +14,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxsonar import Log, SonarError, load_log, save_log
+from jaxsonar import Log, Ring, SonarError, load_log, save_log
 from jaxsonar.hardware.assembly import Assembler, RawScan
 from jaxsonar.hardware.messages import ECHO, Group, Message, Pose
-from jaxsonar.hardware.protocol import Decoder, encode
+from jaxsonar.hardware.protocol import Decoder, encode, frame
 from jaxsonar.hardware.queueing import NewestQueue
 from jaxsonar.hardware.reading import Reader
 from jaxsonar.hardware.recording import Recorder, mark_of, open_recorder, scan_rows
 from jaxsonar.hardware.recording_mcap import EVENTS, MESSAGES, read_mcap
 from jaxsonar.hardware.transports import EndOfStream, Event, Source, open_source, parse_url
 from jaxsonar.journal import CutShort, journal_of, open_record
+from jaxsonar.playing import messages_of
 
 SUFFIXES = (".csv", ".parquet", ".mcap")
 
@@ -266,6 +268,16 @@ def test_a_full_disk_is_told_in_one_line(tmp_path):
         assert "\n" not in str(told.value)
 
 
+def test_frames_and_groups_that_cannot_be_are_counted_together():
+    echoes = np.zeros(1, ECHO)
+    echoes["time_us"] = 1000.0
+    many = encode(Group(9, 2_000_000, 1, 0, 500, 20.0, echoes))  # of so many groups makes nobody a scan
+    hot = frame(struct.pack("<BBBBIQIHHfHH", 1, 0, 1, 0, 10, 2_000_000, 1, 0, 4, 1e9, 0, 0))
+    scans, reader = read_all(Given([*map(encode, messages(1)), many, hot, hot]))
+    assert len(scans) == 1
+    assert (reader.counts["impossible"], reader.counts["rejected"]) == (3, 3)
+
+
 @pytest.mark.parametrize("name", ["log.txt", "log", "nowhere/log.csv", "nowhere/log.parquet", "nowhere/log.mcap"])
 def test_records_that_cannot_be(name, tmp_path):
     with pytest.raises(SonarError) as told:
@@ -281,6 +293,17 @@ def test_files_that_cannot_be_played(tmp_path):
             open_source(url)
         assert "\n" not in str(told.value)
     assert parse_url("file:/a/b.csv?speed=2").path == "/a/b.csv"
+
+
+def test_what_no_device_said_is_refused_before_anybody_listens(faw_ring, tmp_path):
+    garbage, raw = tmp_path / "x.mcap", tmp_path / "raw.mcap"
+    garbage.write_bytes(b"no record at all")
+    with pytest.raises(SonarError, match=r"x\.mcap: this is no MCAP file; needed is a record"):
+        messages_of(garbage, faw_ring)
+    read_all(Given(map(encode, messages(1))), open_recorder(raw))
+    assert len(list(messages_of(raw, faw_ring))) == 5
+    with pytest.raises(SonarError, match=r"raw\.mcap: a sensor beyond the ring came; allowed with it is 0 to 2"):
+        list(messages_of(raw, Ring.circular(count=3, neighbors=1)))
 
 
 def test_a_reader_that_is_stopped_has_written_everything(tmp_path):

@@ -223,6 +223,35 @@ def test_the_first_scans_wait_for_the_compiler_and_a_number_of_scans_ends_it(off
     assert status.warm
 
 
+@pytest.mark.parametrize("mapping", [False, True])
+def test_the_end_waits_for_the_compiler_only_where_a_map_does(mapping, office, log, tmp_path, monkeypatch):
+    """The record is whole at once, either way."""
+    compiled, stop, ending = threading.Event(), threading.Event(), []
+    monkeypatch.setattr(LiveMap, "warm_up", lambda self: compiled.wait(60))
+    record, map_path = tmp_path / "r.csv", tmp_path / "m.geojson"
+
+    def on_status(status):
+        if status.waiting == len(log):
+            stop.set()
+        if status.ending and not ending:
+            ending.append((len(load_log(record)), os.listdir(tmp_path), status.line()))
+            compiled.set()
+
+    with Device("tcp://127.0.0.1:0", log_messages(log, office.ring)) as device:
+        choices = {"record": record, "map_path": map_path if mapping else None, "stop": stop, "on_status": on_status}
+        status = stream(device.sink.url, office.ring, method="hough", **choices)
+    assert len(load_log(record)) == len(log)
+    assert status.warm == compiled.is_set() == mapping
+    assert status.scans == (len(log) if mapping else 0)
+    assert not status.ending
+    compiled.set()
+    if mapping:
+        ((scans, files, line),) = ending
+        assert (scans, files) == (len(log), ["r.csv"])
+        assert "17 waiting; ending once the map has them" in line
+        assert len(load_map(map_path)) > 0
+
+
 def test_errors_come_after_everything_was_written(office, log, tmp_path, monkeypatch):
     from jaxsonar.hardware.transports import Source
 
@@ -361,8 +390,8 @@ def command(tmp_path_factory):
     own = {"PYTHONPATH": str(Path(__file__).parents[1]), "XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 
-    def start(*arguments):
-        return subprocess.Popen([*COMMAND, *map(str, arguments)], env=os.environ | own, **pipes)
+    def start(*arguments, **environment):
+        return subprocess.Popen([*COMMAND, *map(str, arguments)], env=os.environ | own | environment, **pipes)
 
     return start
 
@@ -417,6 +446,28 @@ def test_a_signal_ends_it_with_everything_written(number, device, command, tmp_p
     assert sorted(os.listdir(tmp_path)) == ["map.geojson", "rec.csv"], "nothing is left beside them"
     assert max((max(scans) for scans in world.scans), default=0) <= log.scan.max()
     assert f"{len(log)} scans" in told.splitlines()[-1]
+
+
+@pytest.mark.parametrize("mapping", [False, True])
+def test_signals_end_it_while_it_compiles(mapping, device, command, tmp_path):
+    """Method ml takes many seconds to compile: one signal is enough for a record, and two for a map."""
+    record = tmp_path / "rec.csv"
+    call = ["stream", device("tcp://127.0.0.1:0", "--speed", "20"), "--ring", "faw", "--record", record]
+    call += ["--map", tmp_path / "map.geojson"] if mapping else []
+    streaming = command(*call, JAX_ENABLE_COMPILATION_CACHE="false")
+    end = time.monotonic() + 60
+    while time.monotonic() < end and not (record.exists() and record.stat().st_size > 3000):
+        time.sleep(0.02)
+    before = time.monotonic()
+    for _ in range(1 + mapping):
+        streaming.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+    _, told = streaming.communicate(timeout=60)
+    assert time.monotonic() - before < 8.0, told
+    assert streaming.returncode == mapping, told
+    assert ("interrupted" if mapping else "0 scans, compiling") in told.splitlines()[-1]
+    assert os.listdir(tmp_path) == ["rec.csv"]
+    assert len(load_log(record)) > 0
 
 
 @pytest.mark.parametrize(

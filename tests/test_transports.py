@@ -132,6 +132,7 @@ WRONG = {
     "tcp://localhost:9/path": "tcp://HOST:PORT",
     "tcp://localhost:9?baud=3": "option 'baud' came; allowed is none",
     "tcp://localhost:9?baud": r"'\?baud' came; allowed is",
+    "tcp://localhost:9?a=1&a=2": "each name once",
     "udp://127.0.0.1": "udp://HOST:PORT",
     "tcp://a..b:9": "needed is a device",
     "serial:": "a path as in",
