@@ -1,3 +1,5 @@
+from .batch import BatchReport as BatchReport
+from .batch import batch as batch
 from .calibration import Calibration as Calibration
 from .calibration import calibrate as calibrate
 from .calibrationfile import save_calibration as save_calibration

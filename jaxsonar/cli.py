@@ -14,11 +14,14 @@ from typing import NoReturn
 
 from jaxsonar.hardware.errors import SonarError
 
+from .commands_batch import add_command as add_batch_command
 from .commands_live import add_commands as add_live_commands
 from .files import FIGURE_FORMATS as FIGURES
 
 SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for each scan)"
 SETTINGS_HELP = "accumulator and low pass, for hough also threshold, instead of the paper's"
+COMPILING = ("demo", "lines", "map", "calibrate", "check")
+"""Commands that run kernels: their compiled programs are kept (``stream`` and ``batch`` see to it themselves)."""
 RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
 
 
@@ -230,18 +233,21 @@ def parser() -> argparse.ArgumentParser:
 
     texts = {"ring": RING_HELP, "sigma": SIGMA_HELP, "settings": SETTINGS_HELP}
     whole = partial(_number, int)
+    add_batch_command(command, whole=whole, file=_file, choose_method=_choose_method, texts=texts)
     add_live_commands(command, whole=whole, number=_finite, ending_in=_ending_in, texts=texts)
     return top
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code: 0 done, 2 the input or the call was wrong, 1 anything else."""
+    """Run one command; the exit code: 0 done, 2 the input or the call was wrong, 1 anything else, or a part undone."""
     options = parser().parse_args(arguments)
     if sys.stdout is None:  # closed by whoever called
         with open(os.devnull, "w") as sys.stdout:
             return main(arguments)
     try:
-        getattr(import_module("jaxsonar.commands"), options.command)(options)
+        if options.command in COMPILING:
+            import_module("jaxsonar.compilecache").use_compilation_cache()
+        code = getattr(import_module("jaxsonar.commands"), options.command)(options)
         sys.stdout.flush()
     except SonarError as error:
         print(f"jaxsonar {options.command}: {error}", file=sys.stderr)
@@ -257,4 +263,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jaxsonar {options.command}: {error.strerror or error}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    return 0
+    return code or 0

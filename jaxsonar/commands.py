@@ -510,3 +510,10 @@ def emulate(options: argparse.Namespace) -> None:
     from .commands_live import emulate
 
     emulate(options)
+
+
+def batch(options: argparse.Namespace) -> int:
+    """``jaxsonar batch``."""
+    from .commands_batch import batch
+
+    return batch(options)

@@ -7,9 +7,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from jaxsonar.hardware.errors import SonarError
 
@@ -31,6 +31,7 @@ def stream(options: argparse.Namespace) -> None:
     from jaxsonar.hardware.transports import parse_url
 
     from .commands import _check_sigma_is_used
+    from .compilecache import use_compilation_cache
     from .files import check_outputs
     from .ringfile import load_ring
     from .settings import load_settings
@@ -48,24 +49,30 @@ def stream(options: argparse.Namespace) -> None:
         from .view import View
 
         view = View(ring, file=options.rrd, say=_say)
-    _use_compilation_cache()
+    use_compilation_cache()
     show = _StatusLine()
-    with _stopped_by_signals() as stop:
-        status = stream_scans(
-            options.url,
-            ring,
-            method=options.method,
-            settings=settings,
-            sigma=options.sigma,
-            record=options.record,
-            map_path=options.map,
-            scans=options.scans,
-            view=view,
-            on_status=show.status,
-            on_event=show.event,
-            stop=stop,
-        )
+    try:
+        with _stopped_by_signals() as stop:
+            status = stream_scans(
+                options.url,
+                ring,
+                method=options.method,
+                settings=settings,
+                sigma=options.sigma,
+                record=options.record,
+                map_path=options.map,
+                scans=options.scans,
+                view=view,
+                on_status=show.status,
+                on_event=show.event,
+                stop=stop,
+            )
+    except KeyboardInterrupt:
+        _say("jaxsonar stream: interrupted")
+        _end(1)
     show.last(status)
+    if not status.warm:
+        _end(0)
 
 
 def emulate(options: argparse.Namespace) -> None:
@@ -125,15 +132,17 @@ class _StatusLine:
     def __init__(self):
         self._terminal = sys.stderr.isatty()
         self._at = 0.0
+        self._ending = False
         self._began = time.monotonic()
         self._lock = threading.Lock()
 
     def status(self, status: "Status") -> None:
         """How it goes."""
         now = time.monotonic()
-        if now - self._at >= (ON_TERMINAL if self._terminal else ELSEWHERE):
+        told, self._ending = self._ending, status.ending
+        if now - self._at >= (ON_TERMINAL if self._terminal else ELSEWHERE) or self._ending > told:
             first, self._at = self._at == 0.0, now
-            if self._terminal or not first:
+            if self._terminal or self._ending or not first:
                 self._write(status.line(), over=True)
 
     def event(self, event: "Event") -> None:
@@ -232,24 +241,13 @@ def add_commands(
     )
 
 
+def _end(code: int) -> NoReturn:
+    """Leave without waiting for the compiler, which cannot be told to stop; everything is written."""
+    for file in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            file.flush()
+    os._exit(code)
+
+
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
-
-
-def _use_compilation_cache() -> None:
-    """Keep compiled programs between runs, in a folder that only this user may write to, unless JAX was told where."""
-    import jax
-
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
-        return
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "jaxsonar" / "compiled"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        seen = folder.stat()
-        if seen.st_uid != os.getuid() or seen.st_mode & 0o022:
-            return  # what lies there is run: it must be nobody else's
-    except (OSError, RuntimeError):
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

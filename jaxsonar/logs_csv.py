@@ -61,11 +61,28 @@ def read_csv_text(path: str | os.PathLike[str], text: bytes) -> Log:
     header, _, body = text.partition(b"\n")
     if body and not body.endswith(b"\n"):
         body += b"\n"
-    source = _Source(path, _header(path, header), body)
+    return read_csv_rows(path, csv_header(path, header), body)
+
+
+def read_csv_rows(path: str | os.PathLike[str], columns: tuple[str, ...], body: bytes, *, first: int = 2) -> Log:
+    """As ``read_csv``, from whole rows of a file.
+
+    Args:
+        path: for messages.
+        columns: what ``csv_header`` found.
+        body: rows, each with its LF.
+        first: row of the file that the first of them is; the header is row 1.
+    """
+    source = _Source(path, columns, body, first)
     return source.log(source.rows())
 
 
-def _header(path: str | os.PathLike[str], line: bytes) -> tuple[str, ...]:
+def csv_header(path: str | os.PathLike[str], line: bytes) -> tuple[str, ...]:
+    """The columns that the first row of a file names, without byte order mark and line end.
+
+    Raises:
+        SonarError: these are not the columns of a scan log.
+    """
     wanted = f"allowed is {','.join(COLUMNS)} and optionally ,{OPTIONAL}"
     if not line:
         raise SonarError(f"{shown(path)}: row 1: no header came; {wanted}")
@@ -89,8 +106,8 @@ def _header(path: str | os.PathLike[str], line: bytes) -> tuple[str, ...]:
 class _Source:
     """The body of one file: how its rows are parsed, grouped to scans, and named when they are wrong."""
 
-    def __init__(self, path: str | os.PathLike[str], columns: tuple[str, ...], body: bytes):
-        self.path, self.columns, self.body = path, columns, body
+    def __init__(self, path: str | os.PathLike[str], columns: tuple[str, ...], body: bytes, first: int):
+        self.path, self.columns, self.body, self.first = path, columns, body, first
 
     def rows(self) -> _Rows:
         """Every field as a number."""
@@ -160,17 +177,18 @@ class _Source:
             self.fail(int(np.argmax(bad)), column, allowed)
 
     def fail(self, row: int, column: str, allowed: str) -> NoReturn:
-        """An error about one field; ``row`` counts from 0 below the header."""
+        """An error about one field; ``row`` counts from 0 through the body."""
         field = self.body.split(b"\n", row + 1)[row].split(b",")[self.columns.index(column)]
         came = f"'{shown(field.decode(errors='backslashreplace'), 40)}'" if field else "nothing"
-        raise SonarError(f"{shown(self.path)}: row {row + 2}, column {column}: {came} came; allowed is {allowed}")
+        place = f"{shown(self.path)}: row {row + self.first}"
+        raise SonarError(f"{place}, column {column}: {came} came; allowed is {allowed}")
 
     def refuse_text(self, begin: int) -> NoReturn:
         """An error about the first row from ``begin`` on that is not the right number of decimal numbers."""
         lines = self.body[begin:].split(b"\n")[:-1]
         first = self.body.count(b"\n", 0, begin)
         for row, line in enumerate(lines, first):
-            place = f"{shown(self.path)}: row {row + 2}"
+            place = f"{shown(self.path)}: row {row + self.first}"
             fields = line.split(b",")
             if b"\0" in line:
                 raise SonarError(f"{place}: this is no text; allowed are {len(self.columns)} numbers")

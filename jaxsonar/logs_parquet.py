@@ -4,6 +4,7 @@ Row numbers in messages count scans from 1, echoes within a row from 0.
 """
 
 import os
+from collections.abc import Iterable, Iterator
 from typing import Any, NoReturn
 
 import numpy as np
@@ -45,6 +46,42 @@ def read_parquet(path: str | os.PathLike[str]) -> Log:
             row += len(batch)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as failure:  # the last from column names
         raise SonarError(f"{shown(path)}: {reason(failure)}; needed is a scan log as a whole Parquet file") from None
+    return _log(path, parts)
+
+
+def read_batch(path: str | os.PathLike[str], batch: Any, row: int) -> Log:
+    """As ``read_parquet``, from a record batch of a file whose schema was checked (``open_parquet``).
+
+    Args:
+        path: for messages.
+        batch: rows of the file.
+        row: row of the file that the first of them is, from 0.
+    """
+    pa, _ = _pyarrow(path)
+    return _log(path, [_batch(path, pa, batch, row)], row)
+
+
+def open_parquet(path: str | os.PathLike[str], *, name: str | None = None) -> Any:
+    """A ``pyarrow.parquet.ParquetFile`` of a scan log, for those who read it in parts.
+
+    Args:
+        path: the file.
+        name: what messages call it; the path if left out.
+
+    Raises:
+        SonarError: as ``read_parquet``.
+    """
+    name = os.fspath(path) if name is None else name
+    pa, pq = _pyarrow(name)
+    try:
+        file = pq.ParquetFile(path)
+        _check_schema(name, pa, file.schema_arrow)
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as failure:
+        raise SonarError(f"{shown(name)}: {reason(failure)}; needed is a scan log as a whole Parquet file") from None
+    return file
+
+
+def _log(path: str | os.PathLike[str], parts: list[dict[str, np.ndarray]], row: int = 0) -> Log:
     none = {"scan": np.zeros(0, np.int64), "tx": np.zeros(0, np.int64), "rx": np.zeros(0, np.int64)}
     column = {
         name: np.concatenate([none.get(name, np.zeros(0)), *(part[name] for part in parts)])
@@ -63,7 +100,7 @@ def read_parquet(path: str | os.PathLike[str]) -> Log:
     except LogFault as fault:
         name = fault.column if fault.echo is None else f"echoes[{fault.echo - start[fault.scan]}].{fault.column}"
         name = "x, y, theta" if name == "pose" else name
-        _fail(path, fault.scan, name, str(fault.value), ALLOWED[fault.column])
+        _fail(path, row + fault.scan, name, str(fault.value), ALLOWED[fault.column])
 
 
 def write_parquet(log: Log, path: str | os.PathLike[str]) -> None:
@@ -76,6 +113,11 @@ def write_parquet(log: Log, path: str | os.PathLike[str]) -> None:
     Raises:
         SonarError: the place cannot be written, or the extra is missing.
     """
+    write_parquet_parts([log], path)
+
+
+def write_parquet_parts(parts: Iterable[Log], path: str | os.PathLike[str]) -> None:
+    """As ``write_parquet``, from logs that follow each other, each written before the next one is asked for."""
     pa, pq = _pyarrow(path)
     number = pa.float64()
     echo = pa.struct(
@@ -95,8 +137,7 @@ def write_parquet(log: Log, path: str | os.PathLike[str]) -> None:
         ]
     )
     with atomic_write(path, binary=True) as file, pq.ParquetWriter(file, schema) as writer:
-        for begin in range(0, len(log), SCANS_AT_ONCE):
-            part = log[begin : begin + SCANS_AT_ONCE]
+        for part in _blocks(parts):
             values = pa.StructArray.from_arrays(
                 [
                     pa.array(part.tx.astype(np.int32)),
@@ -112,6 +153,12 @@ def write_parquet(log: Log, path: str | os.PathLike[str]) -> None:
                 pa.ListArray.from_arrays(pa.array(part.start.astype(np.int32)), values, type=echoes),
             ]
             writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
+
+
+def _blocks(parts: Iterable[Log]) -> Iterator[Log]:
+    for log in parts:
+        for begin in range(0, len(log), SCANS_AT_ONCE):
+            yield log[begin : begin + SCANS_AT_ONCE]
 
 
 def _pyarrow(path: str | os.PathLike[str]) -> tuple[Any, Any]:

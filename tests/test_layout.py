@@ -237,7 +237,7 @@ def test_help_needs_nothing_heavy():
     code = f"""
 import sys
 from jaxsonar.cli import main
-for call in " lines demo simulate convert map reference evaluate stream emulate".split(" "):
+for call in " lines demo simulate convert map reference evaluate stream emulate batch".split(" "):
     try:
         main([*call.split(), "--help"])
     except SystemExit as end:
