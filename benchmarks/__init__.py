@@ -1,1 +1,1 @@
-"""Benchmarks: one file a workload, run as ``python -m benchmarks.NAME``."""
+"""Benchmarks: ``python -m benchmarks`` for speed, and one file a workload, some with commands of their own."""

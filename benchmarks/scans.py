@@ -1,0 +1,61 @@
+"""What is measured on: simulated scans in random rooms, as many echoes as the rooms give, or about 64 a scan."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsonar import Log, Ring, Scan, random_pose, random_room, simulate
+
+SLOTS = 2
+"""Echoes that an array has room for on each path."""
+ROOMS = 20
+SIGMA = 0.003
+"""Metres; noise of the ranges."""
+DENSE = 1 / 3
+"""Share of the scans with the most echoes, about 64 each."""
+
+
+class Batch(NamedTuple):
+    """One ring's scans, twice."""
+
+    ring: Ring
+    mixed: Float[np.ndarray, "scans paths slots"]
+    """As they come, about 45 echoes a scan; half path lengths, metres, NaN = no echo."""
+    dense: Float[np.ndarray, "scans paths slots"]
+    """As many again of the third with the most echoes, about 64 a scan, each three times."""
+
+
+def scans_of_random_rooms(ring: Ring, count: int, *, seed: int = 0) -> Float[np.ndarray, "scans paths slots"]:
+    """Ranges (metres, NaN = no echo) of scans in 20 random rooms, noise 3 mm, in random order."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for k in range(ROOMS):
+        room = random_room(rng)
+        poses = np.stack([random_pose(rng, room) for _ in range(-(-count // ROOMS))])
+        parts.append(simulate(ring, room, poses, sigma=SIGMA, seed=seed + k).dense(len(ring.paths), SLOTS))
+    order = rng.permutation(sum(len(part) for part in parts))[:count]
+    return np.concatenate(parts)[order].astype(np.float32)
+
+
+def echoes_of(ranges: Float[np.ndarray, "scans paths slots"]) -> Float[np.ndarray, " scans"]:
+    """Number of echoes of each scan."""
+    return np.isfinite(ranges).sum(axis=(1, 2)).astype(float)
+
+
+def batch(count: int, *, seed: int = 0, ring: Ring | None = None) -> Batch:
+    """So many scans of the paper's ring, or of another one."""
+    ring = Ring.circular() if ring is None else ring
+    mixed = scans_of_random_rooms(ring, count, seed=seed)
+    most = np.argsort(-echoes_of(mixed), kind="stable")[: max(1, round(DENSE * count))]
+    return Batch(ring, mixed, mixed[np.resize(np.sort(most), count)])
+
+
+def single_scans(ring: Ring, ranges: Float[np.ndarray, "scans paths slots"]) -> list[Scan]:
+    """The same as scans of a log."""
+    scan, path, slot = np.nonzero(np.isfinite(ranges))
+    tx, rx = ring.paths[path].T
+    count = len(ranges)
+    reach = ranges[scan, path, slot].astype(np.float64)
+    log = Log.from_echoes(scan, tx, rx, reach, stamp=0.1 * np.arange(count), pose=np.full((count, 3), np.nan))
+    return list(log)
