@@ -14,8 +14,9 @@ import numpy as np
 
 from jaxsonar import HoughSettings, Ring, extract_lines, kernels, local_model
 from jaxsonar.candidates import arcs_of, extract, pieces_of
+from jaxsonar.centres import centres_of_gravity
 from jaxsonar.components import label_components
-from jaxsonar.echoes import FlatEchoes, room_for
+from jaxsonar.echoes import FlatEchoes, Step
 from jaxsonar.explained import explained
 from jaxsonar.local import models_of
 from jaxsonar.windows import Windows
@@ -30,9 +31,8 @@ Stages = dict[str, Callable[[], object]]
 WHOLE = "whole"
 
 
-def _packed(ring: Ring, echoes: FlatEchoes, settings: HoughSettings, *, dear: bool = False) -> list[kernels.Echoes]:
-    pieces = pieces_of(ring, settings)
-    return [step.packed for step in echoes.steps(settings.cells, pieces=pieces, dear=dear)]
+def _steps(ring: Ring, echoes: FlatEchoes, settings: HoughSettings, *, dear: bool = False) -> list[Step]:
+    return list(echoes.steps(settings.cells, pieces=pieces_of(ring, settings), dear=dear))
 
 
 def hough_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = None) -> Stages:
@@ -40,27 +40,18 @@ def hough_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None 
     settings = settings or HoughSettings()
     arcs = arcs_of(ring, settings)
     echoes = FlatEchoes.from_dense(ring, ranges)
-    packed = _packed(ring, echoes, settings)
-    occupied = [kernels.occupied_cells(arcs, one, settings=settings) for one in packed]
-    masks = [np.asarray(mask) for mask in occupied]
+    steps = _steps(ring, echoes, settings)
+    voted = [kernels.vote(arcs, step.packed, settings=settings) for step in steps]
+    masks = [np.asarray(one.occupied) for one in voted]
     labelled = [label_components(mask) for mask in masks]
-    size = room_for(max(int(counts.max(initial=0)) for _, counts in labelled), least=16)
-    labels = [jnp.asarray(one) for one, _ in labelled]
-
-    def centres() -> Any:
-        return [
-            kernels.cluster_lines(arcs, one, label, settings=settings, size=size)
-            for one, label in zip(packed, labels, strict=True)
-        ]
-
     return {
         WHOLE: lambda: extract_lines(ring, ranges, method="hough", settings=settings),
-        "pack": lambda: _packed(ring, FlatEchoes.from_dense(ring, ranges), settings),
-        "votes": lambda: jax.block_until_ready(
-            [kernels.occupied_cells(arcs, one, settings=settings) for one in packed]
-        ),
+        "pack": lambda: _steps(ring, FlatEchoes.from_dense(ring, ranges), settings),
+        "votes": lambda: jax.block_until_ready([kernels.vote(arcs, step.packed, settings=settings) for step in steps]),
         "components": lambda: [label_components(mask) for mask in masks],
-        "centres": lambda: jax.block_until_ready(centres()),
+        "centres": lambda: [
+            centres_of_gravity(arcs, step, one, *found) for step, one, found in zip(steps, voted, labelled, strict=True)
+        ],
     }
 
 
@@ -68,7 +59,7 @@ def ml_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = N
     """A batch by maximum likelihood; ``candidates`` is what of it are votes and low pass."""
     settings = settings or HoughSettings()
     arcs, expected = arcs_of(ring, settings), kernels.Expectations()
-    packed = _packed(ring, FlatEchoes.from_dense(ring, ranges), settings, dear=True)
+    packed = [step.packed for step in _steps(ring, FlatEchoes.from_dense(ring, ranges), settings, dear=True)]
     noise = jnp.asarray(np.nan, jnp.float32)
     found = list(explained(ring, FlatEchoes.from_dense(ring, ranges), settings, None))
 
@@ -77,7 +68,7 @@ def ml_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = N
 
     return {
         WHOLE: lambda: extract_lines(ring, ranges, method="ml", settings=settings),
-        "pack": lambda: _packed(ring, FlatEchoes.from_dense(ring, ranges), settings, dear=True),
+        "pack": lambda: _steps(ring, FlatEchoes.from_dense(ring, ranges), settings, dear=True),
         "explain": lambda: jax.block_until_ready(explain()),
         "lines": lambda: [one.lines for one in found],
     }

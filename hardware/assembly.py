@@ -274,7 +274,7 @@ class Assembler:
         last = max(order, key=lambda k: (scan.parts[k][1].time_us, k))
         stamp = min(part.time_us for part in groups) * 1e-6 + self._clock_offset
         self._last_stamp = max(stamp, scan.parts[last][1].time_us * 1e-6 + self._clock_offset)
-        echoes = np.concatenate([np.zeros(0, ECHO), *(part.echoes for part in groups)])
+        echoes = np.frombuffer(bytearray().join(part.echoes.tobytes() for part in groups), ECHO)
         group = np.repeat(np.array(order, dtype=np.int64), [len(part.echoes) for part in groups])
         if self._sensors is not None:
             by_path = _path_order(echoes, self._sensors)

@@ -109,6 +109,9 @@ def read_mcap(path: str | os.PathLike[str]) -> Iterator[tuple[str, float, bytes]
             except Exception:  # whatever a library says of bytes that stop in the middle
                 if not began:
                     raise SonarError(f"{shown(path)}: this is no MCAP file; needed is a record (MCAP)") from None
+            if topics and MESSAGES not in topics.values():
+                others = shown(", ".join(sorted(topics.values())))
+                raise SonarError(f"{shown(path)}: topics {others}; needed is {MESSAGES}, which a record has")
     except OSError as failure:
         raise SonarError(f"{shown(path)}: {failure.strerror}; needed is a readable file with a record (MCAP)") from None
 

@@ -10,8 +10,9 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
+from .centres import centres_of_gravity
 from .components import label_components
-from .echoes import FlatEchoes, Step, room_for
+from .echoes import FlatEchoes, Step
 from .ring import Ring
 
 WINDOW_THRESHOLD = 0.05
@@ -90,18 +91,14 @@ def extract(
     """
     arcs = arcs_of(ring, settings) if arcs is None else arcs
     for step in echoes.steps(settings.cells, pieces=pieces_of(ring, settings)):
-        packed = step.packed
         # Echo arcs -> equidistant points -> tangent lines -> votes -> low pass -> threshold, in one compiled step.
-        occupied = kernels.occupied_cells(arcs, packed, settings=settings)
+        voted = kernels.vote(arcs, step.packed, settings=settings)
         # Clusters are regions of cohesive highly occupied cells.
-        labels, counts = label_components(np.asarray(occupied))
+        labels, counts = label_components(np.asarray(voted.occupied))
         # Centres of gravity of the points in each cluster, and from the sensors involved the extent of each line.
-        size = room_for(int(counts.max(initial=0)), least=16)
-        clusters, segments = kernels.cluster_lines(arcs, packed, labels, settings=settings, size=size)
-        real = slice(0, len(step.scans))  # the rest is padding
-        columns = (clusters.rho, clusters.theta, clusters.votes, segments, clusters.involved)
-        lines, involved = _sift(*(np.asarray(column)[real] for column in columns), min_echoes=settings.min_echoes)
-        yield Extracted(step, lines, involved, counts[real])
+        centres = centres_of_gravity(arcs, step, voted, labels, counts)
+        lines, involved = _sift(*centres, min_echoes=settings.min_echoes)
+        yield Extracted(step, lines, involved, counts[: len(step.scans)])
 
 
 def _sift(

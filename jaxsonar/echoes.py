@@ -20,7 +20,7 @@ BLOCK = 4096
 """Scans among which those are sought that need the same room."""
 _FARTHEST = 1e6  # m; beyond all rings, and within single precision
 _FEW_CELLS = 50_000  # accumulators larger than this are not stacked by the hundred
-_WORTH_A_SHAPE = 64  # scans
+_WORTH_A_SHAPE = 256  # scans
 _SLACK = 1.1
 
 

@@ -19,7 +19,7 @@ from .maps import GlobalMap
 from .poses import relative
 from .ring import Ring, speed_of_sound
 
-AT_ONCE = 16
+AT_ONCE = 64
 """Scans taken together where so many wait."""
 FEW = 4
 """Scans; fewer are faster one by one."""
@@ -27,7 +27,7 @@ STILL = 1e-4
 """Metres and radians; a robot that moves less than this during a scan stands still."""
 DEGREE = 0.1
 """Kelvin; a change of the air's temperature that is worth a new speed of sound."""
-_WARM = {"ml": (1,), "hough": (1, AT_ONCE)}  # numbers of scans that are taken together
+_WARM = {"ml": (1,), "hough": (1, FEW, AT_ONCE)}  # numbers of scans that are taken together
 _ECHOES = (60, 90, 120)  # of a scan, each in a room of its own (``echoes.room_for``)
 
 

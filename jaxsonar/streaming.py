@@ -1,10 +1,12 @@
 """From a device to lines and a map, live: what ``jaxsonar stream`` does."""
 
 import os
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -30,6 +32,8 @@ MAP_EVERY = 2.0
 WARMING_CAPACITY = 8192
 """Scans that find room while things are compiled, 12 min of the paper's ring and some 30 MB."""
 _LOOK = 0.2
+_TOLD = 0.1  # seconds between two words on how it goes
+_SWITCH = 5e-4  # seconds that one thread may keep the interpreter, where another has a scan to hand on
 _LATENCIES = 1 << 16  # the latest ones are kept
 
 
@@ -182,13 +186,14 @@ def stream(
     reader = Reader(source, queue, sensors=ring.count, recorder=recorder, scans=scans, patient=patient)
     readers.append(reader)
     run = _Run(live, reader, queue, map_path=map_path, map_every=map_every, view=view, on_scan=on_scan)
-    reader.start()
     stop = threading.Event() if stop is None else stop
-    try:
-        run.until_end(stop, on_status)
-    finally:
-        reader.stop()
-        run.finish(on_status)
+    with _switching(_SWITCH):
+        reader.start()
+        try:
+            run.until_end(stop, on_status)
+        finally:
+            reader.stop()
+            run.finish(on_status)
     if on_status is not None:
         on_status(run.status)
     return run.status
@@ -218,6 +223,7 @@ class _Run:
         self._map_at = time.monotonic() + map_every
         self._mapped = -1
         self._ticks: list[tuple[float, int]] = []
+        self._told = 0.0
         self._warming = _in_background(live.warm_up)
 
     def until_end(self, stop: threading.Event, on_status: Callable[[Status], None] | None) -> None:
@@ -294,9 +300,10 @@ class _Run:
         self._map_at = time.monotonic() + self._map_every
 
     def _tell(self, on_status: Callable[[Status], None] | None) -> None:
-        if on_status is None:
-            return
         status, now = self.status, time.monotonic()
+        if on_status is None or (now - self._told < _TOLD and not status.ending):
+            return
+        self._told = now
         self._ticks = [tick for tick in self._ticks if now - tick[0] < 2.0] + [(now, status.scans)]
         (before, scans), *_ = self._ticks
         status.rate = (status.scans - scans) / (now - before) if now > before else 0.0
@@ -310,6 +317,17 @@ class _Run:
         if self._timed:
             known = self._latency[: self._timed]
             status.p50, status.p99 = np.percentile(known, [50, 99]).tolist()
+
+
+@contextmanager
+def _switching(interval: float) -> Iterator[None]:
+    """Let Python threads take turns this often (seconds): by default one that waits does so for 5 ms."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(min(before, interval))
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 def _in_background(work: Callable[[], None]) -> Future[None]:

@@ -31,14 +31,14 @@ from .explanation import explain as explain
 from .extraction import PIECE as PIECE
 from .extraction import Echoes as Echoes
 from .extraction import RingArcs as RingArcs
+from .extraction import Voted as Voted
 from .extraction import accumulators as accumulators
-from .extraction import cluster_lines as cluster_lines
 from .extraction import lines_of_scan as lines_of_scan
 from .extraction import moved_arcs as moved_arcs
 from .extraction import occupied_cells as occupied_cells
 from .extraction import points_of_widest_arc as points_of_widest_arc
 from .extraction import ring_arcs as ring_arcs
-from .extraction import sensors_of as sensors_of
+from .extraction import vote as vote
 from .fitting import Fits as Fits
 from .fitting import fit_candidates as fit_candidates
 from .geometry import edge_range as edge_range

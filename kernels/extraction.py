@@ -1,4 +1,4 @@
-"""Straight lines from the echoes of scans: the jitted steps before and after the component labelling (section 4)."""
+"""From the echoes of scans to highly occupied cells: the jitted step before the component labelling (section 4)."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from . import arcs, clusters, hough
-from .geometry import normal, tangent
+from . import arcs, hough
 from .hough import HoughSettings
 from .paths import EchoPaths, Sensors, echo_paths, moved_path
 
@@ -157,15 +156,6 @@ def lines_of_scan(ring: RingArcs, echoes: Echoes, settings: HoughSettings) -> Ta
     return jax.vmap(part)(echoes.piece, echoes.owner)
 
 
-def sensors_of(ring: RingArcs, echoes: Echoes) -> Float[Array, "echoes 2"]:
-    """Real or virtual sensor of every echo of ONE scan, in the frame of its lines, metres."""
-    sensor = ring.paths.midpoint[echoes.path]
-    if echoes.pose is None:
-        return sensor
-    forward, left = normal(echoes.pose[:, 2]), tangent(echoes.pose[:, 2])
-    return echoes.pose[:, :2] + sensor[:, :1] * forward + sensor[:, 1:] * left
-
-
 def over_scans(one_scan: Callable, *scans):
     """One scan after the other where caches are small (CPU), all at once where cores are many (GPU)."""
     return jax.lax.platform_dependent(
@@ -175,80 +165,51 @@ def over_scans(one_scan: Callable, *scans):
     )
 
 
+class Voted(eqx.Module):
+    """What a batch of scans voted for (paper, section 4, up to the threshold)."""
+
+    occupied: Bool[Array, "*scans theta rho"]
+    """The highly occupied cells of each scan."""
+    cell: Int[Array, "*scans arcs points"]
+    """The cell of every point, row * rho_cells + column; one past the last cell where there is none."""
+    rho: Float[Array, "*scans arcs points"]
+    """The distance of every point's tangent line, metres, any sign."""
+
+
 @partial(jax.jit, static_argnames="settings")
-def occupied_cells(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -> Bool[Array, "scans theta rho"]:
+def vote(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -> Voted:
     """The paper's section 4 up to the threshold, for a batch of scans in one compiled step.
 
     Args:
         ring: arcs of the ring's paths, and the threshold.
         echoes: (scans, echoes) packed echoes.
         settings: accumulator and low pass.
-
-    Returns:
-        The highly occupied cells of each scan.
     """
 
-    def one_scan(scan: Echoes) -> Bool[Array, "theta rho"]:
+    def one_scan(scan: Echoes) -> Voted:
         lines = lines_of_scan(ring, scan, settings)  # arcs -> equidistant points -> tangent lines
         votes = hough.accumulate(lines.cell, settings)  # points per cell
         smooth = hough.lowpass(votes, settings)  # balance between neighbor cells
         level = ring.level if scan.gathered is None else ring.level * scan.gathered
-        return smooth > level  # highly occupied cells
+        return Voted(smooth > level, lines.cell, lines.rho)  # highly occupied cells
 
     return over_scans(one_scan, echoes)
+
+
+@partial(jax.jit, static_argnames="settings")
+def occupied_cells(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -> Bool[Array, "scans theta rho"]:
+    """The highly occupied cells alone; arguments as ``vote``."""
+    return vote(ring, echoes, settings=settings).occupied
 
 
 @partial(jax.jit, static_argnames="settings")
 def accumulators(
     ring: RingArcs, echoes: Echoes, *, settings: HoughSettings
 ) -> tuple[Int[Array, "scans theta rho"], Float[Array, "scans theta rho"]]:
-    """Votes before and after the low pass, to look at; arguments as ``occupied_cells``."""
+    """Votes before and after the low pass, to look at; arguments as ``vote``."""
 
     def one_scan(scan: Echoes):
         votes = hough.accumulate(lines_of_scan(ring, scan, settings).cell, settings)
         return votes, hough.lowpass(votes, settings)
 
     return over_scans(one_scan, echoes)
-
-
-@partial(jax.jit, static_argnames=("settings", "size"))
-def cluster_lines(
-    ring: RingArcs,
-    echoes: Echoes,
-    labels: Int[Array, "scans theta rho"],
-    *,
-    settings: HoughSettings,
-    size: int,
-) -> tuple[clusters.Clusters, Float[Array, "scans clusters 2 2"]]:
-    """The paper's section 4 from the labelled components on, and section 5's extent, for a batch of scans.
-
-    Args:
-        ring: as ``occupied_cells`` got it.
-        echoes: as ``occupied_cells`` got them.
-        labels: component of each cell: 0 none, k or -k (see ``centres_of_gravity``).
-        settings: as ``occupied_cells`` got them.
-        size: room for this many components a scan.
-
-    Returns:
-        Centres of gravity with the echoes involved, and the endpoints of the segments, robot frame, metres.
-    """
-
-    def one_scan(scan: Echoes, label: Int[Array, "theta rho"]):
-        voting = lines_of_scan(ring, scan, settings)
-        label_of_cell = jnp.append(label.ravel(), jnp.zeros(1, label.dtype))  # the last one: no cell, no component
-        count = len(scan.path)
-        lines = clusters.centres_of_gravity(
-            voting.rho,
-            voting.normal_x,
-            voting.normal_y,
-            label_of_cell[voting.cell].astype(jnp.int32),
-            jnp.arange(count) if scan.owner is None else scan.owner,
-            clusters=size,
-            echoes=count,
-        )
-        segments = jax.vmap(clusters.extent, in_axes=(0, 0, None, 0))(
-            lines.rho, lines.theta, sensors_of(ring, scan), lines.involved
-        )
-        return lines, segments
-
-    return over_scans(one_scan, echoes, labels)

@@ -295,6 +295,18 @@ def test_files_that_cannot_be_played(tmp_path):
     assert parse_url("file:/a/b.csv?speed=2").path == "/a/b.csv"
 
 
+def test_a_record_of_another_program_is_refused(tmp_path):
+    writing = pytest.importorskip("mcap.writer")
+    with open(tmp_path / "x.mcap", "wb") as file:
+        writer = writing.Writer(file)
+        writer.start()
+        schema = writer.register_schema("x", "jsonschema", b"{}")
+        writer.add_message(writer.register_channel("/scan", "json", schema), 0, b"{}", 0)
+        writer.finish()
+    with pytest.raises(SonarError, match=r"x\.mcap: topics /scan; needed is jaxsonar/messages"):
+        open_source(f"file:{tmp_path}/x.mcap")
+
+
 def test_what_no_device_said_is_refused_before_anybody_listens(faw_ring, tmp_path):
     garbage, raw = tmp_path / "x.mcap", tmp_path / "raw.mcap"
     garbage.write_bytes(b"no record at all")
