@@ -1,7 +1,6 @@
 """Scans of a log in, columns of lines, points and scans out: the one computation of a batch."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -10,7 +9,7 @@ from jaxsonar import kernels
 
 from .batch_tables import PROBABILITY, SCAN, TABLES, Columns
 from .candidates import Extracted, extract
-from .echoes import FlatEchoes, Step
+from .echoes import FlatEchoes
 from .explained import KINDS, Explained, explained
 from .logs import Log
 from .poses import wrap_angle
@@ -81,15 +80,9 @@ def tables(
     return {"scans": told(whole), "lines": told(lines), "points": told(points)}
 
 
-def _scans_of(step: Step) -> Int[np.ndarray, " scans"]:
-    """Which scans of the log the rows of a step are; rows after those are padding."""
-    scans: Any = step.scans
-    return np.arange(scans.start, scans.stop) if isinstance(scans, slice) else np.asarray(scans)
-
-
 def _of_extracted(extracted: Extracted) -> _Found:
     """What the paper's method found in the scans of one step."""
-    scans, lines = _scans_of(extracted.step), extracted.lines
+    scans, lines = extracted.step.scans, extracted.lines
     row, k = np.nonzero(lines.echoes)
     segment = lines.segments[row, k]
     none = np.full(len(row), np.nan)
@@ -111,7 +104,7 @@ def _of_extracted(extracted: Extracted) -> _Found:
 
 def _of_explained(found: Explained) -> _Found:
     """What maximum likelihood found in the scans of one step, reflectors in the order of their evidence."""
-    scans, all_ = _scans_of(found.step), found.found
+    scans, all_ = found.step.scans, found.found
     row, k = np.nonzero(np.asarray(all_.kind) >= 0)
     decided = found.decided[row, k]
     first, second = np.asarray(all_.parameters)[row, k].astype(np.float64).T
