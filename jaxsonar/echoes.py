@@ -18,6 +18,8 @@ DEAR_SCANS_PER_STEP = (32,)
 """The same where a scan takes milliseconds and a compilation many seconds."""
 BLOCK = 4096
 """Scans among which those are sought that need the same room."""
+DEAR_BLOCK = 512
+"""The same where a scan takes milliseconds."""
 _FARTHEST = 1e6  # m; beyond all rings, and within single precision
 _FEW_CELLS = 50_000  # accumulators larger than this are not stacked by the hundred
 _WORTH_A_SHAPE = 256  # scans
@@ -140,8 +142,8 @@ class FlatEchoes:
     ) -> Iterator["Step"]:
         """The scans in rectangles of few different shapes, fewer scans at once if the accumulator has many cells.
 
-        Scans are taken in blocks; those of a block that need the same room go together. What a scan gives depends on
-        neither its room nor its company.
+        Scans are taken in blocks; those of a block that need the same room go together. On a CPU what a scan gives
+        depends on neither its room nor its company.
 
         Args:
             cells: of the accumulator.
@@ -153,8 +155,9 @@ class FlatEchoes:
             return
         density = _density(pieces)
         need = self._need(pieces, density)
-        for first in range(0, self.scans, BLOCK):
-            block = np.arange(first, min(first + BLOCK, self.scans))
+        most = DEAR_BLOCK if dear else BLOCK
+        for first in range(0, self.scans, most):
+            block = np.arange(first, min(first + most, self.scans))
             for scans, columns in self._groups(block, need[block], dear=dear):
                 last = 0
                 while last < len(scans):
@@ -166,7 +169,8 @@ class FlatEchoes:
         """Number of scans that the next step takes."""
         if self.scans == 1:
             return 1
-        sizes = DEAR_SCANS_PER_STEP if dear else SCANS_PER_STEP if cells <= _FEW_CELLS else SCANS_PER_STEP[-1:]
+        small = cells > _FEW_CELLS or self.pose is not None  # windows have echoes by the hundred
+        sizes = DEAR_SCANS_PER_STEP if dear else SCANS_PER_STEP[-1:] if small else SCANS_PER_STEP
         return next((size for size in sizes if size <= left), sizes[-1])
 
     def _need(self, pieces: Int[np.ndarray, " paths"] | None, density: float) -> Int[np.ndarray, " scans"]:
@@ -232,10 +236,11 @@ class FlatEchoes:
 
 
 def _density(pieces: Int[np.ndarray, " paths"] | None) -> float:
-    """Room for pieces per column: somewhat more than a scan has on average that hears all paths alike."""
+    """Room for pieces per column: somewhat more than an echo has; wide paths hear more often than narrow ones."""
     if pieces is None or not pieces.any():
         return 1.0
-    return min(_SLACK * float(pieces.mean()), float(pieces.max()))
+    many = pieces.astype(np.float64)
+    return min(_SLACK * float(many @ many / many.sum()), float(many.max()))
 
 
 def _counting(counts: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " all"]:
@@ -256,3 +261,4 @@ def in_order(items: Iterable[tuple[int, Item]]) -> Iterator[Item]:
         while last in early:
             yield early.pop(last)
             last += 1
+    assert not early, f"scan {last} never came"

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxsonar import kernels
 from jaxsonar.hardware.assembly import RawScan
 
-from .candidates import settings_for
+from .candidates import pieces_of, settings_for
 from .explained import check_sigma
 from .incremental import Mapper
 from .local import LocalModel, check_method, local_model, local_models
@@ -86,9 +86,11 @@ class LiveMap:
         """Compile what the first scans need."""
         method = str(self._choices["method"])
         rng = np.random.default_rng(0)
+        settings = self._choices["settings"]
+        heard = np.repeat(self.ring.paths, pieces_of(self.ring, settings), axis=0)  # wide paths hear more often
 
         def one(echoes: int) -> LiveScan:
-            path = self.ring.paths[rng.integers(len(self.ring.paths), size=echoes)]
+            path = heard[rng.integers(len(heard), size=echoes)]
             reach = rng.uniform(0.3, 0.9, echoes) * self.ring.max_range
             pose, nothing = np.zeros(3), np.full(echoes, np.nan)
             scans = [Scan(k, 0.0, pose, path[:, 0], path[:, 1], reach, nothing) for k in range(max(_WARM[method]))]

@@ -256,7 +256,8 @@ class _Run:
             self.status.ending = len(self._queue) > 0
             while self.status.ending and not wait([self._warming], _LOOK).done:
                 self._tell(on_status)
-            self.status.warm, self.status.ending = self._warming.done(), False
+            done = self._warming.done()
+            self.status.warm, self.status.ending = done and self._warming.exception() is None, False
         error: BaseException | None = None
         while error is None and not self._queue.ended:
             try:

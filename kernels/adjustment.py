@@ -147,7 +147,7 @@ def adjust(problem: Problem, unknowns: Unknowns, *, poses_free: bool, most: int 
         shift = _shift(problem, system, damping, poses_free)
         trial = jax.tree.map(jnp.add, now, shift)
         then = cost(problem, trial)
-        better = then <= value  # False for NaN
+        better = then <= value * (1 + rounding)  # False for NaN
         now = jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, now)
         done = better & (value - then <= _ENOUGH * value)
         _, least, greatest = _DAMPING
@@ -156,6 +156,7 @@ def adjust(problem: Problem, unknowns: Unknowns, *, poses_free: bool, most: int 
         return now, jnp.where(better, then, value), damping, count + 1, done
 
     before = cost(problem, unknowns)
+    rounding = max(_ENOUGH / 1000, 16 * float(jnp.finfo(before.dtype).eps))  # at the minimum the cost falls no more
     start = (unknowns, before, jnp.asarray(_DAMPING[0], before.dtype), jnp.asarray(0), jnp.asarray(False))
     found, value, _, count, _ = jax.lax.while_loop(lambda state: (state[3] < most) & ~state[4], step, start)
     reduced, _ = _reduced(_linearised(problem, found, poses_free), jnp.zeros_like(value), poses_free)

@@ -1,4 +1,4 @@
-"""From labelled cells back to the points in them: centre of gravity, involved echoes, extent (paper, sections 4, 5)."""
+"""Centre of gravity of lines by the components of their cells, and the extent of a line (paper, section 5)."""
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ from .geometry import fold_line, normal, tangent
 
 
 class Clusters(eqx.Module):
-    """Extracted straight lines of ONE scan, in the order of their labels; unused places hold no echo and NaN."""
+    """Lines in the order of the labels of their components; unused places hold no echo and NaN."""
 
     rho: Float[Array, "*scans clusters"]
     """Distance from the robot's origin, metres, >= 0."""

@@ -332,7 +332,9 @@ def _weighed(scan: _Scan, start: Float[Array, "3 k 2"], scene: _Scene, expected:
     def plane(x: Float[Array, "2"]) -> _Support:
         found = support(reflectors.plane, x)
         silence = expected.silence_plane * _silence_of_plane(scan, found, scene, expected)
-        return with_base(found, silence, _plane_prior(scan, found, scene, expected))
+        found = with_base(found, silence, _plane_prior(scan, found, scene, expected))
+        share = _count(found.gain > 0) / scan.full_wall
+        return found._replace(base=found.base + expected.full * (share - expected.usual))
 
     def point(diffracts: Float[Array, ""], x: Float[Array, "2"]) -> _Support:
         model = partial(_point, diffracts)
@@ -436,7 +438,7 @@ def _silence_of_point(
 
 
 def _silence_of_plane(scan: _Scan, support: _Support, scene: _Scene, expected: Expectations) -> Float[Array, ""]:
-    """The same of a wall, which may end beyond its outermost feet: somewhere before the next path that is silent."""
+    """Nats, at most 0, that silent paths cost a wall; it may end beyond its outermost feet, before the next of them."""
     silence = _silence(scan, reflectors.plane, support, scene, expected)
     foot, echo_foot, mine = silence.foot, silence.echo_foot, support.gain > 0
     low, high = jnp.where(mine, support.foot, jnp.inf).min(), jnp.where(mine, support.foot, -jnp.inf).max()
@@ -450,7 +452,7 @@ def _silence_of_plane(scan: _Scan, support: _Support, scene: _Scene, expected: E
 
 
 def _plane_prior(scan: _Scan, support: _Support, scene: _Scene, expected: Expectations) -> Float[Array, ""]:
-    """Nats before any echo: anywhere, rather square to other walls, not across their corners, heard by many paths."""
+    """Nats before any echo: anywhere, rather square to other walls, not across their corners."""
     rho, theta = support.parameters
     density = jnp.log(expected.planes / (2 * jnp.pi * scan.max_range))
     turn = wrap_angle(scene.wall[:, 1] - theta)
@@ -459,8 +461,7 @@ def _plane_prior(scan: _Scan, support: _Support, scene: _Scene, expected: Expect
     square = _squareness(support.parameters, _inverse(support.information)[1, 1], scene)
     direction = jnp.log(1 - scene.square + scene.square * square)
     density += direction - jnp.where(crossing, expected.crossing, 0)
-    share = _count(support.gain > 0) / scan.full_wall
-    return density + expected.full / expected.prior * (share - expected.usual)
+    return density
 
 
 def _squareness(line: Float[Array, "2"], variance: Float[Array, ""], scene: _Scene) -> Float[Array, ""]:

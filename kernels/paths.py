@@ -45,7 +45,7 @@ class EchoPaths(eqx.Module):
     axes: Float[Array, "*paths 2 2"]
     """Unit vectors along which tx and rx look."""
     cone: Float[Array, "*paths 2"]
-    """Squared chord between the axis and the border of the cones of tx and rx: 4 sin(beam / 4)^2, 0 to 4."""
+    """Squared chord between the axis and the border of the cones of tx and rx: 4 sin(beam / 4)^2, 0 to 2."""
 
 
 def chord_squared(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
