@@ -37,10 +37,11 @@ def label_components(
     theta_seam = _touching(flat[:, 0], flat[:, -1], wrap=False)
     rho_seam = _touching(flat[:, :, 0], np.roll(flat[:, :, 0], rows // 2, axis=1), wrap=True)
     pairs = np.concatenate([theta_seam, rho_seam])
-    cell, component = np.flatnonzero(occupied), flat[occupied]  # few of all cells
+    cell, part = np.flatnonzero(occupied), flat[occupied]  # few of all cells
+    component = part
     if len(pairs):
         graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(total, total))
-        component = graph_components(graph, directed=False)[1][component]
+        component = graph_components(graph, directed=False)[1][part]
     _, first, component = np.unique(component, return_index=True, return_inverse=True)
     scan_of_component = cell[first] // (rows * columns)
     order = np.argsort(first)  # by scan, and within a scan by first cell
@@ -51,7 +52,7 @@ def label_components(
     labels = np.zeros(occupied.size, np.int16 if rows * columns <= _SHORT else np.int32)
     labels[cell] = number[component]
     if len(rho_seam):
-        across = np.isin(component, component[np.isin(flat[occupied], rho_seam)])
+        across = np.isin(component, component[np.isin(part, rho_seam)])
         turn = (cell // columns % rows - (cell[first] // columns % rows)[component]) % rows
         far = across & (np.minimum(turn, rows - turn) > rows // 4)
         labels[cell[far]] *= -1

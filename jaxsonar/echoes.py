@@ -192,7 +192,8 @@ class FlatEchoes:
         """
         least = 64 if self.pose is None else 256
         fit, floor, worth = (power_of_two, least, 0) if dear else (room_for, least // 2, _WORTH_A_SHAPE)
-        columns = np.array([fit(count, least=floor) for count in range(int(need.max()) + 1)])[need]
+        distinct, which = np.unique(need, return_inverse=True)
+        columns = np.array([fit(count, least=floor) for count in distinct.tolist()])[which]
         waiting = block[:0]
         rooms = np.unique(columns)
         for room in rooms:
