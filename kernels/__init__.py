@@ -7,6 +7,7 @@ from .adjustment import Unknowns as Unknowns
 from .adjustment import adjust as adjust
 from .adjustment import cost as cost
 from .adjustment import moved_sensors as moved_sensors
+from .adjustment import pose_covariances as pose_covariances
 from .adjustment import residuals as residuals
 from .arcs import Arc as Arc
 from .arcs import arc as arc
@@ -68,3 +69,7 @@ from .scene import audible as audible
 from .scene import expected_range as expected_range
 from .scene import expected_report as expected_report
 from .scene import seen_from as seen_from
+from .tracking import Belief as Belief
+from .tracking import Tracked as Tracked
+from .tracking import expected_ranges as expected_ranges
+from .tracking import track as track
