@@ -62,6 +62,10 @@ class Track:
     """Echoes that went into it, less what was estimated of them."""
     strange: int = 0
     """Scans in a row that knew nothing of what they saw."""
+    explained: int = 0
+    """Echoes of the last scan that a reflector explains."""
+    squared: float = 0.0
+    """Their squared residuals over the variance of the ranges, summed."""
 
     @property
     def sigma(self) -> float:
@@ -122,6 +126,7 @@ def update(
     row: int,
     sigma: float | None = None,
     path_pose: Float[np.ndarray, "paths 3"] | None = None,
+    grow: bool = True,
 ) -> Track:
     """Take in one scan, whose motion is accounted for.
 
@@ -133,6 +138,7 @@ def update(
         row: number of the scan in the run.
         sigma: noise of the ranges, metres; learned on the way if left out.
         path_pose: where the robot was when each path fired, as ``local_model`` takes it.
+        grow: whether what is new becomes known.
     """
     if sigma is None and not track.free:
         track = replace(track, squares=_CREDIT * (model.sigma if model.sigma > 0 else _SIGMA) ** 2, free=_CREDIT)
@@ -146,7 +152,7 @@ def update(
         claimed = echoes.claimed(seen, first.reflector, noise)
         found = echoes.tracked(track.known, claimed, noise)
         matches = match(echoes.known(track.known, found), seen, full=full)
-        fresh = np.flatnonzero(matches.fresh)
+        fresh = np.flatnonzero(matches.fresh & grow)
         known = _with_new(track.known, seen.take(fresh), np.asarray(found.belief.pose))
         reflector = matches.reflector.copy()
         reflector[fresh] = len(track.known) + np.arange(len(fresh))
@@ -168,6 +174,8 @@ def update(
         squares=track.squares + float(residual @ residual) if freedom else track.squares,
         free=track.free + freedom,
         strange=track.strange + 1 if strange else 0,
+        explained=len(residual),
+        squared=float(residual @ residual) / noise**2,
     )
 
 

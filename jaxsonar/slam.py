@@ -1,0 +1,315 @@
+"""Poses and map together: scan by scan (``Tracker``), and a whole log at once (``slam``).
+
+    scan --local.py--> walls, corners --matching.py--> what is known --kernels.track--> pose, reflectors   (tracking.py)
+      a submap is finished --submaps.py--> SubmapGraph (loops*.py): joined, closed, withdrawn --posegraph.py--> its place
+        the log is finished --smoothing.py--> all poses and reflectors on the raw ranges
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsonar import kernels
+from jaxsonar.hardware.errors import SonarError
+
+from .candidates import settings_for
+from .explained import check_sigma
+from .local import LocalModel, check_method, local_model, local_models
+from .logs import Log, Scan
+from .loops import SubmapGraph
+from .loops_verified import ACCEPTED, Decision
+from .maps import GlobalMap
+from .mapping import build_map
+from .motion import placed
+from .placing import place_parts
+from .poses import composed
+from .ring import Ring
+from .slip import Slip
+from .smoothing import Smoothed
+from .smoothing import smooth as smoothing
+from .tracking import LOST, Track, advance, begin, finished, update
+from .trajectory import Trajectory, stamps_of
+from .windows import check_window
+
+SPARSE = 4.0
+"""Echoes that a long wall sends back to a ring; with fewer, scans are gathered over windows."""
+WINDOW = 1.5
+"""Metres of path of such a window."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """What is remembered between two scans: a submap, and where the others lie."""
+
+    track: Track
+    graph: SubmapGraph
+    """Never changed: a step that finishes a submap makes another one."""
+    start: Float[np.ndarray, "3"]
+    """world_from_robot of the first scan: its odometry, or the origin."""
+    scans: int
+
+
+class Step(NamedTuple):
+    """What one scan came to."""
+
+    model: LocalModel
+    pose: Float[np.ndarray, "3"]
+    """world_from_robot, metres and radians."""
+    covariance: Float[np.ndarray, "3 3"]
+    """Of the pose, with respect to the first one."""
+    decisions: tuple[Decision, ...]
+    """About loop closures, on this occasion."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tracker:
+    """Poses scan by scan: ``state, step = tracker.step(state, scan)``; the poses of the scans are their odometry.
+
+    What a step costs does not depend on how many there were, but for the graph of submaps, one every few metres.
+
+    Raises:
+        SonarError: arguments as for ``local_model``.
+    """
+
+    ring: Ring
+    method: str = "ml"
+    settings: kernels.HoughSettings | None = None
+    sigma: float | None = None
+    """Standard deviation of the ranges, metres; None: learned on the way."""
+    slip: Slip = Slip()
+    """How wrong the odometry is."""
+
+    def __post_init__(self):
+        check_method(self.method)
+        check_sigma(self.sigma)
+        object.__setattr__(self, "settings", settings_for(self.ring, self.settings))
+
+    def start(self) -> TrackerState:
+        """A state that knows nothing."""
+        return TrackerState(begin(), SubmapGraph(), np.zeros(3), 0)
+
+    def step(
+        self,
+        state: TrackerState,
+        scan: Scan,
+        *,
+        model: LocalModel | None = None,
+        path_pose: Float[np.ndarray, "paths 3"] | None = None,
+    ) -> tuple[TrackerState, Step]:
+        """Take in one scan; the state given is left as it was.
+
+        Args:
+            state: so far.
+            scan: its pose is odometry; NaN where there is none.
+            model: its local model, if it is known already.
+            path_pose: where the robot was when each path fired, as ``local_model`` takes it.
+
+        Raises:
+            SonarError: a sensor number that the ring does not have.
+        """
+        if model is None:
+            choices = {"method": self.method, "settings": self.settings, "sigma": self.sigma, "path_pose": path_pose}
+            model = local_model(self.ring, scan, **choices)
+        row, given = state.scans, {"sigma": self.sigma, "path_pose": path_pose}
+        start = scan.pose if row == 0 and np.isfinite(scan.pose).all() else state.start
+        track = update(self.ring, advance(state.track, scan.pose, self.slip), scan, model, row=row, **given)
+        graph, decisions = state.graph, ()
+        lost = track.strange >= LOST
+        if track.ends or lost:
+            graph = graph.copy()
+            decisions = graph.add(finished(track, lost=lost)).decisions
+            # The next submap begins with the same scan: of its first pose nothing else is known.
+            track = update(self.ring, begin(track), scan, model, row=row, **given)
+        state = TrackerState(track, graph, start, row + 1)
+        pose, covariance = self._here(state)
+        return state, Step(model, pose, covariance, decisions)
+
+    def finish(self, state: TrackerState) -> TrackerState:
+        """Look for closures of the submap that is being made, too; the next scan begins another one."""
+        if not state.track.rows:
+            return state
+        graph = state.graph.copy()
+        graph.add(finished(state.track))
+        return replace(state, track=begin(state.track), graph=graph)
+
+    def poses(self, state: TrackerState) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:
+        """Of all scans so far: world_from_robot, and the covariance with respect to the first scan."""
+        pose, cov = np.full((state.scans, 3), np.nan), np.full((state.scans, 3, 3), np.nan)
+        base_cov = state.graph.covariances()
+        parts = [(one.rows, one.poses, one.pose_cov) for one in state.graph.submaps]
+        track = state.track
+        parts.append((np.array(track.rows, dtype=np.int64), np.array(track.poses), np.array(track.covs)))
+        for number, (rows, own, own_cov) in enumerate(parts):
+            for k, row in enumerate(rows.tolist()):
+                pose[row], cov[row] = placed(state.graph.poses[number], base_cov[number], own[k], own_cov[k])
+        turn = np.eye(3)
+        c, s = np.cos(state.start[2]), np.sin(state.start[2])
+        turn[:2, :2] = [[c, -s], [s, c]]
+        return composed(state.start, pose), turn @ cov @ turn.T
+
+    def _here(self, state: TrackerState) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+        number = len(state.graph.submaps)
+        base_cov = state.graph.last_covariance
+        pose, cov = placed(state.graph.poses[number], base_cov, state.track.pose, state.track.covariance)
+        origin = np.zeros((3, 3))
+        turned, _ = placed(state.start, origin, pose, cov)
+        _, cov = placed(np.append(np.zeros(2), state.start[2]), origin, np.zeros(3), cov)
+        return turned, cov
+
+
+class Tie(NamedTuple):
+    """A loop closure."""
+
+    first: int
+    """Row of the first scan of the earlier submap."""
+    second: int
+    """Row of the first scan of the later one."""
+    pose: Float[np.ndarray, "3"]
+    """The later submap in the frame of the earlier one."""
+    state: str
+    """"counted", "withdrawn", "refused" or "proposed": not sure enough to count."""
+
+
+@dataclass(frozen=True, eq=False)
+class Slam:
+    """Poses and map of a log."""
+
+    poses: Float[np.ndarray, "scans 3"]
+    """world_from_robot; NaN for scans that could not be placed."""
+    covariance: Float[np.ndarray, "scans 3 3"]
+    """With respect to the first placed scan."""
+    stamp: Float[np.ndarray, " scans"]
+    """Of every scan (``stamps_of``)."""
+    world: GlobalMap
+    odometry: Float[np.ndarray, "scans 3"]
+    """The poses of the log."""
+    closures: tuple[Tie, ...]
+    step_ms: Float[np.ndarray, " scans"]
+    """Milliseconds of each scan's step; empty where the log was not taken scan by scan."""
+    smoothed: Smoothed | None
+    """What the smoothing found; None without it."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Of the scans that have a pose."""
+        known = np.isfinite(self.poses).all(axis=1)
+        return Trajectory(self.stamp[known], self.poses[known], self.covariance[known])
+
+    @property
+    def left_out(self) -> np.ndarray:
+        """Rows of the scans that could not be placed."""
+        return np.flatnonzero(~np.isfinite(self.poses).all(axis=1))
+
+
+def slam(
+    ring: Ring,
+    log: Log,
+    *,
+    sigma: float | None = None,
+    window: float | None = None,
+    slip: Slip | None = None,
+    smooth: bool = True,
+    speed: bool = False,
+    scale: bool = False,
+    live: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Slam:
+    """Poses of the scans of a log, and the map (paper, section 5, last paragraph).
+
+    With odometry the scans are tracked one after the other, loops are closed, and in the end everything is smoothed.
+    Without it scans are placed by their walls and corners (``placing``); with few echoes a scan (``SPARSE``) only the
+    smoothing is done, on maps of windows.
+
+    Args:
+        ring: the sensors, calibrated.
+        log: scans; their poses are odometry, and may be missing.
+        sigma: noise of the ranges, metres; estimated if left out.
+        window: metres of path gathered into one local model; 1.5 m for sparse rings if left out.
+        slip: how wrong the odometry is.
+        smooth: whether all poses and reflectors are adjusted together in the end.
+        speed: whether the smoothing estimates the speed of sound.
+        scale: whether it estimates the scales of the odometry.
+        live: local models one by one, as a robot makes them, so that ``step_ms`` is all that a step costs.
+        progress: told what is being done, and (scans done, scans) of it; (0, 0) where that is not known.
+
+    Raises:
+        SonarError: no scan, arguments out of range, a sparse ring without odometry, no wall found.
+    """
+    check_sigma(sigma)
+    check_window(window)
+    say = progress or (lambda text, done, total: None)
+    slip = slip or Slip()
+    if not len(log):
+        raise SonarError("slam: no scan in the log; allowed is a log with one or more")
+    odometry = np.where(np.isfinite(log.pose).all(axis=1)[:, None], log.pose, np.nan)
+    measured = bool(np.isfinite(odometry).any())
+    if window is None and float(np.asarray(ring.echo_paths.width).sum() / (2 * np.pi)) < SPARSE:
+        window = WINDOW
+    ties: tuple[Tie, ...] = ()
+    took = np.zeros(0)
+    if window is not None:
+        if not measured:
+            raise SonarError(f"slam: a window of {window:g} m of path, and no scan has a pose; allowed is a log with odometry")
+        start, covariance = odometry, np.full((len(log), 3, 3), np.nan)
+    elif measured:
+        start, covariance, ties, took = _tracked(ring, log, odometry, sigma, slip, live, say)
+    else:
+        models = list(local_models(ring, log, sigma=sigma))
+        parts = place_parts(models, None, blur=BLUR, progress=lambda done, total: say("placing", done, total))
+        start, covariance = parts[0], np.full((len(log), 3, 3), np.nan)
+    given = odometry if measured else None
+    if smooth:
+        choices = {"odometry": given, "sigma": sigma, "window": window, "speed": speed, "scale": scale, "slip": slip}
+        found = smoothing(ring, log, start, **choices, progress=lambda text: say(text, 0, 0))
+        return Slam(found.poses, found.pose_cov, stamps_of(log), found.world, log.pose, ties, took, found)
+    say("building the map", 0, 0)
+    world = build_map(ring, replace(log, pose=start), sigma=sigma, window=window)
+    return Slam(start, covariance, stamps_of(log), world, log.pose, ties, took, None)
+
+
+BLUR = 0.2
+"""Of local models where scans are placed without odometry: of a ring that is calibrated (``placing``)."""
+
+
+def _tracked(
+    ring: Ring,
+    log: Log,
+    odometry: Float[np.ndarray, "scans 3"],
+    sigma: float | None,
+    slip: Slip,
+    live: bool,
+    say: Callable[[str, int, int], None],
+) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"], tuple[Tie, ...], Float[np.ndarray, " scans"]]:
+    tracker = Tracker(ring=ring, sigma=sigma, slip=slip)
+    state, took = tracker.start(), np.zeros(len(log))
+    models: Sequence[LocalModel | None] = [None] * len(log)
+    if not live:
+        models = []
+        for model in local_models(ring, log, sigma=sigma):
+            models.append(model)
+            say("local models", len(models), len(log))
+    for row in range(len(log)):
+        begun = perf_counter()
+        state, _ = tracker.step(state, log[row], model=models[row])
+        took[row] = 1e3 * (perf_counter() - begun)
+        say("tracking", row + 1, len(log))
+    state = tracker.finish(state)
+    return *tracker.poses(state), ties_of(state.graph), took
+
+
+def ties_of(graph: SubmapGraph) -> tuple[Tie, ...]:
+    """The closures of a graph, by the scans that they tie."""
+    first = [int(one.rows[0]) for one in graph.submaps]
+    return tuple(
+        Tie(
+            first[one.earlier],
+            first[one.newest],
+            one.closure.relative,
+            "counted" if one.state == ACCEPTED else one.state,
+        )
+        for one in graph.closures.proposals
+    )
