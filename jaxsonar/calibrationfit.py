@@ -19,7 +19,9 @@ from .maps import GlobalMap
 from .placing import place_parts
 from .ring import Ring
 from .ringmodes import RingModes
+from .rounds import AGAIN, alternated
 from .settling import Data, Settled, State, settle
+from .slip import Share
 from .surroundings import seen_world, surroundings
 
 PINNED = 0.001
@@ -27,9 +29,6 @@ PINNED = 0.001
 LEAST_SCANS = 3
 """Scans that must be laid on one another to tell anything."""
 _WIDE, _WIDE_PLACED = 0.04, 0.08  # m; scale of the first association: poses given, poses found
-_AGAIN = 0.01  # m; scale of the first one after the map was made anew
-_MAPS = 5  # made anew at most, as long as each explains more echoes
-_GROWN = 1.005  # by so much
 _PLACINGS = ((1.0, 4.0), (0.2, 2.0), (0.2, 1.0))  # blur and margin (nats), until all scans are placed: surely at first
 _NOISIER = 1.15  # a fit with so much more noise has laid scans together that do not belong together
 _LEAST_SECOND = 10  # wall to wall echoes
@@ -92,32 +91,29 @@ class Plan:
         return best
 
     def _fitted(self, near: Ring, logs: list[Log], measured: list[Float[np.ndarray, "_ 3"]]) -> Fitted:
-        """The map so far; echoes to its reflectors and least squares, closer and closer; the same with that ring."""
-        data = Data.of(self.ring, logs, measured, self.odometry)
-        state = State(_coordinates(self.held, _change(self.ring, near)), data.poses, surroundings([], tied=False))
-        found = None
-        for _ in range(_MAPS):
-            self.say("building the map")
-            worlds = [seen_world(near, one, window=self.window) for one in data.placed(logs, state.poses)]
+        """Ring, poses and reflectors settle around the map; the map is made anew with that ring, and so on."""
+        data = Data.of(self.ring, logs, measured, Share(self.odometry))
+        start = State(_coordinates(self.held, _change(self.ring, near)), data.poses, surroundings([], tied=False))
+
+        def mapped(state: State) -> list[GlobalMap]:
+            ring = near if state is start else moved_ring(self.ring, self.held, state)
+            worlds = [seen_world(ring, one, window=self.window) for one in data.placed(logs, state.poses)]
             if not any(len(world) for world in worlds):
                 raise SonarError(
                     "calibration: no wall found; allowed are scans of a place with straight walls in reach"
                 )
-            self.say("least squares")
-            state = state._replace(around=surroundings(worlds, tied=False))
-            first = _WIDE_PLACED if self.estimate else _WIDE
-            settled = self.settle(data, state, self.held, first if found is None else _AGAIN)
-            before = 0 if found is None else found.used
-            if settled.used.sum() <= before:
-                break
-            found = Fitted(logs, data, worlds, settled)
-            if found.used <= _GROWN * before:
-                break
-            state = settled.state
-            near = moved_ring(self.ring, self.held, state)
+            return worlds
+
+        found = alternated(
+            start,
+            mapped=mapped,
+            settle=lambda state, widest: self.settle(data, state, self.held, widest),
+            widest=_WIDE_PLACED if self.estimate else _WIDE,
+            say=self.say,
+        )
         if found is None:
             raise SonarError("calibration: no echo fits the walls; is it the right ring, are poses and units right?")
-        return found
+        return Fitted(logs, data, *found)
 
     def settle(self, data: Data, state: State, modes: RingModes, widest: float) -> Settled:
         """In double precision."""
@@ -155,7 +151,7 @@ class Plan:
                 "no two walls of the map end at a common right-angled corner",
             )
         state = alone.settled.state._replace(around=around)
-        tied = self.settle(alone.data, state, self.modes, 2 * _AGAIN)
+        tied = self.settle(alone.data, state, self.modes, 2 * AGAIN)
         second = tied.used & (np.asarray(tied.problem.heard.reflection.kind) == kernels.SECOND)
         count = int(second.sum())
         sd = float(np.sqrt(covariance(tied)[: self.ring.count, : self.ring.count].mean()))

@@ -115,9 +115,10 @@ def _sift(
     kept = echoes >= min_echoes
     order = np.argsort(np.where(kept, -votes, 1), axis=1, kind="stable")
     order = order[:, : int(kept.sum(axis=1).max(initial=0))]
+    row = np.arange(len(order))[:, None]
 
     def sifted(values: np.ndarray) -> np.ndarray:
-        return np.take_along_axis(values, order.reshape(order.shape + (1,) * (values.ndim - 2)), axis=1)
+        return values[row, order]
 
     kept = sifted(kept)
     lines = Lines(

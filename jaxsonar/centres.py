@@ -1,6 +1,7 @@
 """From labelled cells back to the points in them: centre of gravity, involved echoes, extent (paper, sections 4, 5).
 
-On the host, because few of the points are in a component, and NumPy takes just those.
+On the host, because neighboring points of an arc are mostly in one component: there are few such runs, and NumPy adds
+up only those.
 """
 
 from typing import NamedTuple
@@ -33,7 +34,7 @@ def centres_of_gravity(
     arcs: kernels.RingArcs,
     step: Step,
     voted: kernels.Voted,
-    labels: Int[np.ndarray, "rows theta rho"],
+    labels: Int[np.ndarray, "rows theta_and_one rho"],
     counts: Int[np.ndarray, " rows"],
 ) -> Centres:
     """Centre of gravity of the POINTS of each component (paper, section 4), the mean of theta taken on the circle.
@@ -42,51 +43,101 @@ def centres_of_gravity(
         arcs: of the ring's paths.
         step: the echoes, in pieces.
         voted: where their points voted.
-        labels: component of each cell: 0 none, k or -k (``components.label_components``). Minus marks cells that joined
-            across rho = 0: their points enter as the same lines seen from the other side.
+        labels: component of each cell (``components.label_components``).
         counts: number of components of each scan.
     """
+    scans, size, echoes = len(step.scans), max(1, int(counts.max(initial=0))), step.path.shape[1]
+    runs = _runs(arcs, step, voted, labels)
+    own = runs.scan * size + np.abs(runs.label) - 1
+    rho, theta, votes = mean_lines(own, runs.points, runs.rho, runs.normal_x, runs.normal_y, count=scans * size)
+    involved = np.zeros(scans * size * echoes, bool)
+    involved[own * echoes + runs.echo] = True
+    rho, theta = (values.astype(np.float32).reshape(scans, size) for values in (rho, theta))
+    theta[theta >= np.float32(np.pi)] = -np.pi  # rounding
+    involved = involved.reshape(scans, size, echoes)
+    segments = _extents(rho, theta, sensors_of(arcs, step), involved)
+    return Centres(rho, theta, votes.reshape(scans, size), segments, involved)
+
+
+def mean_lines(
+    own: Int[np.ndarray, " sums"],
+    lines: Int[np.ndarray, " sums"],
+    rho: Float[np.ndarray, " sums"],
+    normal_x: Float[np.ndarray, " sums"],
+    normal_y: Float[np.ndarray, " sums"],
+    *,
+    count: int,
+) -> tuple[Float[np.ndarray, " count"], Float[np.ndarray, " count"], Int[np.ndarray, " count"]]:
+    """Means of lines, that of theta on the circle: rho (metres, >= 0), theta (in [-pi, pi)) and number of lines.
+
+    Args:
+        own: which mean each sum of lines belongs to.
+        lines: how many lines were summed.
+        rho: sums of distances of any sign, metres.
+        normal_x: sums of the cosines of the normals.
+        normal_y: sums of the sines.
+        count: of means; NaN for those that no line belongs to.
+    """
+    number, rho, x, y = (np.bincount(own, values, minlength=count) for values in (lines, rho, normal_x, normal_y))
+    rho = np.divide(rho, number, out=np.full(count, np.nan), where=number > 0)
+    theta = np.arctan2(np.where(rho < 0, -y, y), np.where(rho < 0, -x, x))  # (-rho, n) is (rho, -n)
+    theta[theta >= np.pi] = -np.pi
+    theta[number == 0] = np.nan
+    return np.abs(rho), theta, number.astype(np.int64)
+
+
+class _Runs(NamedTuple):
+    """Sums over neighboring points of an arc in one component and on one side of the origin."""
+
+    scan: Int[np.ndarray, " runs"]
+    echo: Int[np.ndarray, " runs"]
+    """Column of the step's row."""
+    label: Int[np.ndarray, " runs"]
+    """Component; minus for one of its parts if it joined across rho = 0."""
+    points: Int[np.ndarray, " runs"]
+    """How many there are."""
+    rho: Float[np.ndarray, " runs"]
+    """Distances of their lines, metres: (rho, n) and (-rho, -n) are one line, here all have the component's side."""
+    normal_x: Float[np.ndarray, " runs"]
+    """Cosines of their normals."""
+    normal_y: Float[np.ndarray, " runs"]
+    """Sines of their normals."""
+
+
+def _runs(
+    arcs: kernels.RingArcs, step: Step, voted: kernels.Voted, labels: Int[np.ndarray, "rows theta_and_one rho"]
+) -> _Runs:
+    """The runs of points in components. Points are many, runs few: of points only passes along the memory."""
     assert step.piece is not None
     assert step.owner is not None
-    scans, size, width = len(step.scans), max(1, int(counts.max(initial=0))), kernels.PIECE
-    cell, rho = (np.asarray(values)[:scans] for values in (voted.cell, voted.rho))
-    cells = labels[0].size
-    label_of_cell = np.zeros((scans, cells + 1), labels.dtype)  # the last one: no cell, no component
-    label_of_cell[:, :cells] = labels[:scans].reshape(scans, cells)
-    first = (np.arange(scans) * (cells + 1))[:, None, None]
-    label = np.take(label_of_cell, cell + first).ravel()
-    # The points in components, with the echo and the normal of each; what points of a piece share is found once.
-    point = np.flatnonzero(label)
-    label, rho, piece = label[point], rho.ravel()[point], point // width
-    number, owner = step.piece[:scans], step.owner[:scans]
-    path = np.take_along_axis(step.path[:scans], owner, axis=1)
-    table = np.asarray(arcs.arcs.normal_x).shape[1]
-    begin = path * table + number * width - np.arange(number.size).reshape(number.shape) * width
-    at = begin.ravel()[piece] + point
-    n_x, n_y = (np.asarray(values).ravel()[at] for values in (arcs.arcs.normal_x, arcs.arcs.normal_y))
+    scans, width = len(step.scans), kernels.PIECE
+    piece, owner = step.piece[:scans], step.owner[:scans]
+    cell, rho = np.asarray(voted.cell), np.asarray(voted.rho)[:scans].ravel()
+    label = np.empty((scans, *cell.shape[1:]), labels.dtype)
+    for scan in range(scans):  # what one scan needs stays in the cache
+        np.take(labels[scan], cell[scan], out=label[scan], mode="clip")  # none is outside; the fastest mode
+    label = label.ravel()
+    behind = rho < 0
+    begins = np.ones(rho.size, bool)  # where the component changes, or the side, and with every arc
+    np.not_equal(label[1:], label[:-1], out=begins[1:])
+    begins[1:] |= behind[1:] != behind[:-1]
+    begins[::width] |= piece.ravel() == 0
+    first = np.flatnonzero(begins)
+    used = np.flatnonzero(label[first])
+    points, total = np.diff(first, append=rho.size)[used], np.add.reduceat(rho, first)[used]
+    first = first[used]
+    label, behind, (at, within) = label[first].astype(np.int64), behind[first], np.divmod(first, width)
+    scan, echo = at // owner.shape[1], owner.ravel()[at]
+    # Normals of an arc are equidistant, so the sum of a run's has the direction of its middle.
+    theta = np.asarray(arcs.arcs.theta, np.float64)
+    path = step.path[scan, echo]
+    half = np.maximum((theta[:, -1] - theta[:, 0]) / (2 * theta.shape[1] - 2), 1e-9)[path]
+    middle = theta[path, piece.ravel()[at] * width + within] + (points - 1) * half
     if step.pose is not None:
-        turn = np.take_along_axis(step.pose[:scans, :, 2], owner, axis=1).ravel()[piece]
-        along, across = np.cos(turn), np.sin(turn)
-        n_x, n_y = along * n_x - across * n_y, across * n_x + along * n_y
-    side = np.copysign(np.sign(label), label * rho).astype(np.float32)  # (rho, n) and (-rho, -n) are one line
-    own = (np.arange(scans) * size - 1).repeat(number.shape[1])[piece] + np.abs(label)
-
-    def total(values: Float[np.ndarray, " points"] | None = None) -> np.ndarray:
-        return np.bincount(own, values, minlength=scans * size).reshape(scans, size)
-
-    votes = total()
-    empty = votes == 0
-    mean = total(side * rho) / np.where(empty, 1, votes)
-    theta = np.arctan2(total(side * n_y), total(side * n_x))
-    theta = np.where(mean < 0, theta + np.pi, theta)
-    theta = np.where(theta >= np.pi, theta - 2 * np.pi, theta).astype(np.float32)
-    theta = np.where(theta >= np.float32(np.pi), np.float32(-np.pi), theta)
-    echoes = step.path.shape[1]
-    involved = np.zeros(scans * size * echoes, bool)
-    involved[own * echoes + owner.ravel()[piece]] = True
-    involved = involved.reshape(scans, size, echoes)
-    rho, theta = (np.where(empty, np.nan, values).astype(np.float32) for values in (np.abs(mean), theta))
-    return Centres(rho, theta, votes, _extents(rho, theta, sensors_of(arcs, step), involved), involved)
+        middle = middle + step.pose[scan, echo, 2]
+    side = np.where(behind, -1, 1) * np.sign(label)
+    long = side * np.sin(points * half) / np.sin(half)
+    return _Runs(scan, echo, label, points, side * total, long * np.cos(middle), long * np.sin(middle))
 
 
 def sensors_of(arcs: kernels.RingArcs, step: Step) -> Float[np.ndarray, "scans echoes 2"]:
@@ -107,12 +158,14 @@ def _extents(
     involved: Bool[np.ndarray, "scans clusters echoes"],
 ) -> Float[np.ndarray, "scans clusters 2 2"]:
     """Endpoints of each line, the second one counter-clockwise from the first as seen from the origin (section 5)."""
-    scan, cluster = np.nonzero(involved.any(axis=2))
-    n = unit(theta[scan, cluster])
-    t = np.stack([-n[:, 1], n[:, 0]], axis=-1)
-    foot = np.einsum("lec,lc->le", sensors[scan], t)
-    own = involved[scan, cluster]
-    ends = np.stack([np.where(own, foot, np.inf).min(axis=1), np.where(own, foot, -np.inf).max(axis=1)], axis=-1)
-    segments = np.full((*rho.shape, 2, 2), np.nan, np.float32)
-    segments[scan, cluster] = (rho[scan, cluster, None] * n)[:, None] + ends[..., None] * t[:, None]
-    return segments
+    segments = np.full((rho.size, 2, 2), np.nan, np.float32)
+    line, echo = np.divmod(np.flatnonzero(involved), involved.shape[2])
+    if len(line):
+        rho, x, y = rho.ravel()[:, None], np.cos(theta).ravel()[:, None], np.sin(theta).ravel()[:, None]
+        sensor = sensors[line // involved.shape[1], echo]
+        foot = sensor[:, 1] * x[line, 0] - sensor[:, 0] * y[line, 0]
+        first = np.flatnonzero(np.diff(line, prepend=-1))
+        ends = np.stack([np.minimum.reduceat(foot, first), np.maximum.reduceat(foot, first)], axis=-1)
+        own = line[first]
+        segments[own] = np.stack([rho[own] * x[own] - ends * y[own], rho[own] * y[own] + ends * x[own]], axis=-1)
+    return segments.reshape(*involved.shape[:2], 2, 2)

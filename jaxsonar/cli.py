@@ -16,11 +16,13 @@ from jaxsonar.hardware.errors import SonarError
 
 from .commands_batch import add_command as add_batch_command
 from .commands_live import add_commands as add_live_commands
+from .commands_slam import add_commands as add_slam_commands
 from .files import FIGURE_FORMATS as FIGURES
 
 SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for each scan)"
 SETTINGS_HELP = "accumulator and low pass, for hough also threshold, instead of the paper's"
-COMPILING = ("demo", "lines", "map", "calibrate", "check")
+ODOMETRY_HELP = "how wrong the odometry is after 1 m: %% of the way and deg (default: 3,1.5)"
+COMPILING = ("demo", "lines", "map", "slam", "localize", "calibrate", "check")
 """Commands that run kernels: their compiled programs are kept (``stream`` and ``batch`` see to it themselves)."""
 RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
 
@@ -71,6 +73,16 @@ def _ending_in(*suffixes: str):
 
 
 _figure = _ending_in(*FIGURES)
+
+
+def _odometry(text: str) -> tuple[float, float]:
+    """Two numbers, per cent of the way and degrees."""
+    try:
+        percent, degrees = map(_finite(0, 100), text.split(","))
+    except (ValueError, argparse.ArgumentTypeError):
+        allowed = "two numbers from 0 to 100, PERCENT,DEG, such as 2,1"
+        raise argparse.ArgumentTypeError(f"{text!r} came; allowed is {allowed}") from None
+    return percent, degrees
 
 
 def _choose_method(command: argparse.ArgumentParser) -> None:
@@ -176,6 +188,15 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--clutter", type=_finite(0, 100), default=0.0, metavar="P", help="false echoes per real one")
     simulate.add_argument("--seed", type=_number(int, 0, 2**32 - 1), default=0, help="of the noise (default: 0)")
     simulate.add_argument("--max-echoes", type=_number(int, 1, 64), default=3, metavar="N", help="a path (default: 3)")
+    logged = simulate.add_mutually_exclusive_group()
+    logged.add_argument(
+        "--odometry",
+        type=_odometry,
+        metavar="PERCENT,DEG",
+        help="poses of the log drift as from wheels: %% of the way and deg after 1 m, growing with its root (try 2,1)",
+    )
+    logged.add_argument("--no-odometry", action="store_true", help="no poses in the log")
+    simulate.add_argument("--truth", type=_file, metavar="TRAJ", help="the true poses, for evo: TUM; - = stdout")
 
     calibrate = command("calibrate", "Find out how a ring really is, from ordinary scans of a room nobody measured.")
     calibrate.add_argument(
@@ -231,10 +252,11 @@ def parser() -> argparse.ArgumentParser:
     formats = ("corridor8", "scitos24", "sew-amr", "csv", "parquet")
     convert.add_argument("--from", dest="from_", choices=formats, help="format of IN (default: by its suffix)")
 
-    texts = {"ring": RING_HELP, "sigma": SIGMA_HELP, "settings": SETTINGS_HELP}
+    texts = {"ring": RING_HELP, "sigma": SIGMA_HELP, "settings": SETTINGS_HELP, "odometry": ODOMETRY_HELP}
     whole = partial(_number, int)
+    add_slam_commands(command, number=_finite, file=_file, figure=_figure, odometry=_odometry, texts=texts)
     add_batch_command(command, whole=whole, file=_file, choose_method=_choose_method, texts=texts)
-    add_live_commands(command, whole=whole, number=_finite, ending_in=_ending_in, texts=texts)
+    add_live_commands(command, whole=whole, number=_finite, ending_in=_ending_in, odometry=_odometry, texts=texts)
     return top
 
 

@@ -257,14 +257,20 @@ def evaluate(options: argparse.Namespace) -> None:
 def simulate(options: argparse.Namespace) -> None:
     """``jaxsonar simulate``."""
     from .files import check_outputs, write_toml
+    from .hardware.errors import SonarError
     from .logs import log_format, save_log
     from .logs_csv import csv_lines
     from .ringfile import load_ring
     from .roomfile import load_room
     from .roompaths import load_path
     from .simulate import simulate as simulate_scans
+    from .trajectory import Trajectory, save_trajectory
 
-    check_outputs({"-o": options.output}, [options.room, options.ring, options.path])
+    beside = _settings_beside(options.output)
+    outputs = {"-o": options.output, "settings beside the log:": beside, "--truth": options.truth}
+    check_outputs(outputs, [options.room, options.ring, options.path])
+    if options.output == "-" and options.truth == "-":
+        raise SonarError("--truth -: the log goes to standard output, too; allowed are different places")
     if options.output != "-":
         log_format(options.output)  # complain before the work, not after it
     ring, room = load_ring(options.ring), load_room(options.room)
@@ -283,15 +289,31 @@ def simulate(options: argparse.Namespace) -> None:
             stamps=stamps,
             progress=lambda done, _: show(done),
         )
-    log = simulation.as_log(ring, poses)
+    log = simulation.as_log(ring, _reported(poses, options))
     if options.output == "-":
         sys.stdout.writelines(csv_lines(log))
     else:
         save_log(log, options.output)
-    if beside := _settings_beside(options.output):
-        said = {key: value for key, value in vars(options).items() if key not in ("command", "output")}
-        write_toml(said, beside)
+    if options.truth:
+        save_trajectory(Trajectory(stamps, poses), options.truth)
+    if beside:
+        said = {key: value for key, value in vars(options).items() if key not in ("command", "output", "truth")}
+        write_toml({key: value for key, value in said.items() if value is not None and value is not False}, beside)
     _say(f"{len(log)} scans, {len(log.range)} echoes")
+
+
+def _reported(poses: "np.ndarray", options: argparse.Namespace) -> "np.ndarray":
+    """The poses that a simulated log has in it: the true ones, none, or those of odometry."""
+    import numpy as np
+
+    from .odometry import drifted
+
+    if options.no_odometry:
+        return np.full_like(poses, np.nan)
+    if options.odometry is None:
+        return poses
+    percent, degrees = options.odometry
+    return drifted(poses, distance=percent / 100, turn=float(np.radians(degrees)), seed=options.seed)
 
 
 def calibrate(options: argparse.Namespace) -> None:
@@ -470,6 +492,13 @@ def _steps() -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
+def _stages() -> Iterator[Callable[[str, int, int], None]]:
+    """What is being done and how far it is, on standard error: a line that changes on a terminal, otherwise nothing."""
+    with _steps() as show:
+        yield lambda text, done, total: show(f"{text} {done} of {total}" if total else text)
+
+
+@contextmanager
 def _bar(unit: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """A progress bar on standard error, with rate and time left; the function given is told how many are done."""
     columns = (
@@ -517,3 +546,17 @@ def batch(options: argparse.Namespace) -> int:
     from .commands_batch import batch
 
     return batch(options)
+
+
+def slam(options: argparse.Namespace) -> None:
+    """``jaxsonar slam``."""
+    from .commands_slam import slam as run
+
+    run(options)
+
+
+def localize(options: argparse.Namespace) -> int:
+    """``jaxsonar localize``."""
+    from .commands_slam import localize as run
+
+    return run(options)

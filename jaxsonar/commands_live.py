@@ -31,6 +31,7 @@ def stream(options: argparse.Namespace) -> None:
     from jaxsonar.hardware.transports import parse_url
 
     from .commands import _check_sigma_is_used
+    from .commands_slam import slip_of
     from .compilecache import use_compilation_cache
     from .files import check_outputs
     from .ringfile import load_ring
@@ -40,7 +41,14 @@ def stream(options: argparse.Namespace) -> None:
     _check_sigma_is_used(options.sigma, options.method, None)
     url = parse_url(options.url)
     played = url.path if url.scheme == "file" else None
-    outputs = {"--record": options.record, "--map": options.map, "--rrd": options.rrd}
+    if (options.trajectory or options.odometry) and not options.slam:
+        raise SonarError("--trajectory or --odometry came without --slam; allowed are they with --slam")
+    outputs = {
+        "--record": options.record,
+        "--map": options.map,
+        "--rrd": options.rrd,
+        "--trajectory": options.trajectory,
+    }
     check_outputs(outputs, [options.ring, options.settings, played])
     ring = load_ring(options.ring)
     settings = load_settings(options.settings) if options.settings else None
@@ -61,6 +69,8 @@ def stream(options: argparse.Namespace) -> None:
                 sigma=options.sigma,
                 record=options.record,
                 map_path=options.map,
+                slip=slip_of(options.odometry) if options.slam else None,
+                trajectory=options.trajectory,
                 scans=options.scans,
                 view=view,
                 on_status=show.status,
@@ -188,6 +198,7 @@ def add_commands(
     whole: Callable[[int, int], Callable[[str], Any]],
     number: Callable[[float, float], Callable[[str], Any]],
     ending_in: Callable[..., Callable[[str], Any]],
+    odometry: Callable[[str], Any],
     texts: dict[str, str],
 ) -> None:
     """Tell the command line of both.
@@ -197,7 +208,8 @@ def add_commands(
         whole: a whole number within bounds.
         number: a number within bounds.
         ending_in: a file name with one of some suffixes.
-        texts: help shared with other commands: ``ring``, ``sigma``, ``settings``.
+        odometry: parser of PERCENT,DEG.
+        texts: help shared with other commands: ``ring``, ``sigma``, ``settings``, ``odometry``.
     """
     live = command("stream", "Lines and a growing map from a device, live.")
     live.add_argument(
@@ -216,6 +228,11 @@ def add_commands(
         help="keep everything: .csv, .parquet: a scan log; .mcap: the raw messages (extra live)",
     )
     live.add_argument("--map", type=ending_in(".geojson", ".json"), metavar="MAP", help="GeoJSON, written every 2 s")
+    live.add_argument("--slam", action="store_true", help="the device's poses are odometry: estimate the robot's own")
+    live.add_argument(
+        "--trajectory", type=ending_in(".tum", ".txt"), metavar="TRAJ", help="with --slam: the poses, TUM, at the end"
+    )
+    live.add_argument("--odometry", type=odometry, metavar="PERCENT,DEG", help=texts["odometry"])
     live.add_argument("--scans", type=whole(1, 2**62), metavar="N", help="end after N scans (default: with the device)")
     live.add_argument("--view", action="store_true", help="show it (extra viz), on this machine only")
     live.add_argument("--rrd", type=ending_in(".rrd"), metavar="FILE", help="the view as a file for rerun (extra viz)")

@@ -44,7 +44,7 @@ def slam(options: argparse.Namespace) -> None:
                 log,
                 sigma=options.sigma,
                 window=options.window,
-                slip=_slip(options.odometry),
+                slip=slip_of(options.odometry),
                 smooth=not options.no_smoothing,
                 speed=options.speed,
                 scale=options.scale,
@@ -109,7 +109,13 @@ def localize(options: argparse.Namespace) -> int:
     try:
         with _stages() as progress:
             found = run(
-                ring, world, log, start=options.start, sigma=options.sigma, slip=_slip(options.odometry), progress=progress
+                ring,
+                world,
+                log,
+                start=options.start,
+                sigma=options.sigma,
+                slip=slip_of(options.odometry),
+                progress=progress,
             )
     except SonarError as error:
         raise SonarError(f"{shown(options.log)}: {error}") from None
@@ -157,22 +163,29 @@ def add_commands(
 
     def common(one: argparse.ArgumentParser) -> None:
         one.add_argument("--ring", type=file, required=True, help=texts["ring"])
-        one.add_argument("--sigma", type=number(1e-4, 1), metavar="METRES", help="noise of the ranges (default: found out)")
+        one.add_argument(
+            "--sigma", type=number(1e-4, 1), metavar="METRES", help="noise of the ranges (default: found out)"
+        )
         one.add_argument(
             "--odometry",
             type=odometry,
-            default=None,
             metavar="PERCENT,DEG",
-            help="how wrong the odometry is after 1 m: %% of the way and deg (default: 5,2)",
+            help=texts["odometry"],
         )
 
     run = command("slam", "Poses and map together, from echoes and odometry, or from echoes alone.")
-    run.add_argument("log", type=file, metavar="LOG", help="scan log, .csv or .parquet; its poses are odometry, or empty")
+    run.add_argument(
+        "log", type=file, metavar="LOG", help="scan log, .csv or .parquet; its poses are odometry, or empty"
+    )
     common(run)
-    run.add_argument("-o", "--output", type=file, metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout")
+    run.add_argument(
+        "-o", "--output", type=file, metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout"
+    )
     run.add_argument("--trajectory", type=file, metavar="TRAJ", help="the poses, TUM format; - = stdout")
     run.add_argument("--figure", type=figure, metavar="FIG", help="poses, odometry, walls: .svg, .png or .pdf")
-    run.add_argument("--truth", type=file, metavar="TRAJ", help="true poses (TUM) to tell the errors against, and to draw")
+    run.add_argument(
+        "--truth", type=file, metavar="TRAJ", help="true poses (TUM) to tell the errors against, and to draw"
+    )
     run.add_argument("--json", type=file, metavar="FILE", help="closures, errors, noise, scales as JSON; - = stdout")
     run.add_argument(
         "--window",
@@ -212,7 +225,8 @@ def _pose(text: str) -> tuple[float, float, float]:
     return x, y, math.radians(degrees)
 
 
-def _slip(given: tuple[float, float] | None) -> "Slip":
+def slip_of(given: tuple[float, float] | None) -> "Slip":
+    """From per cent of the way and degrees, after one metre."""
     import math
 
     from .slip import Slip
@@ -316,7 +330,10 @@ def _told(found: "Slam", against: "dict[str, TrajectoryErrors | None] | None") -
         if smoothed.speed_of_sound_sd:
             line += f"; speed of sound {smoothed.ring.speed_of_sound:.2f} +- {smoothed.speed_of_sound_sd:.2f} m/s"
         if any(smoothed.scale_sd):
-            way, turn = (f"{100 * one:+.2f} +- {100 * sd:.2f} %" for one, sd in zip(smoothed.scale, smoothed.scale_sd, strict=True))
+            way, turn = (
+                f"{100 * one:+.2f} +- {100 * sd:.2f} %"
+                for one, sd in zip(smoothed.scale, smoothed.scale_sd, strict=True)
+            )
             line += f"; odometry's ways {way} too long, its turns {turn} too far"
         lines.append(line)
     covariance = found.trajectory.covariance

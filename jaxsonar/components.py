@@ -3,19 +3,16 @@
 import cv2
 import numpy as np
 from jaxtyping import Bool, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components as graph_components
-
-_SHORT = 1 << 16  # cells that have less than 2^15 components
 
 
 def label_components(
     occupied: Bool[np.ndarray, "scans theta rho"],
-) -> tuple[Int[np.ndarray, "scans theta rho"], Int[np.ndarray, " scans"]]:
+) -> tuple[Int[np.ndarray, "scans theta_and_one rho"], Int[np.ndarray, " scans"]]:
     """8-connected components of the accumulators of a batch of scans, joined across both seams of the plane of lines.
 
     The first and the last row touch, because theta wraps; cells of the first column touch those half a turn further,
-    because (-rho, theta) is the line (rho, theta + pi). All scans go through OpenCV as one image.
+    because (-rho, theta) is the line (rho, theta + pi). All scans go through OpenCV as one image, of runs of empty rows
+    one each: few cells are occupied.
 
     Args:
         occupied: highly occupied cells, rows theta, columns rho.
@@ -23,54 +20,63 @@ def label_components(
     Returns:
         labels: 0 for no component, else k or -k for component k of that scan, counted from 1 in the order of cells.
             Minus marks the far side of a component that joined across rho = 0: cells more than a quarter turn from its
-            first cell.
+            first cell. After the last row comes an empty one: the points of no cell have the index of its first cell.
         counts: number of components of each scan.
     """
     scans, rows, columns = occupied.shape
-    if scans == 0:
-        return np.zeros(occupied.shape, np.int16), np.zeros(0, np.int64)
-    image = np.zeros((scans, rows + 1, columns), np.uint8)  # an empty row keeps scans apart
-    image[:, :rows] = occupied
-    total, stacked = cv2.connectedComponents(image.reshape(-1, columns), connectivity=8, ltype=cv2.CV_32S)
-    flat = stacked.reshape(scans, rows + 1, columns)[:, :rows]
+    cell = np.flatnonzero(occupied)
+    cell += cell // (rows * columns) * columns  # among the labels, which have a row more
+    row, column = np.divmod(cell, columns)
+    place = np.cumsum(np.minimum(np.diff(row, prepend=-2), 2))
+    image = np.zeros((int(place[-1]) + 1 if len(place) else 1, columns), np.uint8)
+    image[place, column] = 1
+    small, kind = (np.int16, cv2.CV_16U) if len(cell) < 1 << 15 else (np.int32, cv2.CV_32S)
+    total, parts = cv2.connectedComponentsWithAlgorithm(image, 8, kind, cv2.CCL_BBDT)  # the fastest here
+    labels = np.zeros((scans, rows + 1, columns), small)
+    labels.ravel()[cell] = parts[place, column]
 
-    theta_seam = _touching(flat[:, 0], flat[:, -1], wrap=False)
-    rho_seam = _touching(flat[:, :, 0], np.roll(flat[:, :, 0], rows // 2, axis=1), wrap=True)
-    pairs = np.concatenate([theta_seam, rho_seam])
-    cell, part = np.flatnonzero(occupied), flat[occupied]  # few of all cells
-    component = part
-    if len(pairs):
-        graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(total, total))
-        component = graph_components(graph, directed=False)[1][part]
-    _, first, component = np.unique(component, return_index=True, return_inverse=True)
-    scan_of_component = cell[first] // (rows * columns)
-    order = np.argsort(first)  # by scan, and within a scan by first cell
-    counts = np.bincount(scan_of_component, minlength=scans)
-    number = np.empty(len(order), np.int64)
-    number[order] = np.arange(len(order)) - (np.cumsum(counts) - counts)[scan_of_component[order]] + 1
+    theta_seam = _touching(labels[:, 0], labels[:, rows - 1], wrap=False)
+    edge = labels[:, :rows, 0]
+    rho_seam = _touching(edge, np.roll(edge, rows // 2, axis=1), wrap=True)
+    # From parts, as OpenCV numbers them, to components, and back to their cells.
+    component_of = _joined(np.concatenate([theta_seam, rho_seam], axis=1), total)
+    component = component_of[labels.ravel()[cell]]
+    first = np.full(total, labels.size)
+    first[component[::-1]] = cell[::-1]  # the last to write is the first cell
+    order = np.argsort(first)[: np.count_nonzero(first < labels.size)]  # by scan, and within a scan by first cell
+    scan = first[order] // ((rows + 1) * columns)
+    counts = np.bincount(scan, minlength=scans)
+    number = np.zeros(total, small)
+    number[order] = np.arange(len(order)) - (np.cumsum(counts) - counts)[scan] + 1
+    label = number[component]
+    if rho_seam.size:
+        joined = np.zeros(total, bool)
+        joined[component_of[rho_seam[0]]] = True
+        around = np.flatnonzero(joined[component])
+        turn = (row[around] - first[component[around]] // columns) % rows
+        label[around[np.minimum(turn, rows - turn) > rows // 4]] *= -1
+    labels.ravel()[cell] = label
+    return labels, counts
 
-    labels = np.zeros(occupied.size, np.int16 if rows * columns <= _SHORT else np.int32)
-    labels[cell] = number[component]
-    if len(rho_seam):
-        across = np.isin(component, component[np.isin(part, rho_seam)])
-        turn = (cell // columns % rows - (cell[first] // columns % rows)[component]) % rows
-        far = across & (np.minimum(turn, rows - turn) > rows // 4)
-        labels[cell[far]] *= -1
-    return labels.reshape(occupied.shape), counts
+
+def _joined(pairs: Int[np.ndarray, "2 pairs"], total: int) -> Int[np.ndarray, " total"]:
+    """The least label that each label can be reached from by pairs; few are in one, and ways are short."""
+    least = np.arange(total)
+    while (least[pairs[0]] != least[pairs[1]]).any():
+        low = least[pairs].min(axis=0)
+        for side in pairs:
+            np.minimum.at(least, side, low)
+    return least
 
 
 def _touching(
     one: Int[np.ndarray, "scans cells"], other: Int[np.ndarray, "scans cells"], *, wrap: bool
-) -> Int[np.ndarray, "pairs 2"]:
+) -> Int[np.ndarray, "2 pairs"]:
     """Pairs of labels that touch: cell k of one side touches cells k-1, k and k+1 of the other."""
-    if not one.any() or not other.any():
-        return np.zeros((0, 2), np.int32)
-    found = []
-    for shift in (-1, 0, 1):
-        shifted = np.roll(other, shift, axis=1)
-        if not wrap and shift:
-            shifted[:, 0 if shift > 0 else -1] = 0
-        touch = (one > 0) & (shifted > 0)
-        found.append(np.stack([one[touch], shifted[touch]], axis=-1))
-    pairs = np.concatenate(found)
-    return np.unique(pairs, axis=0)
+    scan, cell = np.nonzero(one)
+    near = cell + np.array([[-1], [0], [1]])
+    beyond = other[scan, near % one.shape[1]]
+    touch = beyond != 0
+    if not wrap:
+        touch &= (near >= 0) & (near < one.shape[1])
+    return np.stack([np.broadcast_to(one[scan, cell], touch.shape)[touch], beyond[touch]])

@@ -24,6 +24,7 @@ _FARTHEST = 1e6  # m; beyond all rings, and within single precision
 _FEW_CELLS = 50_000  # accumulators larger than this are not stacked by the hundred
 _WORTH_A_SHAPE = 256  # scans
 _SLACK = 1.1
+_FULL = 0.75  # of a step's scans; another call costs more than some padding
 
 
 def room_for(count: int, *, least: int) -> int:
@@ -171,7 +172,7 @@ class FlatEchoes:
             return 1
         small = cells > _FEW_CELLS or self.pose is not None  # windows have echoes by the hundred
         sizes = DEAR_SCANS_PER_STEP if dear else SCANS_PER_STEP[-1:] if small else SCANS_PER_STEP
-        return next((size for size in sizes if size <= left), sizes[-1])
+        return next((size for size in sizes if size * _FULL <= left), sizes[-1])
 
     def _need(self, pieces: Int[np.ndarray, " paths"] | None, density: float) -> Int[np.ndarray, " scans"]:
         """Columns that each scan needs for its echoes, and for their pieces."""

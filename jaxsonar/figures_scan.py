@@ -150,7 +150,7 @@ def accumulator_figure(
     arcs = arcs_of(ring, settings)
     votes, smooth = (np.asarray(image)[0] for image in kernels.accumulators(arcs, packed, settings=settings))
     level = float(arcs.level)
-    labels = np.abs(label_components((smooth > level)[None])[0][0])
+    labels = np.abs(label_components((smooth > level)[None])[0][0, :-1])
 
     with styled():
         figure = Figure(figsize=(10.5, 4.2), layout="constrained")

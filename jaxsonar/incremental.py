@@ -2,21 +2,27 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxsonar import kernels
+from jaxsonar.hardware.errors import SonarError
 
 from . import pieces, points
 from .candidates import settings_for
 from .explained import check_sigma
+from .journey import Journey
 from .local import LocalModel, check_method, local_model, models_of
 from .logs import Log, Scan
 from .mapping import CONFIRMED, Evidence, assemble, check_merging, gather_evidence
 from .maps import GlobalMap
+from .poses import to_world
 from .ring import Ring
 from .seenthrough import SeenThrough
+from .slam import Tracker
+from .slip import Slip
 from .windows import Stretch, check_window
 
 
@@ -30,6 +36,8 @@ class MapState:
     """The path of the window that is being gathered; empty without windows."""
     waiting: tuple[Scan, ...]
     """Scans of that window that are not in the evidence yet."""
+    journey: Journey | None = None
+    """Where poses are estimated: the scans by submap; their evidence is gathered when a map is asked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +50,18 @@ class StepInfo:
     """Its segments in the world frame, metres."""
     ignored: str
     """Why the scan is not in the map; empty if it is."""
+    pose: Float[np.ndarray, "3"] | None = None
+    """Where poses are estimated: world_from_robot, metres and radians."""
+    covariance: Float[np.ndarray, "3 3"] | None = None
+    """Of that pose, with respect to the first one."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mapper:
     """Builds a map scan by scan: ``state, info = mapper.step(state, scan)``; ``mapper.map(state)`` is the map so far.
+
+    With ``slip`` the poses of the scans are odometry, and the robot's own are estimated step by step (``slam``); the
+    scans are kept then, because closing a loop moves them.
 
     The evidence adds up, so the order of the scans does not matter, and the map is that of ``build_map`` on the same
     scans (to rounding, 1e-6 m and rad; only the latest ``SCANS_KEPT`` scans of a piece are listed). With windows the
@@ -64,12 +79,16 @@ class Mapper:
     window: float | None = None
     """Metres of path gathered into one local model; None: every scan is one."""
     merging: str = "fused"
+    slip: Slip | None = None
+    """How wrong the poses of the scans are, as odometry; None: they are right."""
 
     def __post_init__(self):
         check_method(self.method)
         check_sigma(self.sigma)
         check_merging(self.merging)
         check_window(self.window)
+        if self.slip is not None and (self.window is not None or self.merging == "paper"):
+            raise SonarError("mapper: slip came with a window or the paper's merging; allowed is either")
         object.__setattr__(self, "settings", settings_for(self.ring, self.settings, window=self.window))
 
     def start(self) -> MapState:
@@ -77,19 +96,38 @@ class Mapper:
         nowhere = np.zeros((0, 3))
         walls, corners = pieces.aggregate([], nowhere), points.aggregate([], nowhere)
         nothing = Evidence(walls, corners, SeenThrough(), np.zeros((0, 2), np.int64), 0)
-        return MapState(nothing, Stretch(), ())
+        return MapState(nothing, Stretch(), (), None if self._tracker is None else Journey(self._tracker.start()))
 
-    def step(self, state: MapState, scan: Scan) -> tuple[MapState, StepInfo]:
+    def step(
+        self,
+        state: MapState,
+        scan: Scan,
+        *,
+        model: LocalModel | None = None,
+        path_pose: Float[np.ndarray, "paths 3"] | None = None,
+    ) -> tuple[MapState, StepInfo]:
         """Take in one scan; the state given is left as it was.
+
+        Args:
+            state: so far.
+            scan: its pose is right, or odometry (``slip``).
+            model: its local model, if it is known already; not with windows.
+            path_pose: of a robot that moved during the scan, as ``local_model`` takes it; not with windows.
 
         Raises:
             SonarError: a sensor number that the ring does not have.
         """
+        if state.journey is not None and self._tracker is not None:
+            journey, step = state.journey.after(self._tracker, scan, model=model, path_pose=path_pose)
+            segments = [to_world(step.pose, line.segment) for line in step.model.lines]
+            info = StepInfo(step.model, np.array(segments).reshape(-1, 2, 2), "", step.pose, step.covariance)
+            return replace(state, journey=journey), info
         if self.window is None:
             if not np.isfinite(scan.pose).all():
                 return state, _nothing("no pose")
-            choices = {"method": self.method, "settings": self.settings, "sigma": self.sigma}
-            model = local_model(self.ring, scan, **choices)
+            if model is None:
+                choices = {"method": self.method, "settings": self.settings, "sigma": self.sigma}
+                model = local_model(self.ring, scan, **choices, path_pose=path_pose)
             return self._with(state, model, Log.from_scans([scan]))
         if not np.isfinite(scan.pose).all():
             state, info = self._closed(state)
@@ -122,7 +160,20 @@ class Mapper:
 
     def map(self, state: MapState) -> GlobalMap:
         """The map so far."""
-        return assemble(state.evidence, merging=self.merging, confirmed=1 if self.window else CONFIRMED)
+        evidence = state.evidence if state.journey is None else state.journey.evidence(self.ring) or state.evidence
+        return assemble(evidence, merging=self.merging, confirmed=1 if self.window else CONFIRMED)
+
+    def trajectory(self, state: MapState) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:
+        """Where poses are estimated: those of all scans so far, and their covariances with respect to the first one."""
+        if state.journey is None or self._tracker is None:
+            raise SonarError("mapper: no poses are estimated; allowed is a mapper with slip")
+        return self._tracker.poses(state.journey.tracked)
+
+    @cached_property
+    def _tracker(self) -> Tracker | None:
+        if self.slip is None:
+            return None
+        return Tracker(ring=self.ring, method=self.method, settings=self.settings, sigma=self.sigma, slip=self.slip)
 
     def _closed(self, state: MapState) -> tuple[MapState, StepInfo]:
         """The window ends here."""

@@ -18,6 +18,8 @@ from .logs import Log, Scan
 from .maps import GlobalMap
 from .poses import relative
 from .ring import Ring, speed_of_sound
+from .slip import Slip
+from .trajectory import Trajectory
 
 AT_ONCE = 64
 """Scans taken together where so many wait."""
@@ -52,6 +54,7 @@ class LiveMap:
         settings: kernels.HoughSettings | None = None,
         sigma: float | None = None,
         mapping: bool = True,
+        slip: Slip | None = None,
     ):
         """Nothing is known yet.
 
@@ -61,6 +64,8 @@ class LiveMap:
             settings: as ``local_models``.
             sigma: as ``local_models``.
             mapping: False: lines only, at a fraction of the work.
+            slip: how wrong the device's poses are: they are odometry then, and the robot's own are estimated, for the
+                map and in what ``take`` gives. They are right if left out.
 
         Raises:
             SonarError: as ``local_models``.
@@ -73,9 +78,11 @@ class LiveMap:
         self.unplaced = 0
         """Scans without a pose, which are not in the map."""
         self._choices = {"method": method, "settings": settings_for(ring, settings), "sigma": sigma}
-        self._mapper = Mapper(ring=ring, **self._choices) if mapping else None
+        self.slam = slip is not None
+        self._mapper = Mapper(ring=ring, **self._choices, slip=slip) if mapping or self.slam else None
         self._state = self._mapper.start() if self._mapper is not None else None
         self._waiting: list[LiveScan] = []
+        self._stamps: list[float] = []
         self._temperature = float("nan")
         self._paths, self._path_index = ring.paths, ring.path_index
         self._firing: Int[np.ndarray, " sensors"] = np.full(ring.count, -1)
@@ -102,8 +109,15 @@ class LiveMap:
         sizes = _ECHOES if method == "hough" else (_ECHOES[0], _ECHOES[-1])  # ml has rooms of powers of two
         with ThreadPoolExecutor(len(sizes)) as pool:
             warm = list(pool.map(one, sizes))
-        if self._mapper is not None:
+        if self._mapper is None:
+            return
+        if not self.slam:
             self._mapper.map(self._mapper.including(self._mapper.start(), [warm[0].scan], [warm[0].model]))
+            return
+        state = self._mapper.start()
+        for one in (*warm, *warm):
+            state, _ = self._mapper.step(state, one.scan, model=one.model)
+        self._mapper.map(state)
 
     def take(self, raws: Sequence[RawScan]) -> list[LiveScan]:
         """The lines of some scans.
@@ -122,6 +136,8 @@ class LiveMap:
         else:
             pairs = zip(scans, poses, strict=True)
             models = [local_model(self.ring, scan, path_pose=pose, **self._choices) for scan, pose in pairs]
+        if self.slam:
+            return [self._tracked(*one) for one in zip(scans, models, poses, strict=True)]
         taken = [LiveScan(scan, model) for scan, model in zip(scans, models, strict=True)]
         self.unplaced += sum(not np.isfinite(scan.pose).all() for scan in scans)
         if self._mapper is not None:
@@ -147,6 +163,22 @@ class LiveMap:
         assert self._mapper is not None, "lines only"
         assert self._state is not None
         return self._mapper.map(self._state)
+
+    def _tracked(self, scan: Scan, model: LocalModel, path_pose: Float[np.ndarray, "paths 3"] | None) -> LiveScan:
+        """A scan where the robot seems to have been; at once in the map."""
+        assert self._mapper is not None
+        assert self._state is not None
+        self._state, info = self._mapper.step(self._state, scan, model=model, path_pose=path_pose)
+        assert info.pose is not None
+        self._stamps.append(scan.stamp if np.isfinite(scan.stamp) else float(scan.scan))
+        return LiveScan(replace(scan, pose=info.pose), model)
+
+    def trajectory(self) -> Trajectory:
+        """The robot's poses as they are known now, with their covariances; only where they are estimated."""
+        assert self._mapper is not None
+        assert self._state is not None
+        poses, covariances = self._mapper.trajectory(self._state)
+        return Trajectory(np.array(self._stamps), poses, covariances)
 
     def scan_of(self, raw: RawScan) -> Scan:
         """A raw scan as a log has it: times of flight as ranges."""

@@ -5,7 +5,7 @@ the first scans by the ranges of the echoes. Rooms that look alike leave more th
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from .placing import place_parts
 from .placing_evidence import explained
 from .placing_hypotheses import hypotheses
 from .placing_map import Places, seen_of
-from .poses import composed, inverse, relative, unit, wrap_angle
+from .poses import composed, relative, unit, wrap_angle
 from .ring import Ring
 from .slip import Slip
 from .tracking import Track, update
@@ -123,7 +123,9 @@ def localize(
         say("local models", len(models), len(log))
     path = _Path(ring, _Map.of(world), log, models, _odometry(log, models), sigma, slip or Slip())
     if not len(path.rows):
-        raise SonarError("localize: no scan could be laid on another; allowed are scans with odometry, or near each other")
+        raise SonarError(
+            "localize: no scan could be laid on another; allowed are scans with odometry, or near each other"
+        )
     # 1. Where the first scan may be.
     sd = np.array([ROUGH[0], ROUGH[0], ROUGH[1]]) if start is not None else np.array([_FOUND[0], _FOUND[0], _FOUND[1]])
     begins = [np.array(start, dtype=np.float64)] if start is not None else path.begins(world)
@@ -221,9 +223,7 @@ class _Map(NamedTuple):
             np.concatenate([wall_cov, point_cov]),
         )
 
-    def around(
-        self, pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"], reach: float
-    ) -> Known:
+    def around(self, pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"], reach: float) -> Known:
         """What may be heard from a pose, walls with their normals away from it."""
         offset = self.anchor - pose[:2]
         wall = self.kind == kernels.PLANE
@@ -298,13 +298,15 @@ class _Path:
             if not len(found):
                 continue
             found = _thinned(found)
-            evidence = np.concatenate([explained(places, seen, part).evidence for part in np.array_split(found, -(-len(found) // 4096))])
+            evidence = np.concatenate(
+                [explained(places, seen, part).evidence for part in np.array_split(found, -(-len(found) // 4096))]
+            )
             best = np.argsort(-evidence, kind="stable")[: 4 * KEPT]
             back = relative(self.odometry[row], first)
             poses += [composed(pose, back) for pose in found[best]]
             score += evidence[best].tolist()
         order = np.argsort(-np.array(score), kind="stable")
-        kept: list[Float[np.ndarray, "3"]] = []
+        kept: list[Float[np.ndarray, 3]] = []
         for k in order:
             off = [poses[k] - one for one in kept]
             if all(np.hypot(*one[:2]) > SAME[0] / 2 or abs(wrap_angle(one[2])) > SAME[1] / 2 for one in off):

@@ -17,12 +17,12 @@ from .poses import unit, wrap_angle
 
 NO_COV = np.diag([0.01, np.radians(3.0)]) ** 2
 """Of lines that come without a covariance (method hough): m^2, rad^2."""
-FEWEST = 0.5, 6
+FEWEST = 0.4, 6
 """Echoes of something new: of a wall this share of what a long one sends, of a point so many. Of a wall that is hardly
 seen the edge answers as well."""
 _ROUNDS = 40
 _FINE = 1.5  # covariances of local models are bounds
-_PAIR = float(chi2.ppf(0.9999, 2))
+_PAIR = float(chi2.ppf(0.999, 2))
 _BESIDE = 0.3  # m; what is seen of a wall may lie this far from what is known of it
 _APART = (0.02, float(np.radians(5.0)))  # m, rad; nearer than this to something known is nothing new
 _JOINT = chi2.ppf(0.999, 2 * np.arange(1, _ROUNDS + 1))
@@ -135,7 +135,9 @@ def match(known: Known, seen: Features, *, full: float) -> Matches:
     if not len(known) or not len(seen.kind):
         return Matches(nothing, worth)
     place, slope = seen_from(known.pose, known)
-    column = np.concatenate([np.tile(np.arange(3), (len(known), 1)), 3 + 2 * np.arange(len(known))[:, None] + [0, 1]], 1)
+    column = np.concatenate(
+        [np.tile(np.arange(3), (len(known), 1)), 3 + 2 * np.arange(len(known))[:, None] + [0, 1]], 1
+    )
     own = known.covariance[column[:, :, None], column[:, None, :]]
     spread = slope @ own @ slope.transpose(0, 2, 1)
     off = _offsets(seen, place)
@@ -154,7 +156,7 @@ def match(known: Known, seen: Features, *, full: float) -> Matches:
     matched = nothing.copy()
     matched[feature[kept]] = reflector[kept]
     points = (seen.kind != kernels.PLANE)[:, None] & (known.kind != kernels.PLANE)
-    doubtful = (alike & (squared < 2 * _PAIR)) | (near & beside & (alike | points))
+    doubtful = (alike & (squared < _PAIR)) | (near & beside & (alike | points))
     return Matches(matched, worth & (matched < 0) & ~doubtful.any(axis=1))
 
 

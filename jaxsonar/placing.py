@@ -90,6 +90,39 @@ def place_parts(
     return [_begun(part.poses, given) for part in parts]
 
 
+def place_more(
+    models: Sequence[LocalModel],
+    poses: Float[np.ndarray, "scans 3"],
+    odometry: Float[np.ndarray, "scans 3"] | None = None,
+    *,
+    slip: float = ODOMETRY,
+    margin: float = MARGIN,
+    blur: float = 1.0,
+) -> Float[np.ndarray, "scans 3"]:
+    """The same poses, with those scans that find their place in the map of the others by now.
+
+    Args:
+        models: as for ``place_parts``.
+        poses: world_from_robot of those that are placed, metres and radians; NaN for the others.
+        odometry: as for ``place_parts``.
+        slip: as for ``place_parts``.
+        margin: as for ``place_parts``.
+        blur: as for ``place_parts``.
+
+    Returns:
+        (scans, 3); the poses that were given are as they were, NaN where a scan has no place yet.
+    """
+    given = np.full((len(models), 3), np.nan) if odometry is None else np.array(odometry, dtype=np.float64)
+    tracker = _Tracker([seen_of(model, blur=blur) for model in models], Motion(given, slip), margin)
+    base = _Part(np.full((len(models), 3), np.nan), Places())
+    for scan in np.flatnonzero(np.isfinite(poses[:, 0])):
+        base.take(int(scan), tracker.seen[scan], poses[scan])
+    free = ~base.placed
+    tracker.fill(base, free)
+    others = [part for part in tracker.parts(None, free & ~base.placed) if part.placed.sum() > 1]
+    return tracker.joined([base, *others], first=True)[0].poses
+
+
 def _begun(poses: Float[np.ndarray, "scans 3"], given: Float[np.ndarray, "scans 3"]) -> Float[np.ndarray, "scans 3"]:
     """The same with the first placed scan at the origin, or where the odometry has it."""
     first = int(np.flatnonzero(np.isfinite(poses[:, 0]))[0])
@@ -124,10 +157,12 @@ class _Tracker:
         far = np.concatenate([np.zeros(1), *(one.heard[:, 0] for one in seen)])
         self.reach = 0.85 * float(np.quantile(far, 0.98))  # as near as this walls are surely heard
 
-    def parts(self, progress: Callable[[int, int], None] | None) -> list[_Part]:
-        """The log in pieces: a new one begins where several scans in a row find no place."""
+    def parts(
+        self, progress: Callable[[int, int], None] | None, free: Bool[np.ndarray, " scans"] | None = None
+    ) -> list[_Part]:
+        """The log in pieces, or those scans of it that are free: a new one begins where several find no place."""
         count, parts = len(self.seen), []
-        free = np.ones(count, dtype=bool)
+        free = np.ones(count, dtype=bool) if free is None else free.copy()
         for start in range(count):
             if not free[start] or not self._begins(start):
                 continue
@@ -189,9 +224,9 @@ class _Tracker:
             if turn and not any(more):
                 break
 
-    def joined(self, parts: list[_Part]) -> list[_Part]:
-        """Lay smaller parts on the largest wherever that is unambiguous."""
-        parts = sorted(parts, key=lambda part: -int(part.placed.sum()))
+    def joined(self, parts: list[_Part], *, first: bool = False) -> list[_Part]:
+        """Lay smaller parts on the largest, or all on the first, wherever that is unambiguous."""
+        parts = parts if first else sorted(parts, key=lambda part: -int(part.placed.sum()))
         number = 1
         while number < len(parts):
             moved = self._laid_on(parts[0], parts[number])

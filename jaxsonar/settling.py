@@ -21,6 +21,7 @@ from .logs import Log
 from .poses import relative
 from .ring import Ring
 from .ringmodes import RingModes
+from .slip import OdometryNoise
 from .surroundings import Surroundings
 from .windows import renewed
 
@@ -31,8 +32,6 @@ LEAST_ECHOES = 3
 LEAST_SIGMA = 1e-5
 """Metres; noise-free echoes have some, too: that of their digits."""
 _ANCHOR, _LOOSE = 1e-5, 1.0  # m, rad; the first pose of a path, and all others
-_SLIP = (0.0005, 0.001)  # m, rad; of odometry even where the robot stands
-_TURN = 0.5  # rad; turn in which odometry slips as much as over a metre
 _HALVINGS = 12
 _LAST_ROUNDS = 3
 _JUDGED, _MISFIT = 8, 1.1  # echoes and share; from there on a point must fit as well as the walls do
@@ -58,23 +57,37 @@ class Data:
     rows: tuple[Int[np.ndarray, " _"], ...]
     """Of every log: its scans that are used, the first of them in row ``begin`` of the rectangle and so on."""
     begin: tuple[int, ...]
+    reach: float = 1.0
+    """As in ``kernels.Problem``."""
+    together: int = 1
+    """Echoes of one reflector that a scan must have for them to count. A pose that hardly anything holds in one
+    direction goes where one or two echoes of something that is not in the map fit a reflector that is."""
 
     @classmethod
-    def of(cls, ring: Ring, logs: Sequence[Log], odometry: Sequence[Float[np.ndarray, "_ 3"]], share: float) -> "Data":
+    def of(
+        cls,
+        ring: Ring,
+        logs: Sequence[Log],
+        odometry: Sequence[Float[np.ndarray, "_ 3"]],
+        noise: OdometryNoise,
+        *,
+        silent: bool = False,
+    ) -> "Data":
         """Scans with poses and echoes.
 
         Args:
             ring: the sensors.
             logs: scans, with the poses to start from.
             odometry: of every log, as measured; NaN where there is none.
-            share: of the way and the turn between scans that odometry is wrong by.
+            noise: of the odometry.
+            silent: whether scans without echoes are used, too: odometry leads through them.
         """
         flats = [FlatEchoes.from_log(ring, log)[0] for log in logs]
         fresh = [renewed(flat) for flat in flats]  # a reading that was not renewed is the one before, not one more
         used, counts = [], []
         for log, flat, new in zip(logs, flats, fresh, strict=True):
             count = np.bincount(flat.scan[new], minlength=len(log))
-            rows = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1) & (count > 0))
+            rows = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1) & (silent | (count > 0)))
             used.append(rows)
             counts.append(count[rows])
         begin = np.cumsum([0, *(len(rows) for rows in used)])
@@ -92,7 +105,7 @@ class Data:
             begin=tuple(begin[:-1].tolist()),
         )
         for number, columns_of in enumerate(zip(logs, flats, fresh, used, odometry, strict=True)):
-            data._fill(number, *columns_of, share)
+            data._fill(number, *columns_of, noise)
         return data
 
     def _fill(
@@ -103,7 +116,7 @@ class Data:
         new: np.ndarray,
         rows: np.ndarray,
         measured: np.ndarray,
-        share: float,
+        noise: OdometryNoise,
     ) -> None:
         first = self.begin[number]
         here = slice(first, first + len(rows))
@@ -120,8 +133,7 @@ class Data:
             return
         step: np.ndarray = relative(measured[rows[:-1]], measured[rows[1:]])
         known = np.all(np.isfinite(step), axis=1)
-        way, turn = np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])
-        off = np.stack([share * way + _SLIP[0]] * 2 + [share * (turn + _TURN * way) + _SLIP[1]], axis=-1)
+        off = noise(measured, rows)
         self.odometry[first : first + len(rows) - 1] = np.where(known[:, None], step, 0)
         self.linked[first : first + len(rows) - 1] = np.where(known[:, None], 1 / off**2, 0)
 
@@ -268,6 +280,7 @@ def problem_of(
         anchored=jnp.asarray(data.anchored),
         odometry=jnp.asarray(data.odometry),
         linked=jnp.asarray(data.linked),
+        reach=data.reach,
     )
 
 
@@ -296,6 +309,10 @@ def _associated(
             around.candidates.reflection.second,
         )
     )
+    if data.together > 1:
+        room = len(around.world)
+        group = first + room * np.arange(len(first))[:, None]
+        used &= np.bincount(group[used], minlength=room * len(first))[group] >= data.together
     # A reflector that hardly anything comes from fits anything.
     count = np.bincount(first[used], minlength=len(around.world))
     used &= (count[first] >= LEAST_ECHOES) | (kind == kernels.SECOND)

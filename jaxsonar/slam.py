@@ -1,8 +1,8 @@
 """Poses and map together: scan by scan (``Tracker``), and a whole log at once (``slam``).
 
-    scan --local.py--> walls, corners --matching.py--> what is known --kernels.track--> pose, reflectors   (tracking.py)
-      a submap is finished --submaps.py--> SubmapGraph (loops*.py): joined, closed, withdrawn --posegraph.py--> its place
-        the log is finished --smoothing.py--> all poses and reflectors on the raw ranges
+scan --local.py--> walls, corners --matching.py--> what is known --kernels.track--> pose, reflectors   (tracking.py)
+a submap is finished --submaps.py--> SubmapGraph (loops*.py): joined, closed, withdrawn --posegraph.py--> its place
+the log is finished --smoothing.py--> all poses and reflectors on the raw ranges
 """
 
 from collections.abc import Callable, Sequence
@@ -22,8 +22,8 @@ from .local import LocalModel, check_method, local_model, local_models
 from .logs import Log, Scan
 from .loops import SubmapGraph
 from .loops_verified import ACCEPTED, Decision
-from .maps import GlobalMap
 from .mapping import build_map
+from .maps import GlobalMap
 from .motion import placed
 from .placing import place_parts
 from .poses import composed
@@ -253,7 +253,9 @@ def slam(
     took = np.zeros(0)
     if window is not None:
         if not measured:
-            raise SonarError(f"slam: a window of {window:g} m of path, and no scan has a pose; allowed is a log with odometry")
+            raise SonarError(
+                f"slam: a window of {window:g} m of path, and no scan has a pose; allowed is a log with odometry"
+            )
         start, covariance = odometry, np.full((len(log), 3, 3), np.nan)
     elif measured:
         start, covariance, ties, took = _tracked(ring, log, odometry, sigma, slip, live, say)

@@ -26,6 +26,8 @@ from .mapfile import save_map
 from .maps import GlobalMap
 from .playing import file_opener
 from .ring import Ring
+from .slip import Slip
+from .trajectory import save_trajectory
 
 MAP_EVERY = 2.0
 """Seconds between two writings of the map."""
@@ -130,6 +132,8 @@ def stream(
     record: str | os.PathLike[str] | None = None,
     map_path: str | os.PathLike[str] | None = None,
     map_every: float = MAP_EVERY,
+    slip: Slip | None = None,
+    trajectory: str | os.PathLike[str] | None = None,
     scans: int | None = None,
     view: Viewer | None = None,
     on_scan: Callable[[LiveScan], None] | None = None,
@@ -149,6 +153,8 @@ def stream(
         record: file for everything that comes, ``.csv``, ``.parquet`` or ``.mcap``; see ``open_record``.
         map_path: GeoJSON, written now and then and at the end, each time whole.
         map_every: seconds between two writings.
+        slip: how wrong the device's poses are: they are odometry then, and the robot's own are estimated (``slam``).
+        trajectory: TUM file of the estimated poses, written at the end; with ``slip``.
         scans: end after this many.
         view: shows it.
         on_scan: told of every scan with its model.
@@ -164,7 +170,10 @@ def stream(
         SonarError: a call that makes no sense, a device that cannot be opened, a place that cannot be written to. What
             came before is written.
     """
-    live = LiveMap(ring, method=method, settings=settings, sigma=sigma, mapping=bool(map_path) or view is not None)
+    if trajectory is not None and slip is None:
+        raise SonarError("stream: a trajectory came without slip; allowed is a trajectory where poses are estimated")
+    mapping = bool(map_path) or view is not None
+    live = LiveMap(ring, method=method, settings=settings, sigma=sigma, mapping=mapping, slip=slip)
     register("file", file_opener(ring))
     scheme = parse_url(url).scheme
     readers: list[Reader] = []
@@ -185,7 +194,9 @@ def stream(
     patient = True if scheme == "file" else False if scheme == "udp" else None
     reader = Reader(source, queue, sensors=ring.count, recorder=recorder, scans=scans, patient=patient)
     readers.append(reader)
-    run = _Run(live, reader, queue, map_path=map_path, map_every=map_every, view=view, on_scan=on_scan)
+    run = _Run(
+        live, reader, queue, map_path=map_path, map_every=map_every, view=view, on_scan=on_scan, trajectory=trajectory
+    )
     stop = threading.Event() if stop is None else stop
     with _switching(_SWITCH):
         reader.start()
@@ -212,7 +223,9 @@ class _Run:
         map_every: float,
         view: Viewer | None,
         on_scan: Callable[[LiveScan], None] | None,
+        trajectory: str | os.PathLike[str] | None,
     ):
+        self._trajectory = trajectory
         self.status = Status()
         self._live, self._reader, self._queue = live, reader, queue
         self._map_path, self._map_every = map_path, map_every
@@ -248,7 +261,8 @@ class _Run:
     def finish(self, on_status: Callable[[Status], None] | None) -> None:
         """What is left: scans in the queue, the last map, what went wrong."""
         if not self._warming.done():
-            if self._map_path is None and self._view is None and self._on_scan is None:
+            asked = (self._map_path, self._view, self._on_scan, self._trajectory)
+            if all(one is None for one in asked):
                 self._note()
                 while not self._queue.ended:
                     self._queue.get(0.0, most=AT_ONCE)  # nobody asks for lines, but for what went wrong
@@ -265,6 +279,8 @@ class _Run:
             except BaseException as failure:  # of the reader; what came before it is still to be written
                 error = failure
         self._write_map(last=True)
+        if self._trajectory is not None:
+            save_trajectory(self._live.trajectory(), self._trajectory)
         self._note()
         if self._view is not None:
             self._view.close()

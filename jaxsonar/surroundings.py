@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 from jaxsonar import kernels
 
 from .echoes import power_of_two
-from .local import local_models
+from .local import LocalModel, local_models
 from .logs import Log
 from .mapping import assemble, build_map, gather_evidence
 from .maps import GlobalMap
@@ -25,14 +25,20 @@ _TWICE = 2  # scans that see a point
 _ROOM = 16
 
 
-def seen_world(ring: Ring, log: Log, *, window: float | None) -> GlobalMap:
+def seen_world(ring: Ring, log: Log, *, window: float | None, models: Sequence[LocalModel] | None = None) -> GlobalMap:
     """The map of a log, with every corner and edge that two scans saw, however little they agree where.
 
     A map keeps only points that stand still; before ring and poses are adjusted they do not.
+
+    Args:
+        ring: the sensors.
+        log: scans with poses.
+        window: metres of path for a local model, where single scans are sparse.
+        models: the local models of the log, where they are known already; without a window they need no poses.
     """
     if window is not None:
         return build_map(ring, log, window=window)
-    evidence = gather_evidence(ring, log, local_models(ring, log))
+    evidence = gather_evidence(ring, log, local_models(ring, log) if models is None else models)
     world = assemble(evidence)
     found, _ = cluster(condense(evidence.points))
     apart = np.linalg.norm(found.place[:, None] - world.points[None], axis=-1).min(axis=1, initial=np.inf)

@@ -293,7 +293,8 @@ class _Echoes:
         """The belief without padding."""
         count, size = len(before), len(before.covariance)
         belief = found.belief
-        return replace(before, 
+        return replace(
+            before,
             pose=np.asarray(belief.pose),
             parameters=np.asarray(belief.scene.parameters)[:count],
             covariance=np.asarray(belief.covariance)[:size, :size],
@@ -345,9 +346,7 @@ def _with_new(known: Known, new: Features, pose: Float[np.ndarray, "3"]) -> Know
     )
 
 
-def _seen_farther(
-    known: Known, seen: Features, reflector: Int[np.ndarray, " features"], explains: np.ndarray
-) -> Known:
+def _seen_farther(known: Known, seen: Features, reflector: Int[np.ndarray, " features"], explains: np.ndarray) -> Known:
     """Walls reach as far as they were seen; whatever explains an echo was seen once more."""
     ends = known.ends.copy()
     for feature in np.flatnonzero((reflector >= 0) & (seen.kind == kernels.PLANE)):

@@ -1,9 +1,8 @@
 """Ring, poses and reflectors together: Levenberg-Marquardt on the ranges of all echoes, linear in the number of scans.
 
 Every echo touches two sensors, one pose and one or two reflectors. So the normal equations are an arrow: a small dense
-block for the ring and the scene, and poses that hang on it and on their neighbors along the path. The poses are
-eliminated one after the other (Schur complement of a block tridiagonal matrix); a dense Jacobian of a thousand scans
-would hold a gigabyte.
+block for the ring and the scene, and poses that hang on it and on their neighbors along the path (``arrow.py``); a
+dense Jacobian of a thousand scans would hold a gigabyte.
 
 The ring moves along modes: columns that say how offsets, speed of sound and positions change together, each scaled to
 the standard deviation that is expected of it, so that every mode has the prior N(0, 1). What is held has no mode.
@@ -17,11 +16,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .arrow import Arrow, covariances, eliminated, solved
 from .geometry import normal, tangent, wrap_angle
 from .paths import Sensors
 from .scene import Reflection, Scene, expected_range, expected_report, seen_from, take
 
-_REFLECTOR = 1.0  # m, rad; how far a reflector may lie from its start: so that none is undetermined
 _DAMPING = (1e-6, 1e-12, 1e8)  # relative to the diagonal: first, least, most
 _ENOUGH = 1e-9  # relative decrease of the cost at which it ends
 
@@ -56,7 +55,8 @@ class Problem(eqx.Module):
     sensors: Sensors
     """The ring to start from."""
     modes: Float[Array, "ring modes"]
-    """Columns: change of offsets (sensors), logarithm of the speed of sound, positions (sensors x 2); metres."""
+    """Columns: change of offsets (sensors), logarithm of the speed of sound, positions (sensors x 2); metres. With two
+    rows more the logarithms of how much too long the odometry's ways are, and too far its turns."""
     scene: Scene
     """The reflectors to start from."""
     heard: Heard
@@ -69,6 +69,8 @@ class Problem(eqx.Module):
     """The next pose in the frame of each one; the last is not used."""
     linked: Float[Array, "scans 3"]
     """Inverse variance of the odometry; 0 where there is none, and for the last one."""
+    reach: float = eqx.field(default=1.0, static=True)
+    """Metres, radians; how far a reflector may lie from its start (one standard deviation): none is undetermined."""
 
 
 class Adjusted(eqx.Module):
@@ -86,9 +88,12 @@ class Adjusted(eqx.Module):
 
 
 def moved_sensors(sensors: Sensors, change: Float[Array, " ring"]) -> Sensors:
-    """The ring after a change of (offsets, logarithm of the speed of sound, positions), as columns of modes are."""
+    """The ring after a change of (offsets, logarithm of the speed of sound, positions), as columns of modes are.
+
+    What may follow in such a column is of the odometry, not of the ring.
+    """
     count = sensors.heading.shape[0]
-    offset, speed, place = change[:count], change[count], change[count + 1 :]
+    offset, speed, place = change[:count], change[count], change[count + 1 : 3 * count + 1]
     return eqx.tree_at(
         lambda s: (s.range_offset, s.range_scale, s.position),
         sensors,
@@ -122,10 +127,11 @@ def residuals(problem: Problem, unknowns: Unknowns) -> Float[Array, "scans echoe
 def cost(problem: Problem, unknowns: Unknowns) -> Float[Array, ""]:
     """Half the weighted sum of squares of the residuals and of what was expected of modes, poses and reflectors."""
     total = (problem.heard.weight * residuals(problem, unknowns) ** 2).sum() + (unknowns.modes**2).sum()
-    total += (((unknowns.scene - problem.scene.parameters) / _REFLECTOR) ** 2).sum()
+    total += (((unknowns.scene - problem.scene.parameters) / problem.reach) ** 2).sum()
     total += (problem.anchored * _pose_difference(unknowns.poses, problem.poses) ** 2).sum()
     if len(problem.poses) > 1:
-        slips = jax.vmap(_slip)(unknowns.poses[:-1], unknowns.poses[1:], problem.odometry[:-1])
+        steps = (unknowns.poses[:-1], unknowns.poses[1:], problem.odometry[:-1])
+        slips = jax.vmap(_slip, in_axes=(0, 0, 0, None))(*steps, _odometry_scale(problem, unknowns))
         total += (problem.linked[:-1] * slips**2).sum()
     return total / 2
 
@@ -143,8 +149,7 @@ def adjust(problem: Problem, unknowns: Unknowns, *, poses_free: bool, most: int 
 
     def step(state):
         now, value, damping, count, _ = state
-        system = _linearised(problem, now, poses_free)
-        shift = _shift(problem, system, damping, poses_free)
+        shift = _shift(problem, _linearised(problem, now, poses_free), damping)
         trial = jax.tree.map(jnp.add, now, shift)
         then = cost(problem, trial)
         better = then <= value * (1 + rounding)  # False for NaN
@@ -159,22 +164,22 @@ def adjust(problem: Problem, unknowns: Unknowns, *, poses_free: bool, most: int 
     rounding = max(_ENOUGH / 1000, 16 * float(jnp.finfo(before.dtype).eps))  # at the minimum the cost falls no more
     start = (unknowns, before, jnp.asarray(_DAMPING[0], before.dtype), jnp.asarray(0), jnp.asarray(False))
     found, value, _, count, _ = jax.lax.while_loop(lambda state: (state[3] < most) & ~state[4], step, start)
-    reduced, _ = _reduced(_linearised(problem, found, poses_free), jnp.zeros_like(value), poses_free)
-    return Adjusted(found, value, before, jnp.linalg.inv(reduced), count)
+    known = eliminated(_linearised(problem, found, poses_free), jnp.zeros_like(value)).shared
+    return Adjusted(found, value, before, jnp.linalg.inv(known), count)
 
 
-class _System(NamedTuple):
-    """Normal equations H x = g, taken apart: ring and scene (shared), poses, and poses with their next ones."""
+@jax.jit
+def pose_covariances(problem: Problem, unknowns: Unknowns) -> Float[Array, "scans 3 3"]:
+    """Of every pose (x, y, theta) by itself, at the minimum of the cost; ring and scene unknown as the problem has it.
 
-    shared: Float[Array, "shared shared"]
-    shared_g: Float[Array, " shared"]
-    cross: Float[Array, "scans 3 shared"]
-    pose: Float[Array, "scans 3 3"]
-    pose_g: Float[Array, "scans 3"]
-    next: Float[Array, "scans 3 3"]
+    By a backward recursion over the chain of poses, O(shared^2) a scan.
+    """
+    _, poses = covariances(_linearised(problem, unknowns, poses_free=True))
+    return poses
 
 
-def _linearised(problem: Problem, unknowns: Unknowns, poses_free: bool) -> _System:
+def _linearised(problem: Problem, unknowns: Unknowns, poses_free: bool) -> Arrow:
+    """The normal equations; shared are modes and scene parameters. No poses where they are held."""
     sensors = moved_sensors(problem.sensors, problem.modes @ unknowns.modes)
     scene = _at(problem.scene, unknowns.scene)
     count, ring = sensors.heading.shape[0], problem.modes.shape[0]
@@ -198,101 +203,88 @@ def _linearised(problem: Problem, unknowns: Unknowns, poses_free: bool) -> _Syst
                 *(slope.tx, slope.rx, slope.first, slope.second),
             ]
         )
-        row = jnp.zeros(size, value.dtype).at[column].add(value)
         keep = weight > 0
-        return jnp.where(keep, row, 0), jnp.where(keep, slope.pose, 0), jnp.where(keep, reported - report, 0)
+        return column, jnp.where(keep, value, 0), jnp.where(keep, slope.pose, 0), jnp.where(keep, reported - report, 0)
 
     def one_scan(carry, scan):
         heard, pose = scan
         echo = (heard.path, heard.reported, heard.reflection, heard.weight)
-        row, turn, left = jax.vmap(one_echo, in_axes=(0, 0, 0, 0, None))(*echo, pose)
-        weighted = heard.weight[:, None] * row
-        total = (carry[0] + row.T @ weighted, carry[1] + weighted.T @ left)
+        column, value, turn, left = jax.vmap(one_echo, in_axes=(0, 0, 0, 0, None))(*echo, pose)
+        weighted = heard.weight[:, None] * value
+        h, g = carry
+        # An echo has 11 slopes, however many reflectors there are.
+        h = h.at[column[:, :, None], column[:, None, :]].add(weighted[:, :, None] * value[:, None, :])
+        total = (h, g.at[column].add(weighted * left[:, None]))
         if not poses_free:
             return total, None
         pull = heard.weight[:, None] * turn
-        return total, (turn.T @ weighted, pull.T @ turn, pull.T @ left)
+        cross = jnp.zeros((size, 3), h.dtype).at[column].add(weighted[:, :, None] * turn[:, None, :])
+        return total, (cross.T, pull.T @ turn, pull.T @ left)
 
     zero = (jnp.zeros((size, size), unknowns.scene.dtype), jnp.zeros(size, unknowns.scene.dtype))
     (h, g), own = jax.lax.scan(one_scan, zero, (problem.heard, unknowns.poses))
-    # Along the modes, with what is expected of them and of the reflectors.
-    modes, reflectors = problem.modes, jnp.eye(size - ring, dtype=h.dtype)
+    if own is None:
+        none = jnp.zeros((0, 3, 3), h.dtype)
+        arrow = Arrow(h, g, jnp.zeros((0, 3, size), h.dtype), none, none[:, 0], none)
+    else:
+        arrow = _with_links(problem, unknowns, Arrow(h, g, *own, jnp.zeros_like(own[1])))
+    return _along_modes(problem, unknowns, arrow)
+
+
+def _along_modes(problem: Problem, unknowns: Unknowns, arrow: Arrow) -> Arrow:
+    """From changes of the ring to its modes, with what is expected of these and of the reflectors."""
+    modes, ring, h, g = problem.modes, problem.modes.shape[0], arrow.shared, arrow.shared_g
+    reflectors = jnp.eye(len(g) - ring, dtype=h.dtype)
     shared = jnp.block(
         [
             [modes.T @ h[:ring, :ring] @ modes + jnp.eye(modes.shape[1], dtype=h.dtype), modes.T @ h[:ring, ring:]],
-            [h[ring:, :ring] @ modes, h[ring:, ring:] + reflectors / _REFLECTOR**2],
+            [h[ring:, :ring] @ modes, h[ring:, ring:] + reflectors / problem.reach**2],
         ]
     )
-    strayed = (problem.scene.parameters - unknowns.scene).ravel() / _REFLECTOR**2
+    strayed = (problem.scene.parameters - unknowns.scene).ravel() / problem.reach**2
     shared_g = jnp.concatenate([modes.T @ g[:ring] - unknowns.modes, g[ring:] + strayed])
-    if own is None:
-        none = jnp.zeros((0, 3, 3), h.dtype)
-        return _System(shared, shared_g, jnp.zeros((0, 3, shared.shape[0]), h.dtype), none, none[:, 0], none)
-    cross, pose, pose_g = own
-    cross = jnp.concatenate([cross[..., :ring] @ modes, cross[..., ring:]], axis=-1)
-    return _with_priors(problem, unknowns, _System(shared, shared_g, cross, pose, pose_g, jnp.zeros_like(pose)))
+    cross = jnp.concatenate([arrow.cross[..., :ring] @ modes, arrow.cross[..., ring:]], axis=-1)
+    return arrow._replace(shared=shared, shared_g=shared_g, cross=cross)
 
 
-def _with_priors(problem: Problem, unknowns: Unknowns, system: _System) -> _System:
+def _with_links(problem: Problem, unknowns: Unknowns, arrow: Arrow) -> Arrow:
     """The normal equations with the anchors of the poses and the odometry between them."""
     start = problem.anchored * _pose_difference(problem.poses, unknowns.poses)
-    pose = system.pose + jax.vmap(jnp.diag)(problem.anchored)
-    pose_g, following = system.pose_g + start, system.next
-    if len(problem.poses) > 1:
-        here, there = unknowns.poses[:-1], unknowns.poses[1:]
-        odometry, weight = problem.odometry[:-1], problem.linked[:-1]
-        slip = jax.vmap(_slip)(here, there, odometry)
-        by_here, by_there = jax.vmap(jax.jacfwd(_slip, argnums=(0, 1)))(here, there, odometry)
-        heavy_here, heavy_there = weight[:, :, None] * by_here, weight[:, :, None] * by_there
-        pose = pose.at[:-1].add(_t(by_here) @ heavy_here).at[1:].add(_t(by_there) @ heavy_there)
-        pull = -slip[:, :, None]
-        pose_g = pose_g.at[:-1].add((_t(heavy_here) @ pull)[..., 0]).at[1:].add((_t(heavy_there) @ pull)[..., 0])
-        following = following.at[:-1].set(_t(by_here) @ heavy_there)
-    return system._replace(pose=pose, pose_g=pose_g, next=following)
+    pose = arrow.pose + jax.vmap(jnp.diag)(problem.anchored)
+    pose_g = arrow.pose_g + start
+    if len(problem.poses) < 2:
+        return arrow._replace(pose=pose, pose_g=pose_g)
+    scale = _odometry_scale(problem, unknowns)
+    steps = (unknowns.poses[:-1], unknowns.poses[1:], problem.odometry[:-1])
+    weight = problem.linked[:-1]
+    slip = jax.vmap(_slip, in_axes=(0, 0, 0, None))(*steps, scale)
+    by_here, by_there, by_scale = jax.vmap(
+        jax.jacfwd(_slip, argnums=(0, 1, 3)), in_axes=(0, 0, 0, None)
+    )(*steps, scale)  # fmt: skip
+    heavy_here, heavy_there = weight[:, :, None] * by_here, weight[:, :, None] * by_there
+    pose = pose.at[:-1].add(_t(by_here) @ heavy_here).at[1:].add(_t(by_there) @ heavy_there)
+    pull = -slip[:, :, None]
+    pose_g = pose_g.at[:-1].add((_t(heavy_here) @ pull)[..., 0]).at[1:].add((_t(heavy_there) @ pull)[..., 0])
+    following = arrow.next.at[:-1].set(_t(by_here) @ heavy_there)
+    arrow = arrow._replace(pose=pose, pose_g=pose_g, next=following)
+    if not _has_scale(problem):
+        return arrow
+    ring = problem.modes.shape[0]
+    own = slice(ring - 2, ring)
+    heavy = weight[:, :, None] * by_scale
+    return arrow._replace(
+        shared=arrow.shared.at[own, own].add((_t(by_scale) @ heavy).sum(axis=0)),
+        shared_g=arrow.shared_g.at[own].add((_t(heavy) @ pull)[..., 0].sum(axis=0)),
+        cross=arrow.cross.at[:-1, :, own].add(_t(heavy_here) @ by_scale).at[1:, :, own].add(_t(heavy_there) @ by_scale),
+    )
 
 
-def _reduced(system: _System, damping: Float[Array, ""], poses_free: bool):
-    """The equations of ring and scene alone, and what it takes to come back to the poses."""
-    shared = _damped(system.shared, damping)
-    side = system.shared_g
-    if not poses_free:
-        return shared, (side, None)
-
-    def eliminate(carry, one):
-        shared, side, last, last_right, link = carry
-        cross, pose, pose_g, following = one
-        # What the pose before leaves of this one: link is H(before, this), last the inverse of the block before.
-        into = link.T @ last
-        pose = _damped(pose, damping) - into @ link
-        right = jnp.concatenate([cross, pose_g[:, None]], axis=1) - into @ last_right
-        inverse = jnp.linalg.inv(pose)
-        folded = right.T @ inverse @ right
-        shared, side = shared - folded[:-1, :-1], side - folded[:-1, -1]
-        return (shared, side, inverse, right, following), (inverse, right)
-
-    size = shared.shape[0]
-    nothing = jnp.zeros((3, 3), shared.dtype)
-    start = (shared, side, nothing, jnp.zeros((3, size + 1), shared.dtype), nothing)
-    columns = (system.cross, system.pose, system.pose_g, system.next)
-    (shared, side, *_), back = jax.lax.scan(eliminate, start, columns)
-    return shared, (side, back)
-
-
-def _shift(problem: Problem, system: _System, damping: Float[Array, ""], poses_free: bool) -> Unknowns:
+def _shift(problem: Problem, arrow: Arrow, damping: Float[Array, ""]) -> Unknowns:
     """The step of all unknowns."""
-    reduced, (side, back) = _reduced(system, damping, poses_free)
-    shared = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(reduced), side)
+    shared, poses = solved(arrow, damping)
     modes = problem.modes.shape[1]
-    poses = jnp.zeros_like(problem.poses)
-    if back is not None:
-
-        def substitute(later, one):
-            inverse, right, following = one
-            here = inverse @ (right[:, -1] - right[:, :-1] @ shared - following @ later)
-            return here, here
-
-        _, poses = jax.lax.scan(substitute, jnp.zeros(3, shared.dtype), (*back, system.next), reverse=True)
-    return Unknowns(shared[:modes], poses, shared[modes:].reshape(-1, 2))
+    held = jnp.zeros_like(problem.poses)
+    return Unknowns(shared[:modes], poses if len(arrow.pose) else held, shared[modes:].reshape(-1, 2))
 
 
 class _Local(NamedTuple):
@@ -334,11 +326,26 @@ def _report(local: _Local, reflectors: tuple[Scene, Scene], kind: Int[Array, ""]
     return expected_report(reach, range_offset=local.offset, range_scale=jnp.exp(local.speed))
 
 
-def _slip(here: Float[Array, "3"], there: Float[Array, "3"], odometry: Float[Array, "3"]) -> Float[Array, "3"]:
+def _has_scale(problem: Problem) -> bool:
+    return problem.modes.shape[0] > 3 * problem.sensors.heading.shape[0] + 1
+
+
+def _odometry_scale(problem: Problem, unknowns: Unknowns) -> Float[Array, "2"]:
+    """Logarithms of how much too long the odometry's ways are, and too far its turns; 0 where they are no unknowns."""
+    if not _has_scale(problem):
+        return jnp.zeros(2, unknowns.poses.dtype)
+    return problem.modes[-2:] @ unknowns.modes
+
+
+def _slip(
+    here: Float[Array, "3"], there: Float[Array, "3"], odometry: Float[Array, "3"], scale: Float[Array, "2"]
+) -> Float[Array, "3"]:
     """How far the next pose is from where the odometry has it, in the frame of this one: metres and radians."""
     way = there[:2] - here[:2]
     ahead = jnp.stack([normal(here[2]) @ way, tangent(here[2]) @ way])
-    return jnp.concatenate([ahead - odometry[:2], wrap_angle(there[2:] - here[2:] - odometry[2:])])
+    told = jnp.exp(-scale)
+    turn = there[2:] - here[2:] - told[1:] * wrap_angle(odometry[2:])
+    return jnp.concatenate([ahead - told[0] * odometry[:2], wrap_angle(turn)])
 
 
 def _pose_difference(a: Float[Array, "scans 3"], b: Float[Array, "scans 3"]) -> Float[Array, "scans 3"]:
@@ -347,10 +354,6 @@ def _pose_difference(a: Float[Array, "scans 3"], b: Float[Array, "scans 3"]) -> 
 
 def _at(scene: Scene, parameters: Float[Array, "reflectors 2"]) -> Scene:
     return eqx.tree_at(lambda s: s.parameters, scene, parameters)
-
-
-def _damped(matrix: Float[Array, "n n"], damping: Float[Array, ""]) -> Float[Array, "n n"]:
-    return matrix + damping * jnp.diag(jnp.diag(matrix))
 
 
 def _t(matrices: Float[Array, "*many m n"]) -> Float[Array, "*many n m"]:

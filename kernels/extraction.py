@@ -185,15 +185,16 @@ def vote(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -> Voted:
         echoes: (scans, echoes) packed echoes.
         settings: accumulator and low pass.
     """
+    # Arcs -> equidistant points -> tangent lines: no sums, so all scans at once.
+    lines = jax.vmap(lambda scan: lines_of_scan(ring, scan, settings))(echoes)
+    gathered = jnp.ones(len(lines.cell)) if echoes.gathered is None else echoes.gathered
 
-    def one_scan(scan: Echoes) -> Voted:
-        lines = lines_of_scan(ring, scan, settings)  # arcs -> equidistant points -> tangent lines
-        votes = hough.accumulate(lines.cell, settings)  # points per cell
+    def one_scan(cell: Int[Array, "arcs points"], level: Float[Array, ""]) -> Bool[Array, "theta rho"]:
+        votes = hough.accumulate(cell, settings)  # points per cell
         smooth = hough.lowpass(votes, settings)  # balance between neighbor cells
-        level = ring.level if scan.gathered is None else ring.level * scan.gathered
-        return Voted(smooth > level, lines.cell, lines.rho)  # highly occupied cells
+        return smooth > level  # highly occupied cells
 
-    return over_scans(one_scan, echoes)
+    return Voted(over_scans(one_scan, lines.cell, ring.level * gathered), lines.cell, lines.rho)
 
 
 @partial(jax.jit, static_argnames="settings")

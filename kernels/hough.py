@@ -146,12 +146,16 @@ def soft_accumulate(
 
 def lowpass(votes: Num[Array, "theta rho"], settings: HoughSettings) -> Float[Array, "theta rho"]:
     """Two-dimensional low pass, to balance between neighbor cells; beyond the last column there are no votes."""
-    taps = np.asarray(settings.smoothing) / np.sum(settings.smoothing)
-    half = len(taps) // 2
-    wide = bordered(jnp.asarray(votes, jnp.float32), half)
-    rows, columns = votes.shape
-    smooth = sum((float(tap) * wide[k : k + rows] for k, tap in enumerate(taps)), start=jnp.zeros(()))
-    return sum((float(tap) * smooth[:, k : k + columns] for k, tap in enumerate(taps)), start=jnp.zeros(()))
+    taps = (np.asarray(settings.smoothing) / np.sum(settings.smoothing)).tolist()
+    half, (rows, columns) = len(taps) // 2, votes.shape
+    smooth = jnp.asarray(votes, jnp.float32)
+    # Along theta, then along rho, each over one array in memory, so that each is one loop.
+    wide = jnp.zeros((rows + 2 * half, columns)).at[half : half + rows].set(smooth)
+    wide = wide.at[:half].set(smooth[rows - half :]).at[half + rows :].set(smooth[:half])
+    smooth = sum((tap * wide[k : k + rows] for k, tap in enumerate(taps)), start=jnp.zeros(()))
+    before = jnp.roll(smooth[:, :half][:, ::-1], rows // 2, axis=0)  # (-rho, theta) is (rho, theta + pi)
+    wide = jnp.zeros((rows, columns + 2 * half)).at[:, half : half + columns].set(smooth).at[:, :half].set(before)
+    return sum((tap * wide[:, k : k + columns] for k, tap in enumerate(taps)), start=jnp.zeros(()))
 
 
 def bordered(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "rows columns"]:
@@ -159,8 +163,6 @@ def bordered(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "rows
 
     One array in memory, so that what reads it with all its neighbors is one loop.
     """
-    if width == 0:
-        return cells
     rows, columns = cells.shape
     before = jnp.roll(cells[:, :width][:, ::-1], rows // 2, axis=0)  # (-rho, theta) is (rho, theta + pi)
     wide = jnp.zeros((rows + 2 * width, columns + 2 * width), cells.dtype)

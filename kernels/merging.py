@@ -44,7 +44,7 @@ def occupied_by_lines(
 def merged_lines(
     rho: Float[Array, "clusters lines"],
     theta: Float[Array, "clusters lines"],
-    labels: Int[Array, "clusters theta rho"],
+    labels: Int[Array, "clusters theta_and_one rho"],
     *,
     settings: HoughSettings,
     size: int,
@@ -54,7 +54,8 @@ def merged_lines(
     Args:
         rho: as ``occupied_by_lines``.
         theta: as ``occupied_by_lines``.
-        labels: component of each cell, as ``clusters.centres_of_gravity`` takes them.
+        labels: component of each cell, as ``clusters.centres_of_gravity`` takes them; then a row for lines that have
+            no cell.
         settings: as ``occupied_by_lines``.
         size: room for this many components a cluster.
 
@@ -65,8 +66,7 @@ def merged_lines(
 
     def one_cluster(one):
         rho, theta, label = one
-        label_of_cell = jnp.append(label.ravel(), jnp.zeros(1, label.dtype))
-        of_line = label_of_cell[cells_of_lines(rho, theta, settings)].astype(jnp.int32)
+        of_line = label.ravel()[cells_of_lines(rho, theta, settings)].astype(jnp.int32)
         rho, n = jnp.where(of_line == 0, 0, rho), normal(jnp.where(of_line == 0, 0, theta))
         count = len(rho)
         points = (rho[:, None], n[:, :1], n[:, 1:], of_line[:, None])

@@ -1,0 +1,147 @@
+"""Submaps into one map: the chain of them, closures where the robot comes back, and where every submap lies.
+
+``SubmapGraph`` is all that a front end needs: ``add`` takes a finished submap, and ``poses`` says where all are.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from .loops_closure import REACH, closure
+from .loops_joining import joined
+from .loops_verified import Closures, Decision, Proposal
+from .posegraph import Graph, Link, solve
+from .poses import composed
+from .submaps import Submap
+
+MOST, LOOKED_AT = 4, 12
+"""Earlier submaps that are compared with a new one, and those among which they are chosen."""
+RECENT = 5
+"""Submaps not older than this take at most half of these places."""
+BEYOND = 3.0
+"""Submaps may overlap if they do within so many standard deviations."""
+
+
+class Added(NamedTuple):
+    """What came of a finished submap."""
+
+    base: Float[np.ndarray, "3"]
+    """world_from_submap of the next submap."""
+    closed: bool
+    """Whether any pose but the newest moved because of closures."""
+    decisions: tuple[Decision, ...]
+    """Made on this occasion."""
+
+
+class SubmapGraph:
+    """Where submaps lie. The first one's frame is the world; the last node is the frame of the submap still to come.
+
+    Args:
+        reach: walls as near as this to the robot are heard, metres.
+        most: earlier submaps that are compared with each new one.
+    """
+
+    def __init__(self, *, reach: float = REACH, most: int = MOST):
+        self.reach, self.most = reach, most
+        self.submaps: list[Submap] = []
+        self.chain: list[Link] = []
+        self.closures = Closures()
+        self.graph = Graph(np.zeros((1, 3)), (), converged=True)
+
+    @property
+    def poses(self) -> Float[np.ndarray, "nodes 3"]:
+        """world_from_submap, of the submap still to come as well."""
+        return self.graph.poses
+
+    def copy(self) -> "SubmapGraph":
+        """One that can be added to, while this one stays as it is."""
+        twin = SubmapGraph(reach=self.reach, most=self.most)
+        twin.submaps, twin.chain, twin.graph = list(self.submaps), list(self.chain), self.graph
+        twin.closures = self.closures.copy()
+        return twin
+
+    @property
+    def last_covariance(self) -> Float[np.ndarray, "3 3"]:
+        """Of the pose of the submap still to come."""
+        return self.graph.covariance(np.array([len(self.graph) - 1]))[0]
+
+    def covariances(self) -> Float[np.ndarray, "nodes 3 3"]:
+        """Of ``poses``."""
+        return self.graph.covariance(np.arange(len(self.graph)))
+
+    def add(self, submap: Submap) -> Added:
+        """Take a finished submap: its chain link, walls shared with the one before, closures with earlier ones."""
+        made = len(self.closures.decisions)
+        newest = len(self.submaps)
+        self.submaps.append(submap)
+        if newest:
+            self.chain[-1] = joined(self.submaps[-2], submap, newest - 1)
+        self.chain.append(chain_link(submap, newest))
+        poses = np.concatenate([self.poses, composed(self.poses[-1], submap.exit)[None]])
+        self.graph = solve(poses, self.chain + self.closures.links)
+        # Each closure that counts makes the prior of the next ones narrower.
+        closed = False
+        for earlier in candidates(self.graph, self.submaps, newest, most=self.most):
+            if self._closed(int(earlier), newest):
+                self.graph = self.closures.settled(self.graph.poses, self.chain, newest)
+                closed = True
+        return Added(self.poses[-1], closed, tuple(self.closures.decisions[made:]))
+
+    def _closed(self, earlier: int, newest: int) -> bool:
+        expected, covariance = self.graph.relative(earlier, np.array([newest]))
+        found = closure(self.submaps[newest], self.submaps[earlier], expected[0], covariance[0], reach=self.reach)
+        if found is None:
+            return False
+        known = self.submaps[earlier]
+        return self.closures.consider(
+            self.graph, Proposal(earlier, newest, found, known.anchor[found.pairs.earlier].mean(axis=0))
+        )
+
+
+def chain_link(submap: Submap, number: int) -> Link:
+    """From a submap to the next one, by the exit alone."""
+    return Link(number, number + 1, submap.exit, np.linalg.inv(submap.covariance[:3, :3]))
+
+
+def candidates(graph: Graph, submaps: Sequence[Submap], newest: int, *, most: int = MOST) -> Int[np.ndarray, " chosen"]:
+    """Earlier submaps that may overlap the newest one, the likeliest first.
+
+    The one just before is not among them: what it shares is in the chain (``joined``).
+
+    Args:
+        graph: where the submaps lie.
+        submaps: all of them.
+        newest: number of the newest.
+        most: so many at most.
+    """
+    if newest < 2:
+        return np.zeros(0, dtype=np.int64)
+    middle, radius = (np.array(part) for part in zip(*(_extent(one) for one in submaps[: newest + 1]), strict=True))
+    heading = graph.poses[: newest + 1, 2]
+    c, s = np.cos(heading), np.sin(heading)
+    x, y = middle.T
+    at = graph.poses[: newest + 1, :2] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    apart = np.linalg.norm(at[:-2] - at[newest], axis=1)
+    room = radius[:-2] + radius[newest]
+    looked_at = np.argsort(apart - room, kind="stable")[:LOOKED_AT]
+    _, covariance = graph.relative(newest, looked_at)
+    sigma = np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1])
+    # A turn of the newest moves what is far.
+    sigma = sigma + np.sqrt(covariance[:, 2, 2]) * (radius[looked_at] + radius[newest])
+    score = apart[looked_at] / np.sqrt(room[looked_at] ** 2 + sigma**2)
+    may = apart[looked_at] - room[looked_at] < BEYOND * sigma
+    order = np.argsort(np.where(may, score, np.inf), kind="stable")[: int(may.sum())]
+    chosen = looked_at[order]
+    recent = newest - chosen <= RECENT
+    kept = ~recent | (np.cumsum(recent) <= max(most // 2, 1))
+    return chosen[kept][:most]
+
+
+def _extent(submap: Submap) -> tuple[Float[np.ndarray, "2"], float]:
+    """Middle of the path, and how far reflectors are from it, metres, roughly."""
+    if not len(submap.poses):
+        return np.zeros(2), 2.0
+    low, high = submap.poses[:, :2].min(axis=0), submap.poses[:, :2].max(axis=0)
+    return (low + high) / 2, float(np.linalg.norm(high - low)) / 2 + 1.0

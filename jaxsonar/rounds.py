@@ -1,0 +1,62 @@
+"""Map, settle, map again: the loop that calibration and smoothing share."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from .maps import GlobalMap
+from .settling import Settled, State
+from .surroundings import surroundings
+
+AGAIN = 0.01
+"""Metres; scale of the first association after the map was made anew."""
+_MAPS = 5  # made anew at most, as long as each explains more echoes
+_GROWN = 1.005  # by so much
+
+
+class Round(NamedTuple):
+    """Maps, one for every world, and what settled around them."""
+
+    worlds: list[GlobalMap]
+    settled: Settled
+
+    @property
+    def used(self) -> int:
+        """Echoes that are explained."""
+        return int(self.settled.used.sum())
+
+
+def alternated(
+    state: State,
+    *,
+    mapped: Callable[[State], list[GlobalMap]],
+    settle: Callable[[State, float], Settled],
+    widest: float,
+    say: Callable[[str], None],
+) -> Round | None:
+    """The map so far; echoes to its reflectors and least squares, closer and closer; the same from there.
+
+    Args:
+        state: where to begin; its reflectors are not looked at.
+        mapped: the maps of a state.
+        settle: lets a state settle, with this scale of the first association (metres).
+        widest: that of the first round.
+        say: told what is being done.
+
+    Returns:
+        The best round, or None where no echo fits the first map.
+    """
+    found = None
+    for _ in range(_MAPS):
+        say("building the map")
+        worlds = mapped(state)
+        say("least squares")
+        around = state._replace(around=surroundings(worlds, tied=False))
+        settled = settle(around, widest if found is None else AGAIN)
+        before = 0 if found is None else found.used
+        if settled.used.sum() <= before:
+            break
+        found = Round(worlds, settled)
+        if found.used <= _GROWN * before:
+            break
+        state = settled.state
+    return found

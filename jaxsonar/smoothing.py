@@ -1,0 +1,315 @@
+"""All poses, walls and corners together, on the raw ranges: the batch back end of SLAM.
+
+From poses that are good to centimetres: map the scans, let poses and reflectors settle (``rounds.py``), look again for
+the scans that had no place, and say how well everything is known.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxsonar import kernels
+from jaxsonar.hardware.errors import SonarError
+
+from .local import LocalModel, check_sigma, local_models
+from .logs import Log
+from .maps import GlobalMap
+from .placing import place_more
+from .poses import composed, relative
+from .ring import Ring
+from .ringmodes import SPEED_SD, RingModes, ring_modes
+from .rounds import AGAIN, Round, alternated
+from .settling import Data, Settled, State, settle
+from .slip import Slip
+from .smoothing_map import settled_map
+from .surroundings import seen_world, surroundings
+from .windows import check_window
+
+SCALE_SD = 0.05
+"""Relative; wheels and track of an odometry that was never calibrated."""
+_TOGETHER = 4  # echoes of one reflector in a scan
+_WIDEST = 0.04  # m; scale of the first association
+_ANCHOR, _LOOSE = 1e-5, (30.0, 30.0, 3.0)  # m, rad; the first pose, and all others: hardly more than the digits ask for
+SPARSE_SIGMA = 0.01
+"""Metres; noise that is taken for granted of sparse rings."""
+_NEAR = (0.05, 0.05, 0.05)  # m, rad; how good the start is, in the first round
+_MARGINS = (4.0, 2.0)  # nats; for scans without a place, surely at first
+_BLUR = 0.2  # of local models, for a ring that is calibrated
+_NOISIER = 1.15  # so much more noise, and scans were laid together that do not belong together
+_ODD = 0.4  # of the share of echoes that is explained elsewhere: a scan with less stands in the wrong place
+_LEAST = 3  # echoes that a pose without odometry rests on
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """Poses, map, and how well they are known. Frame: the first scan that was placed stays where it was."""
+
+    poses: Float[np.ndarray, "scans 3"]
+    """world_from_robot: x, y (metres), theta (radians); NaN for scans that could not be placed."""
+    pose_cov: Float[np.ndarray, "scans 3 3"]
+    """Covariance of (x, y, theta) with respect to the first scan that was placed; NaN as above. Metres and radians;
+    what nothing determines has a standard deviation of many metres."""
+    heard: Int[np.ndarray, " scans"]
+    """Echoes that determined each pose; 0 where odometry alone did."""
+    world: GlobalMap
+    """The reflectors that settled, with their standard deviations."""
+    used: float
+    """Share of the echoes of placed scans that the map explains."""
+    sigma: float
+    """Noise of the ranges, metres."""
+    ring: Ring
+    """The ring, with the speed of sound that was found."""
+    speed_of_sound_sd: float
+    """Metres per second; 0 where it was held."""
+    scale: tuple[float, float]
+    """By which the odometry's ways are too long and its turns too far, relative; 0 where they were held."""
+    scale_sd: tuple[float, float]
+
+    @property
+    def left_out(self) -> Int[np.ndarray, " rows"]:
+        """Rows of the scans that could not be placed."""
+        return np.flatnonzero(np.isnan(self.poses[:, 0]))
+
+
+def smooth(
+    ring: Ring,
+    log: Log,
+    poses: Float[np.ndarray, "scans 3"],
+    *,
+    odometry: Float[np.ndarray, "_ 3"] | None = None,
+    sigma: float | None = None,
+    window: float | None = None,
+    speed: bool = False,
+    scale: bool = False,
+    slip: Slip | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Smoothed:
+    """Adjust all poses, walls and corners to the ranges.
+
+    Args:
+        ring: the sensors, calibrated; held, but for the speed of sound if asked for.
+        log: the echoes. Its poses are not looked at.
+        poses: (scans, 3) world_from_robot to start from, good to centimetres and degrees, loops closed to a decimetre;
+            NaN where it is not known. Those are led on from their neighbors by odometry, where there is some, or laid
+            on the map.
+        odometry: (scans, 3) world_from_robot as measured, drifting; NaN where there is none.
+        sigma: noise of the ranges, metres; if left out it is estimated, but for a window: 1 cm. (Where a scan has
+            hardly more echoes than a pose has freedoms, too little is left over to tell.)
+        window: metres of path gathered into one local model for the map, for sparse rings.
+        speed: whether the speed of sound is estimated.
+        scale: whether the scales of the odometry's ways and turns are.
+        slip: noise of the odometry; as ``Slip()`` if left out.
+        progress: told what is being done.
+
+    Raises:
+        SonarError: shapes that do not fit, no pose, no wall found, a scale without odometry.
+    """
+    given, measured = _checked(log, poses, odometry, sigma, window, scale)
+    say = progress or (lambda text: None)
+    sigma = SPARSE_SIGMA if sigma is None and window is not None else sigma
+    modes = _modes(ring, speed=speed, scale=scale)
+    models = None
+    if window is None:
+        say("local models")
+        models = list(local_models(ring, log, sigma=sigma))
+    job = _Job(ring, log, measured, modes, slip or Slip(), sigma, window, models, int(_placed(given).argmax()), say)
+    # 1. Maps and least squares in turn, from the poses as they came.
+    best = job.settled(_led(given, measured))
+    # 2. The map is better now: scans that had no place may find one.
+    for margin in _MARGINS if models is not None else ():
+        if _placed(best.poses).all():
+            break
+        say("looking again for scans without a place")
+        more = place_more(models or [], best.poses, measured, margin=margin, blur=_BLUR)
+        if _placed(more).sum() > _placed(best.poses).sum():
+            fit = job.settled(more)
+            best = fit if fit.round.used > best.round.used and fit.sigma < _NOISIER * best.sigma else best
+    # 3. How well all of it is known.
+    say("covariances")
+    return job.result(best)
+
+
+class _Fit(NamedTuple):
+    """Poses that settled."""
+
+    data: Data
+    round: Round
+    poses: Float[np.ndarray, "scans 3"]
+    """NaN where a scan has no place."""
+    heard: Int[np.ndarray, " scans"]
+
+    @property
+    def sigma(self) -> float:
+        return self.round.settled.sigma
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What is asked for."""
+
+    ring: Ring
+    log: Log
+    odometry: Float[np.ndarray, "scans 3"]
+    modes: RingModes
+    slip: Slip
+    sigma: float | None
+    window: float | None
+    models: Sequence[LocalModel] | None
+    first: int
+    """Row of the scan that stays where it is."""
+    say: Callable[[str], None]
+
+    def settled(self, poses: Float[np.ndarray, "scans 3"]) -> _Fit:
+        """Poses and reflectors from a start; scans of which hardly an echo fits are taken out, and again."""
+        fit = self._settled(poses)
+        return fit if _placed(fit.poses).sum() == _placed(poses).sum() else self._settled(fit.poses)
+
+    def _settled(self, poses: Float[np.ndarray, "scans 3"]) -> _Fit:
+        log = replace(self.log, pose=poses)
+        data = _free(Data.of(self.ring, [log], [self.odometry], self.slip, silent=True), self.first)
+        data = replace(data, together=_TOGETHER if self.window is None else 1)
+        found = self._alternated(data, log)
+        if found is None:
+            raise SonarError("smooth: no echo fits the walls; is it the right ring, are poses and units right?")
+        rows = data.rows[0]
+        heard, echoes = np.zeros((2, len(log)), dtype=np.int64)
+        heard[rows] = found.settled.used.sum(axis=1)[: len(rows)]
+        echoes[rows] = np.isfinite(data.reported).sum(axis=1)[: len(rows)]
+        odd = self._odd(data, heard, echoes)
+        now = data.placed([log], found.settled.state.poses)[0].pose
+        return _Fit(data, found, np.where(odd[:, None], np.nan, now), np.where(odd, 0, heard))
+
+    def _odd(
+        self, data: Data, heard: Int[np.ndarray, " scans"], echoes: Int[np.ndarray, " scans"]
+    ) -> Bool[np.ndarray, " scans"]:
+        """Scans that nothing holds where they are: too few echoes fit, and no odometry leads to them."""
+        rows = data.rows[0]
+        linked = np.zeros(len(heard), dtype=bool)
+        tied = (data.linked[: len(rows), 0] > 0)[:-1] if len(rows) else np.zeros(0, dtype=bool)
+        linked[rows[:-1]] |= tied
+        linked[rows[1:]] |= tied
+        usual = heard.sum() / max(echoes.sum(), 1)
+        odd = np.zeros(len(heard), dtype=bool)
+        odd[rows] = (heard[rows] < np.maximum(_LEAST, _ODD * usual * echoes[rows])) & ~linked[rows]
+        odd[self.first] = False
+        return odd
+
+    def _mapped(self, data: Data, log: Log, state: State) -> GlobalMap:
+        ring = self._heard_with(state)
+        world = seen_world(ring, data.placed([log], state.poses)[0], window=self.window, models=self.models)
+        if not len(world):
+            raise SonarError("smooth: no wall found; allowed are scans of a place with straight walls in reach")
+        return world
+
+    def _alternated(self, data: Data, log: Log) -> Round | None:
+        """Map and least squares in turn; at first the poses stay near where they began, until the map has shape."""
+        near = replace(data, anchored=np.maximum(data.anchored, 1 / np.square(_NEAR)))
+        state = State(np.zeros(self.modes.columns.shape[1]), data.poses, surroundings([], tied=False))
+        self.say("first map")
+        around = surroundings([self._mapped(data, log, state)], tied=False)
+        return alternated(
+            self._settle(near, state._replace(around=around), _WIDEST).state,
+            mapped=lambda state: [self._mapped(data, log, state)],
+            settle=lambda state, widest: self._settle(data, state, widest),
+            widest=AGAIN,
+            say=self.say,
+        )
+
+    def _settle(self, data: Data, state: State, widest: float) -> Settled:
+        """In double precision."""
+        with jax.enable_x64(True):
+            return settle(self.ring, data, self.modes, state, widest=widest, poses_free=True, sigma=self.sigma)
+
+    def _heard_with(self, state: State) -> Ring:
+        """The ring with the speed of sound so far."""
+        faster = float(np.exp((self.modes.columns @ state.coordinates)[self.ring.count]))
+        return replace(self.ring, speed_of_sound=float(self.ring.speed_of_sound) * faster)
+
+    def result(self, fit: _Fit) -> Smoothed:
+        """With covariances."""
+        found, rows = fit.round.settled, fit.data.rows[0]
+        with jax.enable_x64(True):
+            cov = np.asarray(kernels.pose_covariances(found.problem, found.adjusted.unknowns))
+        pose_cov = np.full((len(self.log), 3, 3), np.nan)
+        pose_cov[rows] = cov[: len(rows)]
+        pose_cov[np.isnan(fit.poses[:, 0])] = np.nan
+        shared, columns = np.asarray(found.adjusted.covariance), self.modes.columns
+        size = columns.shape[1]
+        change, known = columns @ found.state.coordinates, columns @ shared[:size, :size] @ columns.T
+        sd, count = np.sqrt(np.maximum(np.diag(known), 0)), self.ring.count
+        scaled = len(change) > 3 * count + 1
+        ring = self._heard_with(found.state)
+        return Smoothed(
+            poses=fit.poses,
+            pose_cov=pose_cov,
+            heard=fit.heard,
+            world=settled_map(fit.round.worlds[0], found),
+            used=float(found.used.sum() / max(fit.data.echoes, 1)),
+            sigma=found.sigma,
+            ring=ring,
+            speed_of_sound_sd=float(sd[count] * ring.speed_of_sound),
+            scale=(float(np.expm1(change[-2])), float(np.expm1(change[-1]))) if scaled else (0.0, 0.0),
+            scale_sd=(float(sd[-2]), float(sd[-1])) if scaled else (0.0, 0.0),
+        )
+
+
+def _modes(ring: Ring, *, speed: bool, scale: bool) -> RingModes:
+    """The speed of sound, if it is free, and the scales of the odometry."""
+    modes = ring_modes(ring, ("speed",) if speed else (), poses_free=True, speed_sd=SPEED_SD)
+    if not scale:
+        return modes
+    columns = np.zeros((len(modes.columns) + 2, modes.columns.shape[1] + 2))
+    columns[:-2, :-2] = modes.columns
+    columns[-2:, -2:] = SCALE_SD * np.eye(2)
+    return RingModes(columns, (*modes.names, "way", "turn"))
+
+
+def _free(data: Data, first: int) -> Data:
+    """With all poses free but that of one scan, and reflectors that may go as far."""
+    anchored = np.tile(1 / np.square(_LOOSE), (len(data.poses), 1))
+    anchored[int(np.searchsorted(data.rows[0], first))] = 1 / _ANCHOR**2
+    return replace(data, anchored=anchored, reach=_LOOSE[0])
+
+
+def _led(poses: Float[np.ndarray, "scans 3"], odometry: Float[np.ndarray, "scans 3"]) -> Float[np.ndarray, "scans 3"]:
+    """Poses that are missing, from the nearest scan that has one, by odometry."""
+    out, known = poses.copy(), np.flatnonzero(_placed(poses) & _placed(odometry))
+    if not len(known):
+        return out
+    for row in np.flatnonzero(~_placed(poses) & _placed(odometry)):
+        near = known[np.argmin(np.abs(known - row))]
+        out[row] = composed(poses[near], relative(odometry[near], odometry[row]))
+    return out
+
+
+def _placed(poses: Float[np.ndarray, "scans 3"]) -> Bool[np.ndarray, " scans"]:
+    return np.isfinite(poses[:, 0])
+
+
+def _checked(
+    log: Log,
+    poses: Float[np.ndarray, "_ 3"],
+    odometry: Float[np.ndarray, "_ 3"] | None,
+    sigma: float | None,
+    window: float | None,
+    scale: bool,
+) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3"]]:
+    """Start and odometry, double precision, rows that are not finite NaN; or a SonarError."""
+    check_sigma(sigma)
+    check_window(window)
+    out = []
+    for name, given in {"poses": poses, "odometry": odometry}.items():
+        values = np.full((len(log), 3), np.nan) if given is None else np.array(given, dtype=np.float64)
+        if values.shape != (len(log), 3):
+            raise SonarError(f"smooth: {name} of shape {values.shape}; allowed is ({len(log)}, 3): x, y, theta a scan")
+        values[~np.isfinite(values).all(axis=1)] = np.nan
+        out.append(values)
+    if not _placed(out[0]).any():
+        raise SonarError(f"smooth: none of the {len(log)} scans has a pose; allowed is one or more to start from")
+    if scale and not _placed(out[1]).any():
+        raise SonarError("smooth: a scale to be estimated, and no odometry; allowed is odometry, or no scale")
+    return out[0], out[1]
