@@ -71,7 +71,7 @@ def slam(options: argparse.Namespace) -> None:
             truth=None if truth is None else _laid_on(trajectory, truth),
             closures=_rows(counted, found),
             withdrawn=_rows(withdrawn, found),
-            title=f"{_count(len(trajectory), 'pose')} and {_count(len(found.world), 'wall')} from {_plain(options.log)}",
+            title=f"{_count(len(trajectory), 'pose')}, {_count(len(found.world), 'wall')} from {_plain(options.log)}",
         )
     save_map(found.world, options.output)
     if options.trajectory:
@@ -240,7 +240,7 @@ def slip_of(given: tuple[float, float] | None) -> "Slip":
 def _errors(
     errors: "Callable[..., TrajectoryErrors]", estimate: "Trajectory", truth: "Trajectory", found: "Slam", name: str
 ) -> "dict[str, TrajectoryErrors | None]":
-    """Against the truth, of the estimate and of odometry; with the best alignment, as evo has it, without covariance."""
+    """Against the truth: the estimate as it is, best aligned (as evo has it), and odometry."""
     import numpy as np
 
     from jaxsonar.hardware.errors import SonarError

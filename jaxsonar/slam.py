@@ -6,7 +6,7 @@ the log is finished --smoothing.py--> all poses and reflectors on the raw ranges
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from .mapping import build_map
 from .maps import GlobalMap
 from .motion import placed
 from .placing import place_parts
-from .poses import composed
+from .poses import composed, relative, wrap_angle
 from .ring import Ring
 from .slip import Slip
 from .smoothing import Smoothed
@@ -35,6 +35,8 @@ from .tracking import LOST, Track, advance, begin, finished, update
 from .trajectory import Trajectory, stamps_of
 from .windows import check_window
 
+REACH = 0.85
+"""Of the ring's maximum range; nearer than that walls are surely heard."""
 SPARSE = 4.0
 """Echoes that a long wall sends back to a ring; with fewer, scans are gathered over windows."""
 WINDOW = 1.5
@@ -80,7 +82,7 @@ class Tracker:
     settings: kernels.HoughSettings | None = None
     sigma: float | None = None
     """Standard deviation of the ranges, metres; None: learned on the way."""
-    slip: Slip = Slip()
+    slip: Slip = field(default_factory=Slip)
     """How wrong the odometry is."""
 
     def __post_init__(self):
@@ -90,7 +92,7 @@ class Tracker:
 
     def start(self) -> TrackerState:
         """A state that knows nothing."""
-        return TrackerState(begin(), SubmapGraph(), np.zeros(3), 0)
+        return TrackerState(begin(), SubmapGraph(reach=REACH * float(self.ring.max_range)), np.zeros(3), 0)
 
     def step(
         self,
@@ -197,7 +199,8 @@ class Slam:
     def trajectory(self) -> Trajectory:
         """Of the scans that have a pose."""
         known = np.isfinite(self.poses).all(axis=1)
-        return Trajectory(self.stamp[known], self.poses[known], self.covariance[known])
+        covariance = self.covariance[known]
+        return Trajectory(self.stamp[known], self.poses[known], covariance if np.isfinite(covariance).all() else None)
 
     @property
     def left_out(self) -> np.ndarray:
@@ -306,12 +309,12 @@ def _tracked(
 def ties_of(graph: SubmapGraph) -> tuple[Tie, ...]:
     """The closures of a graph, by the scans that they tie."""
     first = [int(one.rows[0]) for one in graph.submaps]
-    return tuple(
-        Tie(
-            first[one.earlier],
-            first[one.newest],
-            one.closure.relative,
-            "counted" if one.state == ACCEPTED else one.state,
-        )
-        for one in graph.closures.proposals
-    )
+    ties = []
+    for one in graph.closures.proposals:
+        now, basis = relative(graph.poses[one.earlier], graph.poses[one.newest]), one.closure.basis
+        off = one.closure.relative - now
+        off[2] = wrap_angle(float(off[2]))
+        pose = now + basis @ (basis.T @ off)  # what the walls leave open is as the graph has it
+        state = "counted" if one.state == ACCEPTED else one.state
+        ties.append(Tie(first[one.earlier], first[one.newest], pose, state))
+    return tuple(ties)

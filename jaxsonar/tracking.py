@@ -35,7 +35,7 @@ ELSEWHERE = (0.5, 0.5)
 GATE, DOUBT = 4.0, 5.0
 """Sigma; how far an echo may be off its reflector, and how near to its range another one's makes it doubtful."""
 SURE = 2.0
-"""Sigma; how well a range must be known from what the scan's own features say, to take in an echo that none of them has."""
+"""Sigma; how well a range must be known from the scan's own features, to take in an echo that none of them has."""
 _NEW = np.array([0.5, 0.3])  # m, rad; a reflector before its first echoes are taken in
 _ROOM, _ECHOES = 16, 32  # reflectors and echoes; powers of two from there on are compiled
 _SIGMA, _CREDIT = 0.003, 30.0  # m; noise before any is known, and the echoes that this is worth
@@ -149,14 +149,14 @@ def update(
     with jax.enable_x64(True):
         # Where the robot is by what it knows again; then, with that, what is new and what else was heard.
         first = match(track.known, seen, full=full)
-        claimed = echoes.claimed(seen, first.reflector, noise)
-        found = echoes.tracked(track.known, claimed, noise)
+        feature = echoes.claimed(seen, noise)
+        found = echoes.tracked(track.known, _of(first.reflector, feature), noise)
         matches = match(echoes.known(track.known, found), seen, full=full)
         fresh = np.flatnonzero(matches.fresh & grow)
         known = _with_new(track.known, seen.take(fresh), np.asarray(found.belief.pose))
         reflector = matches.reflector.copy()
         reflector[fresh] = len(track.known) + np.arange(len(fresh))
-        every = echoes.explained(found, echoes.claimed(seen, reflector, noise), noise)
+        every = echoes.explained(found, _of(reflector, feature), noise)
         found = echoes.tracked(known, every, noise)
     known = echoes.known(known, found)
     used = np.asarray(found.used)[: len(echoes)] > 0
@@ -227,17 +227,17 @@ class _Echoes:
         row, reach = row[heard], reach[heard]
         room = power_of_two(len(row), least=_ECHOES)
         paths = _geometry(ring)
-        own = jax.tree.map(lambda leaf: leaf[np.pad(row, (0, room - len(row)))], paths)
+        padded = _pad(row, room)
+        own = jax.tree.map(lambda leaf: leaf[padded], paths)
         if path_pose is not None:
-            own = _moved(own, np.pad(path_pose[row], [(0, room - len(row)), (0, 0)]))
-        return cls(own, np.pad(reach, (0, room - len(row))), len(row))
+            own = _moved(own, _pad(path_pose[row], room))
+        return cls(own, _pad(reach, room), len(row))
 
-    def claimed(self, seen: Features, reflector: Int[np.ndarray, " features"], noise: float) -> np.ndarray:
-        """Reflector of the echoes that the scan's own features explain; -1 for all others."""
+    def claimed(self, seen: Features, noise: float) -> Int[np.ndarray, " echoes"]:
+        """Feature of the echoes that the scan's own features explain; -1 for all others."""
         count = len(seen.kind)
-        own = np.full(self.count, -1)
         if not count or not self.count:
-            return own
+            return np.full(self.count, -1)
         room = power_of_two(count, least=_ROOM)
         wall = (seen.kind == kernels.PLANE)[:, None]
         half = np.linalg.norm(seen.segment[:, 1] - seen.segment[:, 0], axis=-1) / 2
@@ -254,7 +254,7 @@ class _Echoes:
         off = np.abs(expected - self.ranges[: self.count])
         best = off.argmin(axis=0)
         near = off.min(axis=0) < GATE * noise
-        return np.where(near, reflector[best], -1)
+        return np.where(near, best, -1)
 
     def tracked(self, known: Known, row: np.ndarray, noise: float) -> kernels.Tracked:
         """The belief after echoes of these reflectors."""
@@ -357,5 +357,13 @@ def _seen_farther(known: Known, seen: Features, reflector: Int[np.ndarray, " fea
     return replace(known, ends=ends, scans=known.scans + explains)
 
 
+def _of(reflector: Int[np.ndarray, " features"], feature: Int[np.ndarray, " echoes"]) -> Int[np.ndarray, " echoes"]:
+    """Reflector of each echo by the feature that claims it; -1 for none."""
+    return np.append(reflector, -1)[feature]
+
+
 def _pad(array: np.ndarray, room: int, filler: float | int = 0) -> np.ndarray:
-    return np.pad(array, [(0, room - len(array))] + [(0, 0)] * (array.ndim - 1), constant_values=filler)
+    """With rows up to ``room``; np.pad takes ten times as long."""
+    out = np.full((room, *array.shape[1:]), filler, dtype=array.dtype)
+    out[: len(array)] = array
+    return out
