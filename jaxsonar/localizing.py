@@ -24,8 +24,8 @@ from .motion import moved, step_variance
 from .placing import place_parts
 from .placing_evidence import explained
 from .placing_hypotheses import hypotheses
-from .placing_map import Places, seen_of
-from .poses import composed, relative, unit, wrap_angle
+from .placing_map import Places, Seen, seen_of, turned
+from .poses import relative, unit, wrap_angle
 from .ring import Ring
 from .slip import Slip
 from .tracking import Track, update
@@ -37,18 +37,28 @@ TRIED = 12
 """Scans by which the first pose is found."""
 STARTS = 4
 """Scans whose hypotheses are looked at."""
-KEPT = 48
+KEPT = 24
 """Hypotheses that are followed."""
-MARGIN = 12.0
-"""Nats by which the best one must beat all others together; echoes of one wall are not independent."""
-LEAST = 0.3
+BEHIND = 60.0, 0.25
+"""Nats, and share of those of the best one, by which a hypothesis may be behind it to be followed further."""
+MARGIN = 20.0, 0.05
+"""Nats, and share of its own, by which the best one must beat all others together; echoes of one wall are not
+independent."""
+LEAST = 0.5
 """Share of the echoes that the map must explain at the best one."""
 SAME = (0.25, float(np.radians(8.0)))
-"""Metres and radians; hypotheses that are nearer are one."""
+"""Metres and radians; hypotheses that are nearer are one, if they cannot be told apart."""
+SURE = (0.03, float(np.radians(2.0)))
+"""Largest standard deviation of a pose that was found from nothing, metres and radians."""
 _MAP = (0.002, float(np.radians(0.1)))  # m, rad; of walls whose map does not say how good they are
+_FINE = (1e-4, float(np.radians(0.005)))  # m, rad; no map is better
 _BLUR = 0.5  # of local models, against the covariance of their walls
 _FOUND = (0.05, float(np.radians(3.0)))  # m, rad; of a hypothesis before its ranges are looked at
-_SECOND = 6.0  # nats; a place that so nearly is as good is told of
+_TOGETHER = 6  # scans whose walls and corners choose among the hypotheses
+_CLOSER = 4  # steps of Gauss and Newton before that
+_NEAR = 3.5  # standard deviations of a rough pose within which hypotheses are looked for
+_BESIDE = 0.3  # m; a wall is heard only where it was seen
+_MOST = 32  # reflectors that are looked at from a pose
 
 
 class Place(NamedTuple):
@@ -127,22 +137,27 @@ def localize(
             "localize: no scan could be laid on another; allowed are scans with odometry, or near each other"
         )
     # 1. Where the first scan may be.
-    sd = np.array([ROUGH[0], ROUGH[0], ROUGH[1]]) if start is not None else np.array([_FOUND[0], _FOUND[0], _FOUND[1]])
-    begins = [np.array(start, dtype=np.float64)] if start is not None else path.begins(world)
-    # 2. Each is followed through the first scans.
-    tried = path.rows[:TRIED]
-    followed = []
-    for number, begin in enumerate(begins):
-        followed.append(path.followed(begin, sd, tried))
-        say("hypotheses", number + 1, len(begins))
-    places = _different([run.place for run in followed])
+    found = np.array([_FOUND[0], _FOUND[0], _FOUND[1]])
+    if start is None:
+        begins = [_Run(pose, np.diag(found**2)) for pose in path.begins()]
+    else:
+        rough, near = np.array(start, dtype=np.float64), np.array([ROUGH[0], ROUGH[0], ROUGH[1]])
+        begins = [_Run(rough, np.diag(near**2))]
+        begins += [_Run(pose, np.diag(found**2)) for pose in path.begins(rough)]
+    # 2. Each is followed through the first scans, as long as it is not far behind the best one.
+    runs = path.followed(begins, say)
+    places = tuple(run.place for run in runs)
     certain, why = _judged(places, len(path.rows))
+    if certain and start is None and not runs[0].sure:
+        certain, why = False, f"{len(path.rows)} scans: what they see leaves a direction open; a longer path may tell"
     poses, cov = np.full((len(log), 3), np.nan), np.full((len(log), 3, 3), np.nan)
     # 3. The only one, through all scans.
     if certain:
-        best = max(followed, key=lambda run: run.place.nats)
-        run = path.followed(best.begin, sd, path.rows)
-        poses[path.rows], cov[path.rows] = run.poses, run.covs
+        run = runs[0]
+        for number in range(len(run.poses), len(path.rows)):
+            run = path.after(run, number)
+            say("localizing", number + 1, len(path.rows))
+        poses[path.rows], cov[path.rows] = np.array(run.poses), np.array(run.covs)
     return Localized(poses, cov, stamps_of(log), places, certain, why)
 
 
@@ -159,19 +174,6 @@ def _odometry(log: Log, models: Sequence[LocalModel]) -> Float[np.ndarray, "scan
     return alone
 
 
-def _different(places: Sequence[Place]) -> tuple[Place, ...]:
-    """The best of those that are at the same place, the likeliest first."""
-    kept: list[Place] = []
-    for place in sorted(places, key=lambda one: -one.nats):
-        near = [
-            np.hypot(*(place.pose - one.pose)[:2]) < SAME[0] and abs(wrap_angle(place.pose[2] - one.pose[2])) < SAME[1]
-            for one in kept
-        ]
-        if not any(near):
-            kept.append(place)
-    return tuple(kept)
-
-
 def _judged(places: Sequence[Place], scans: int) -> tuple[bool, str]:
     """Whether there is one place only, and what there is to say."""
     of = f"{scans} scan{'' if scans == 1 else 's'}"
@@ -180,10 +182,13 @@ def _judged(places: Sequence[Place], scans: int) -> tuple[bool, str]:
         return False, f"{of}: no place in the map fits{share}; needed are {100 * LEAST:.0f} %"
     best, others = places[0], [place.nats for place in places[1:]]
     margin = best.nats - float(logsumexp(others)) if others else np.inf
-    if margin < MARGIN:
-        alike = [place for place in places if place.nats > best.nats - MARGIN - _SECOND][:4]
-        said = "; ".join(f"{p.pose[0]:.2f}, {p.pose[1]:.2f} m, {np.degrees(p.pose[2]):.0f} deg" for p in alike)
-        return False, f"{of}: ambiguous, {len(alike)} places look alike: {said}; a longer path may tell"
+    needed = MARGIN[0] + MARGIN[1] * max(best.nats, 0.0)
+    if margin < needed:
+        alike = [place for place in places if place.nats > best.nats - needed]
+        alike = alike if len(alike) > 1 else list(places[:2])
+        shown = "; ".join(f"{p.pose[0]:.2f}, {p.pose[1]:.2f} m, {np.degrees(p.pose[2]):.0f} deg" for p in alike[:4])
+        more = f"; {len(alike) - 4} more" if len(alike) > 4 else ""
+        return False, f"{of}: ambiguous, {len(alike)} places look alike: {shown}{more}; a longer path may tell"
     by = "no other place fits" if not others else f"{margin:.0f} nats better than any other place"
     x, y, theta = best.pose
     return True, (
@@ -208,10 +213,12 @@ class _Map(NamedTuple):
         # The distance at the middle is better known than that of the line from the far origin of the world.
         lever = (middle * unit(world.theta + np.pi / 2)).sum(axis=-1)
         turn = np.where(np.isfinite(world.sigma_theta), world.sigma_theta, _MAP[1])
-        across = np.where(np.isfinite(world.sigma_rho), world.sigma_rho**2 - (lever * turn) ** 2, 0.0)
+        across = np.where(np.isfinite(world.sigma_rho), world.sigma_rho**2 - (lever * turn) ** 2, _MAP[0] ** 2)
+        # Echoes spread over its length tell both: were the rest smaller than this, it would be rounding.
+        across = np.maximum(across, (half * turn) ** 2 / 12)
         wall_cov = np.zeros((len(world), 2, 2))
-        wall_cov[:, 0, 0] = np.maximum(across, _MAP[0] ** 2)
-        wall_cov[:, 1, 1] = turn**2
+        wall_cov[:, 0, 0] = np.maximum(across, _FINE[0] ** 2)
+        wall_cov[:, 1, 1] = np.maximum(turn, _FINE[1]) ** 2
         point_cov = np.where(np.isfinite(world.point_cov), world.point_cov, np.eye(2) * _MAP[0] ** 2)
         kinds = [kernels.CORNER if kind == "corner" else kernels.EDGE for kind in world.point_kinds]
         none = np.zeros(len(kinds))
@@ -231,8 +238,9 @@ class _Map(NamedTuple):
         across = (offset * unit(self.theta)).sum(axis=-1)
         beyond = np.maximum(np.abs(along) - self.half, 0.0)
         near = np.where(wall, np.hypot(across, beyond), np.linalg.norm(offset, axis=-1))
-        rows = np.flatnonzero(near < reach + 3 * np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
-        rows = rows[np.argsort(near[rows], kind="stable")][:48]
+        room = 3 * np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+        rows = np.flatnonzero((near < reach + room) & (~wall | (beyond < _BESIDE + room)))
+        rows = rows[np.argsort(near[rows], kind="stable")][:_MOST]
         behind = (across < 0) & wall
         theta = np.where(wall, wrap_angle(self.theta + np.pi * behind), 0.0)[rows]
         size = 3 + 2 * len(rows)
@@ -251,13 +259,40 @@ class _Map(NamedTuple):
         )
 
 
-class _Followed(NamedTuple):
-    """A hypothesis through some scans."""
+class _Run(NamedTuple):
+    """A hypothesis, followed so far."""
 
-    begin: Float[np.ndarray, "3"]
-    place: Place
-    poses: Float[np.ndarray, "scans 3"]
-    covs: Float[np.ndarray, "scans 3 3"]
+    pose: Float[np.ndarray, "3"]
+    """Of the latest scan, or of the first one before that is looked at."""
+    cov: Float[np.ndarray, "3 3"]
+    poses: tuple[Float[np.ndarray, "3"], ...] = ()
+    covs: tuple[Float[np.ndarray, "3 3"], ...] = ()
+    nats: float = 0.0
+    heard: int = 0
+    fits: int = 0
+    """Echoes, and those that the map explains."""
+
+    @property
+    def place(self) -> Place:
+        """What it says of the first scan."""
+        return Place(self.poses[0], self.nats, self.fits / max(self.heard, 1))
+
+    @property
+    def sure(self) -> bool:
+        """Whether the scans, and not what was assumed, say where the robot is at last."""
+        place = np.linalg.eigvalsh(self.cov[:2, :2])[-1]
+        return bool(place < SURE[0] ** 2 and self.cov[2, 2] < SURE[1] ** 2)
+
+    def same(self, other: "_Run") -> bool:
+        """Whether two cannot be told apart."""
+        off = self.pose - other.pose
+        off[2] = wrap_angle(off[2])
+        if np.hypot(off[0], off[1]) > SAME[0] or abs(off[2]) > SAME[1]:
+            return False
+        return bool(off @ np.linalg.solve(self.cov + other.cov + np.diag(_ONE) ** 2, off) < 16.0)
+
+
+_ONE = np.array([0.02, 0.02, np.radians(1.0)])  # m, rad; nearer than this nothing is looked at twice
 
 
 @dataclass(frozen=True)
@@ -283,31 +318,42 @@ class _Path:
         known = [model.sigma for model in self.models if model.sigma > 0]
         return self.sigma or (float(np.median(known)) if known else 0.003)
 
-    def begins(self, world: GlobalMap) -> list[Float[np.ndarray, "3"]]:
-        """Poses of the first scan at which walls or corners of one of the first scans lie on some of the map."""
-        places, rows = _places(self.map), self.rows
+    def begins(self, rough: Float[np.ndarray, "3"] | None = None) -> list[Float[np.ndarray, "3"]]:
+        """Poses of the first scan at which walls or corners of the first scans lie on those of the map.
+
+        Args:
+            rough: where the first scan was taken, about; anywhere if left out.
+        """
+        places, rows = _places(self.map), self.rows[:TRIED]
         first = self.odometry[rows[0]]
-        poses, score = [], []
-        richest = sorted(rows[:TRIED], key=lambda row: -len(features_of(self.models[row]).kind))[:STARTS]
-        for row in richest:
-            seen = seen_of(self.models[row], blur=_BLUR)
+        richest = sorted(rows, key=lambda row: -len(features_of(self.models[row]).kind))
+        views = {row: seen_of(self.models[row], blur=_BLUR) for row in richest[:_TOGETHER]}
+        steps = {row: relative(first, self.odometry[row]) for row in views}
+        some = []
+        for row in richest[:STARTS]:
+            seen, back = views[row], relative(self.odometry[row], first)
             if len(seen.theta) + len(seen.point) < 2:
                 continue
             # Two features fix a pose; what one wall alone allows is a whole line of them.
             found = hypotheses(seen, places, np.zeros(3))[1 + len(seen.theta) * len(places.theta) :]
+            if rough is not None:
+                away = _followed_by(found, back) - rough
+                near = np.hypot(away[:, 0], away[:, 1]) < _NEAR * ROUGH[0]
+                found = found[near & (np.abs(wrap_angle(away[:, 2])) < _NEAR * ROUGH[1])]
             if not len(found):
                 continue
             found = _thinned(found)
-            evidence = np.concatenate(
-                [explained(places, seen, part).evidence for part in np.array_split(found, -(-len(found) // 4096))]
-            )
-            best = np.argsort(-evidence, kind="stable")[: 4 * KEPT]
-            back = relative(self.odometry[row], first)
-            poses += [composed(pose, back) for pose in found[best]]
-            score += evidence[best].tolist()
-        order = np.argsort(-np.array(score), kind="stable")
+            parts = np.array_split(found, -(-len(found) // 4096))
+            evidence = np.concatenate([explained(places, seen, part).evidence for part in parts])
+            best = found[np.argsort(-evidence, kind="stable")[: 4 * KEPT]]
+            some.append(_followed_by(_closer(places, seen, best), back))
+        if not some:
+            return []
+        # What all of these scans say of them, as odometry has them.
+        poses = _thinned(np.concatenate(some))
+        evidence = sum(explained(places, views[row], _followed_by(poses, steps[row])).evidence for row in views)
         kept: list[Float[np.ndarray, 3]] = []
-        for k in order:
+        for k in np.argsort(-np.asarray(evidence), kind="stable"):
             off = [poses[k] - one for one in kept]
             if all(np.hypot(*one[:2]) > SAME[0] / 2 or abs(wrap_angle(one[2])) > SAME[1] / 2 for one in off):
                 kept.append(poses[k])
@@ -315,32 +361,72 @@ class _Path:
                 break
         return kept
 
-    def followed(
-        self, begin: Float[np.ndarray, "3"], sd: Float[np.ndarray, "3"], rows: Int[np.ndarray, " rows"]
-    ) -> _Followed:
-        """A hypothesis through scans, by odometry and the ranges of the echoes."""
-        noise = self.noise
-        pose, cov = begin, np.diag(sd**2)
-        poses, covs, first = [], [], None
-        nats = heard = fits = 0.0
-        for k, row in enumerate(rows):
-            if k:
-                step = relative(self.odometry[rows[k - 1]], self.odometry[row])
-                pose, cov = moved(pose, cov, step, step_variance(self.slip, step))
-            known = self.map.around(pose, cov, self.ring.max_range + 0.3)
-            scan = self.log[int(row)]
-            fit = update(self.ring, Track(known), scan, self.models[row], row=int(row), sigma=noise, grow=False)
-            pose, cov = np.append(fit.pose[:2], wrap_angle(fit.pose[2])), fit.covariance
-            # An explained echo is so much likelier than one that lies anywhere; those of one wall say the same.
-            heard += len(scan.range)
-            fits += fit.explained
-            nats += float(np.log(self.ring.max_range / (noise * np.sqrt(2 * np.pi)))) * fit.explained / 4
-            nats -= fit.squared / 8
-            poses.append(pose)
-            covs.append(cov)
-            first = pose if first is None else first
-        assert first is not None
-        return _Followed(begin, Place(first, nats, fits / max(heard, 1)), np.array(poses), np.array(covs))
+    def followed(self, begins: Sequence[_Run], say: Callable[[str, int, int], None]) -> list[_Run]:
+        """Hypotheses through the first scans, the likeliest first; those far behind only as far as that shows."""
+        tried = min(TRIED, len(self.rows))
+        alive, dropped = list(begins), []
+        for number in range(tried):
+            alive = sorted((self.after(run, number) for run in alive), key=lambda run: -run.nats)
+            alive = _different(alive)
+            best = alive[0].nats if alive else 0.0
+            behind = BEHIND[0] + BEHIND[1] * max(best, 0.0)
+            # Behind by as much they will be in the end.
+            dropped += [(run, best - run.nats) for run in alive if run.nats < best - behind]
+            alive = [run for run in alive if run.nats >= best - behind]
+            say("hypotheses", number + 1, tried)
+        best = alive[0].nats if alive else 0.0
+        return [*alive, *sorted((run._replace(nats=best - lag) for run, lag in dropped), key=lambda run: -run.nats)]
+
+    def after(self, run: _Run, number: int) -> _Run:
+        """A hypothesis one scan on, by odometry and the ranges of the echoes."""
+        row, noise = int(self.rows[number]), self.noise
+        pose, cov = run.pose, run.cov
+        if number:
+            step = relative(self.odometry[self.rows[number - 1]], self.odometry[row])
+            pose, cov = moved(pose, cov, step, step_variance(self.slip, step))
+        known = self.map.around(pose, cov, self.ring.max_range)
+        scan = self.log[row]
+        fit = update(self.ring, Track(known), scan, self.models[row], row=row, sigma=noise, grow=False)
+        pose, cov = np.append(fit.pose[:2], wrap_angle(fit.pose[2])), fit.covariance
+        # An explained echo is so much likelier than one that lies anywhere; those of one wall say the same.
+        worth = float(np.log(self.ring.max_range / (noise * np.sqrt(2 * np.pi))))
+        return _Run(
+            pose,
+            cov,
+            (*run.poses, pose),
+            (*run.covs, cov),
+            run.nats + worth * fit.explained / 4 - fit.squared / 8,
+            run.heard + len(scan.range),
+            run.fits + fit.explained,
+        )
+
+
+def _different(runs: Sequence[_Run]) -> list[_Run]:
+    """The first of those that are at the same place."""
+    kept: list[_Run] = []
+    for run in runs:
+        if not any(run.same(one) for one in kept):
+            kept.append(run)
+    return kept
+
+
+def _followed_by(poses: Float[np.ndarray, "poses 3"], step: Float[np.ndarray, "3"]) -> Float[np.ndarray, "poses 3"]:
+    """All of them after the same step."""
+    place = poses[:, :2] + turned(np.broadcast_to(step[:2], (len(poses), 2)), poses[:, 2])
+    return np.column_stack([place, wrap_angle(poses[:, 2] + step[2])])
+
+
+def _closer(places: Places, seen: Seen, poses: Float[np.ndarray, "poses 3"]) -> Float[np.ndarray, "poses 3"]:
+    """Poses where walls and points lie better on those that they lie on."""
+    held = np.diag(np.array([*_FOUND[:1] * 2, _FOUND[1]]) ** -2.0)
+    start = poses
+    for _ in range(_CLOSER):
+        result = explained(places, seen, poses)
+        away = poses - start
+        away[:, 2] = wrap_angle(away[:, 2])
+        gradient = result.gradient + away @ held
+        poses = poses - np.linalg.solve(result.information + held, gradient[..., None])[..., 0]
+    return poses
 
 
 def _places(known: _Map) -> Places:
