@@ -44,8 +44,15 @@ with jax.enable_x64(True):
         return jax.vmap(misfit, (0, 0, 0, None))(kelvin, one_by_one, at.poses, scene).sum() + smooth
 
     x, unravel = ravel_pytree((jnp.zeros(len(at.poses)), at.scene))  # walls, too: they were fitted to the mean
-    for _ in range(4):  # Newton
-        x -= jnp.linalg.solve(jax.hessian(lambda x: loss(unravel(x)))(x), jax.grad(lambda x: loss(unravel(x)))(x))
+
+    @jax.jit
+    def newton(x):
+        """Of the loss, one step."""
+        slope = jax.grad(lambda x: loss(unravel(x)))
+        return x - jnp.linalg.solve(jax.jacfwd(slope)(x), slope(x))
+
+    for _ in range(4):
+        x = newton(x)
     kelvin, _ = unravel(x)
     middle = 273.15 * ((float(found.ring.speed_of_sound) / 331.3) ** 2 - 1)
     estimate = middle + np.asarray(kelvin)[: len(truth)]

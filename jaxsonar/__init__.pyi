@@ -21,6 +21,8 @@ from .local import LocalModel as LocalModel
 from .local import extract_lines as extract_lines
 from .local import local_model as local_model
 from .local import local_models as local_models
+from .localizing import Localized as Localized
+from .localizing import localize as localize
 from .logs import Log as Log
 from .logs import Scan as Scan
 from .logs import load_log as load_log
@@ -39,5 +41,15 @@ from .roomfile import save_room as save_room
 from .rooms import Room as Room
 from .simulate import Simulation as Simulation
 from .simulate import simulate as simulate
+from .slam import Slam as Slam
+from .slam import Tracker as Tracker
+from .slam import slam as slam
+from .slip import Slip as Slip
+from .smoothing import Smoothed as Smoothed
+from .smoothing import smooth as smooth
 from .streaming import Status as Status
 from .streaming import stream as stream
+from .trajectory import Trajectory as Trajectory
+from .trajectory import errors as errors
+from .trajectory import load_trajectory as load_trajectory
+from .trajectory import save_trajectory as save_trajectory

@@ -39,13 +39,15 @@ STARTS = 4
 """Scans whose hypotheses are looked at."""
 KEPT = 24
 """Hypotheses that are followed."""
-BEHIND = 60.0, 0.25
+BEHIND = 30.0, 0.2
 """Nats, and share of those of the best one, by which a hypothesis may be behind it to be followed further."""
 MARGIN = 20.0, 0.05
 """Nats, and share of its own, by which the best one must beat all others together; echoes of one wall are not
 independent."""
 LEAST = 0.5
 """Share of the echoes that the map must explain at the best one."""
+MARGIN_NEAR, LEAST_NEAR = (6.0, 0.03), 0.2
+"""The same of hypotheses near a rough pose."""
 SAME = (0.25, float(np.radians(8.0)))
 """Metres and radians; hypotheses that are nearer are one, if they cannot be told apart."""
 SURE = (0.03, float(np.radians(2.0)))
@@ -142,12 +144,15 @@ def localize(
         begins = [_Run(pose, np.diag(found**2)) for pose in path.begins()]
     else:
         rough, near = np.array(start, dtype=np.float64), np.array([ROUGH[0], ROUGH[0], ROUGH[1]])
-        begins = [_Run(rough, np.diag(near**2))]
+        begins = [_Run(rough, np.diag(near**2), rough=True)]
         begins += [_Run(pose, np.diag(found**2)) for pose in path.begins(rough)]
     # 2. Each is followed through the first scans, as long as it is not far behind the best one.
     runs = path.followed(begins, say)
-    places = tuple(run.place for run in runs)
-    certain, why = _judged(places, len(path.rows))
+    if start is not None:
+        runs = path.near(runs, np.array(start, dtype=np.float64))
+    places = tuple(Place(path.smoothed(run)[0][0], run.nats, run.explained) for run in runs)
+    needed = (MARGIN, LEAST) if start is None else (MARGIN_NEAR, LEAST_NEAR)
+    certain, why = _judged(places, len(path.rows), *needed)
     if certain and start is None and not runs[0].sure:
         certain, why = False, f"{len(path.rows)} scans: what they see leaves a direction open; a longer path may tell"
     poses, cov = np.full((len(log), 3), np.nan), np.full((len(log), 3, 3), np.nan)
@@ -157,7 +162,7 @@ def localize(
         for number in range(len(run.poses), len(path.rows)):
             run = path.after(run, number)
             say("localizing", number + 1, len(path.rows))
-        poses[path.rows], cov[path.rows] = np.array(run.poses), np.array(run.covs)
+        poses[path.rows], cov[path.rows] = path.smoothed(run)
     return Localized(poses, cov, stamps_of(log), places, certain, why)
 
 
@@ -174,15 +179,15 @@ def _odometry(log: Log, models: Sequence[LocalModel]) -> Float[np.ndarray, "scan
     return alone
 
 
-def _judged(places: Sequence[Place], scans: int) -> tuple[bool, str]:
+def _judged(places: Sequence[Place], scans: int, margins: tuple[float, float], least: float) -> tuple[bool, str]:
     """Whether there is one place only, and what there is to say."""
     of = f"{scans} scan{'' if scans == 1 else 's'}"
-    if not places or places[0].explained < LEAST:
+    if not places or places[0].explained < least:
         share = f": at the best place {100 * places[0].explained:.0f} % of their echoes fit" if places else ""
-        return False, f"{of}: no place in the map fits{share}; needed are {100 * LEAST:.0f} %"
+        return False, f"{of}: no place in the map fits{share}; needed are {100 * least:.0f} %"
     best, others = places[0], [place.nats for place in places[1:]]
     margin = best.nats - float(logsumexp(others)) if others else np.inf
-    needed = MARGIN[0] + MARGIN[1] * max(best.nats, 0.0)
+    needed = margins[0] + margins[1] * max(best.nats, 0.0)
     if margin < needed:
         alike = [place for place in places if place.nats > best.nats - needed]
         alike = alike if len(alike) > 1 else list(places[:2])
@@ -271,11 +276,13 @@ class _Run(NamedTuple):
     heard: int = 0
     fits: int = 0
     """Echoes, and those that the map explains."""
+    rough: bool = False
+    """Whether it began with what a person said."""
 
     @property
-    def place(self) -> Place:
-        """What it says of the first scan."""
-        return Place(self.poses[0], self.nats, self.fits / max(self.heard, 1))
+    def explained(self) -> float:
+        """Share of the echoes that the map explains."""
+        return self.fits / max(self.heard, 1)
 
     @property
     def sure(self) -> bool:
@@ -377,13 +384,22 @@ class _Path:
         best = alive[0].nats if alive else 0.0
         return [*alive, *sorted((run._replace(nats=best - lag) for run, lag in dropped), key=lambda run: -run.nats)]
 
+    def near(self, runs: Sequence[_Run], rough: Float[np.ndarray, "3"]) -> list[_Run]:
+        """Those near a rough pose, the likeliest first; what leaves a direction open is in that which began with it."""
+        sd, judged = np.array([ROUGH[0], ROUGH[0], ROUGH[1]]), []
+        for run in runs:
+            away = self.smoothed(run)[0][0] - rough
+            away[2] = wrap_angle(away[2])
+            if run.rough or run.sure:
+                judged.append(run._replace(nats=run.nats - float(np.square(away / sd).sum()) / 2))
+        return sorted(judged, key=lambda run: -run.nats)
+
     def after(self, run: _Run, number: int) -> _Run:
         """A hypothesis one scan on, by odometry and the ranges of the echoes."""
         row, noise = int(self.rows[number]), self.noise
         pose, cov = run.pose, run.cov
         if number:
-            step = relative(self.odometry[self.rows[number - 1]], self.odometry[row])
-            pose, cov = moved(pose, cov, step, step_variance(self.slip, step))
+            pose, cov = self._moved(pose, cov, number)
         known = self.map.around(pose, cov, self.ring.max_range)
         scan = self.log[row]
         fit = update(self.ring, Track(known), scan, self.models[row], row=row, sigma=noise, grow=False)
@@ -398,15 +414,43 @@ class _Path:
             run.nats + worth * fit.explained / 4 - fit.squared / 8,
             run.heard + len(scan.range),
             run.fits + fit.explained,
+            run.rough,
         )
+
+    def smoothed(self, run: _Run) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:
+        """Poses of a hypothesis and their covariances, with what later scans tell of earlier ones.
+
+        (Rauch, Tung and Striebel 1965.)
+        """
+        poses, covs = np.array(run.poses), np.array(run.covs)
+        for k in reversed(range(len(poses) - 1)):
+            # What the next pose was expected to be, and how that hangs on this one.
+            ahead, both = self._moved(poses[k], np.tile(covs[k], (2, 2)), k + 1)
+            gain = np.linalg.solve(both[:3, :3], both[:3, 3:]).T
+            off = poses[k + 1] - ahead
+            off[2] = wrap_angle(off[2])
+            poses[k] += gain @ off
+            poses[k, 2] = wrap_angle(poses[k, 2])
+            covs[k] += gain @ (covs[k + 1] - both[:3, :3]) @ gain.T
+        return poses, covs
+
+    def _moved(
+        self, pose: Float[np.ndarray, "3"], cov: Float[np.ndarray, "unknowns unknowns"], number: int
+    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "unknowns unknowns"]]:
+        """A pose and what hangs on it, by odometry, at a scan from the one before."""
+        step = relative(self.odometry[self.rows[number - 1]], self.odometry[self.rows[number]])
+        return moved(pose, cov, step, step_variance(self.slip, step))
 
 
 def _different(runs: Sequence[_Run]) -> list[_Run]:
-    """The first of those that are at the same place."""
+    """The first of those that are at the same place; that which began with what a person said assumes least."""
     kept: list[_Run] = []
     for run in runs:
-        if not any(run.same(one) for one in kept):
+        twin = next((k for k, one in enumerate(kept) if run.same(one)), None)
+        if twin is None:
             kept.append(run)
+        elif run.rough:
+            kept[twin] = run
     return kept
 
 

@@ -32,6 +32,7 @@ LEAST_ECHOES = 3
 LEAST_SIGMA = 1e-5
 """Metres; noise-free echoes have some, too: that of their digits."""
 _ANCHOR, _LOOSE = 1e-5, 1.0  # m, rad; the first pose of a path, and all others
+_BESIDE = 0.5  # m; beyond the maximum range, for poses and reflectors that are not yet where they should be
 _HALVINGS = 12
 _LAST_ROUNDS = 3
 _JUDGED, _MISFIT = 8, 1.1  # echoes and share; from there on a point must fit as well as the walls do
@@ -59,6 +60,8 @@ class Data:
     begin: tuple[int, ...]
     reach: float = 1.0
     """As in ``kernels.Problem``."""
+    steps: int = 20
+    """Of least squares in each round at most."""
     together: int = 1
     """Echoes of one reflector that a scan must have for them to count. A pose that hardly anything holds in one
     direction goes where one or two echoes of something that is not in the map fit a reflector that is."""
@@ -297,6 +300,7 @@ def _associated(
         jnp.asarray(data.world),
         jnp.asarray(data.path),
         jnp.asarray(data.reported),
+        jnp.asarray(around.near(state.poses, data.world, float(ring.max_range) + _BESIDE)),
     )
     candidate, residual, rival = (np.asarray(column) for column in (found.candidate, found.residual, found.rival))
     used = (candidate >= 0) & (np.abs(residual) < gate) & (rival > doubt) & np.isfinite(data.reported)
@@ -329,7 +333,7 @@ def _adjusted(
     poses_free: bool,
 ) -> tuple[State, kernels.Problem, kernels.Adjusted]:
     problem = problem_of(ring, data, modes, state, reflection, weight)
-    found = kernels.adjust(problem, _unknowns(state), poses_free=poses_free)
+    found = kernels.adjust(problem, _unknowns(state), poses_free=poses_free, most=data.steps)
     now = found.unknowns
     scene = eqx.tree_at(lambda s: s.parameters, state.around.scene, np.asarray(now.scene))
     moved = State(np.asarray(now.modes), np.asarray(now.poses), state.around._replace(scene=scene))

@@ -41,6 +41,7 @@ _MARGINS = (4.0, 2.0)  # nats; for scans without a place, surely at first
 _BLUR = 0.2  # of local models, for a ring that is calibrated
 _NOISIER = 1.15  # so much more noise, and scans were laid together that do not belong together
 _ODD = 0.4  # of the share of echoes that is explained elsewhere: a scan with less stands in the wrong place
+_MANY, _FEW_STEPS = 100, 6  # scans; from there on rounds of least squares are cut short: the next one goes on
 _LEAST = 3  # echoes that a pose without odometry rests on
 
 
@@ -172,6 +173,8 @@ class _Job:
         log = replace(self.log, pose=poses)
         data = _free(Data.of(self.ring, [log], [self.odometry], self.slip, silent=True), self.first)
         data = replace(data, together=_TOGETHER if self.window is None else 1)
+        if data.scans > _MANY:
+            data = replace(data, steps=_FEW_STEPS)
         found = self._alternated(data, log)
         if found is None:
             raise SonarError("smooth: no echo fits the walls; is it the right ring, are poses and units right?")

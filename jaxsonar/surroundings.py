@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 
@@ -60,6 +60,32 @@ class Surroundings(NamedTuple):
     world: Int[np.ndarray, " reflectors"]
     """Which map each reflector is from; -1 for padding."""
     candidates: kernels.Candidates
+
+    def near(
+        self, poses: Float[np.ndarray, "scans 3"], world: Int[np.ndarray, " scans"], reach: float
+    ) -> Int[np.ndarray, "scans near"]:
+        """Rows of the candidates that scans may hear, -1 for none: those of their world of which a part is in reach.
+
+        Args:
+            poses: of the scans, where they are now.
+            world: of each scan.
+            reach: how far off an echo may come from, metres.
+        """
+        scene, reflection = self.scene, self.candidates.reflection
+        wall = np.asarray(scene.kind) == kernels.PLANE
+        parameters, anchor, ends = (np.asarray(leaf) for leaf in (scene.parameters, scene.anchor, scene.ends))
+        offset = poses[:, None, :2] - anchor
+        theta = np.where(wall, parameters[:, 1], 0.0)
+        along = (offset * unit(theta + np.pi / 2)).sum(axis=-1)
+        beyond = np.maximum(np.maximum(ends[:, 0] - along, along - ends[:, 1]), 0.0)
+        across = (offset * unit(theta)).sum(axis=-1) - parameters[:, 0]
+        distance = np.where(wall, np.hypot(across, beyond), np.linalg.norm(offset - parameters, axis=-1))
+        either = np.minimum(distance[:, np.asarray(reflection.first)], distance[:, np.asarray(reflection.second)])
+        heard = (either < reach) & (np.asarray(self.candidates.world) == world[:, None]) & (world >= 0)[:, None]
+        heard &= np.asarray(reflection.kind) >= 0
+        room = min(power_of_two(int(heard.sum(axis=1).max(initial=1)), least=_ROOM), heard.shape[1])
+        order = np.argsort(~heard, axis=1, kind="stable")[:, :room]
+        return np.where(np.take_along_axis(heard, order, axis=1), order, -1).astype(np.int32)
 
 
 def surroundings(worlds: Sequence[GlobalMap], *, tied: bool) -> Surroundings:

@@ -43,6 +43,7 @@ def associate(
     world: Int[Array, " scans"],
     path: Int[Array, "scans echoes"],
     reported: Float[Array, "scans echoes"],
+    near: Int[Array, "scans near"],
 ) -> Association:
     """The reflection with the range nearest to each echo's, of those that its path can hear.
 
@@ -54,11 +55,11 @@ def associate(
         world: which world each scan was taken in.
         path: row of the ring's ``paths`` of each echo.
         reported: half path lengths as reported, metres; NaN where there is no echo.
+        near: rows of the candidates that each scan may hear; -1 for none.
     """
     paths = echo_paths(sensors)
     half_beam = jnp.minimum(_WIDER * 2 * jnp.arcsin(jnp.sqrt(paths.cone) / 2), jnp.pi / 2)
     paths = eqx.tree_at(lambda p: p.cone, paths, chord_squared(half_beam))
-    first, second = take(scene, candidates.reflection.first), take(scene, candidates.reflection.second)
 
     def report(pose, reflection, first, second, path: EchoPaths):
         reach, share, _ = audible(pose, reflection, first, second, path)
@@ -69,19 +70,23 @@ def associate(
     each_candidate = jax.vmap(each_path, in_axes=(None, 0, 0, 0, None))
 
     def one_scan(scan):
-        pose, here, path, reported = scan
+        pose, here, path, reported, near = scan
         own = jax.tree.map(lambda leaf: leaf[path], paths)
-        expected = each_candidate(pose, candidates.reflection, first, second, own)
-        expected = jnp.where((candidates.world == here)[:, None], expected, jnp.inf)
-        off = jnp.abs(reported[None] - expected)  # (candidates, echoes)
+        reflection, world, group = jax.tree.map(
+            lambda leaf: leaf[jnp.maximum(near, 0)], (candidates.reflection, candidates.world, candidates.group)
+        )
+        first, second = take(scene, reflection.first), take(scene, reflection.second)
+        expected = each_candidate(pose, reflection, first, second, own)
+        expected = jnp.where(((world == here) & (near >= 0))[:, None], expected, jnp.inf)
+        off = jnp.abs(reported[None] - expected)  # (near, echoes)
         off = jnp.where(jnp.isfinite(off), off, jnp.inf)
         best = off.argmin(axis=0)
         nearest = jnp.take_along_axis(expected, best[None], axis=0)[0]
         found = jnp.isfinite(off.min(axis=0))
         residual = reported - nearest
-        other = candidates.group[:, None] != candidates.group[best][None]
+        other = group[:, None] != group[best][None]
         apart = jnp.abs(expected - jnp.where(found, nearest, 0)[None])
         rival = jnp.where(other, apart, jnp.inf).min(axis=0)
-        return jnp.where(found, best, -1), jnp.where(found, residual, jnp.inf), rival
+        return jnp.where(found, near[best], -1), jnp.where(found, residual, jnp.inf), rival
 
-    return Association(*jax.lax.map(one_scan, (poses, world, path, reported)))
+    return Association(*jax.lax.map(one_scan, (poses, world, path, reported, near)))

@@ -98,12 +98,8 @@ def full_wall_votes(ring, settings):
     listeners = []
     for k in range(7200):
         direction = -math.pi + (k + 0.5) * 2 * math.pi / 7200
-        listeners.append(
-            sum(
-                hears(ring.heading[tx], ring.beam[tx], direction) and hears(ring.heading[rx], ring.beam[rx], direction)
-                for tx, rx in ring.paths
-            )
-        )
+        heard = [hears(heading, beam, direction) for heading, beam in zip(ring.heading, ring.beam, strict=True)]
+        listeners.append(sum(heard[tx] and heard[rx] for tx, rx in ring.paths))
     covered = [count for count in listeners if count]
     return np.mean(covered) * settings.theta_cell / settings.point_pitch
 

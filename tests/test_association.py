@@ -98,9 +98,18 @@ def associated(poses, path, reported, world=None, candidates=None, scene=None):
     trees = (the_scene() if scene is None else scene, the_candidates() if candidates is None else candidates)
     scene, candidates = (jax.tree.map(jnp.asarray, tree) for tree in trees)
     found = kernels.associate(
-        RING.sensors, scene, candidates, *(jnp.asarray(x) for x in (poses, world, path, reported))
+        RING.sensors,
+        scene,
+        candidates,
+        *(jnp.asarray(x) for x in (poses, world, path, reported)),
+        every(candidates, poses),
     )
     return [np.asarray(x) for x in (found.candidate, found.residual, found.rival)]
+
+
+def every(candidates, poses):
+    """All candidates for all scans."""
+    return jnp.tile(jnp.arange(len(candidates.world), dtype=jnp.int32), (len(poses), 1))
 
 
 # A slow search
@@ -269,7 +278,14 @@ def test_offsets_and_speed_of_sound_are_part_of_what_is_expected(heard, rng):
     scene, candidates = (jax.tree.map(jnp.asarray, tree) for tree in (the_scene(), the_candidates()))
     world = jnp.zeros(SCANS, jnp.int32)
     found = kernels.associate(
-        sensors, scene, candidates, jnp.asarray(poses), world, jnp.asarray(path), jnp.asarray(told)
+        sensors,
+        scene,
+        candidates,
+        jnp.asarray(poses),
+        world,
+        jnp.asarray(path),
+        jnp.asarray(told),
+        every(candidates, poses),
     )
     before = associated(poses, path, reported)
     np.testing.assert_array_equal(found.candidate, before[0])

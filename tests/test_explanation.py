@@ -20,7 +20,7 @@ from jaxsonar.rooms import lines_in
 from jaxsonar.simulate import Acoustics, Kind
 
 RING, SETTINGS, EXPECTED = Ring.circular(), HoughSettings(), kernels.Expectations()
-SCANS, ROOM, PATHS, POINTS = DEAR_SCANS_PER_STEP[0], 64, 168, 60
+SCANS, ROOM, PATHS, POINTS = DEAR_SCANS_PER_STEP[0], 64, 168, 64
 DECIDED = 0.7
 PLAIN: dict[str, Any] = {"box": 0.0, "segment": 0.0, "pole": 0.0}
 ORIGIN = np.zeros((1, 3))

@@ -9,14 +9,16 @@ import subprocess
 import sys
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+from devices import Given, messages
 
 from jaxsonar import Log, Ring, SonarError, load_log, save_log
 from jaxsonar.hardware.assembly import Assembler, RawScan
-from jaxsonar.hardware.messages import ECHO, Group, Message, Pose
+from jaxsonar.hardware.messages import ECHO, Group, Message
 from jaxsonar.hardware.protocol import Decoder, encode, frame
 from jaxsonar.hardware.queueing import NewestQueue
 from jaxsonar.hardware.reading import Reader
@@ -27,40 +29,6 @@ from jaxsonar.journal import CutShort, journal_of, open_record
 from jaxsonar.playing import messages_of
 
 SUFFIXES = (".csv", ".parquet", ".mcap")
-
-
-def messages(scans=5, groups=4, echoes=6, start_us=1_000_000):
-    """Of a device whose every number is another one; scan 2 is silent."""
-    rng = np.random.default_rng(scans)
-    sequence, time_us = 0, start_us
-    for scan in range(scans):
-        yield Pose(sequence, time_us, *rng.normal(size=3).tolist())
-        sequence += 1
-        for group in range(groups):
-            heard = np.zeros(0 if scan == 2 else echoes, ECHO)
-            heard["tx"], heard["rx"] = group, rng.integers(0, 24, len(heard))
-            heard["time_us"], heard["amplitude"] = rng.uniform(500, 11000, (2, len(heard)))
-            yield Group(sequence, time_us, scan, group, groups, 20.0 + scan % 100, heard)
-            sequence, time_us = sequence + 1, time_us + 11_700
-
-
-class Given(Source):
-    """A source of given pieces; None is a time without any."""
-
-    url = "given:"
-
-    def __init__(self, pieces, pause=0.0):
-        self.pieces, self.pause, self.closed = iter(pieces), pause, False
-
-    def read(self, timeout: float) -> bytes | None:
-        time.sleep(self.pause)
-        piece = next(self.pieces, EndOfStream("given: no more"))
-        if isinstance(piece, BaseException):
-            raise piece
-        return piece
-
-    def close(self) -> None:
-        self.closed = True
 
 
 def read_all(source: Source, recorder: Recorder | None = None, **choices) -> tuple[list[RawScan], Reader]:
@@ -368,7 +336,7 @@ def test_a_device_that_runs_ahead_of_its_clock_is_waited_for_and_a_live_one_is_n
 WRITER = """
 import sys, time
 sys.path.insert(0, {tests!r})
-from test_recording_live import Given, messages
+from devices import Given, messages
 from jaxsonar.hardware.protocol import encode
 from jaxsonar.hardware.queueing import NewestQueue
 from jaxsonar.hardware.reading import Reader
@@ -393,38 +361,41 @@ reader._thread.join()
 """
 
 
+def killed(stem, pause, after):
+    """A process that records, killed so long after its first scan: what it said until then, and when that was."""
+    code = WRITER.format(tests=str(Path(__file__).parent), stem=stem, pause=pause)
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert select.select([process.stdout], [], [], 60)[0], "no scan came"
+        lines, end = b"", time.monotonic() + after
+        while (left := end - time.monotonic()) > 0:
+            if select.select([process.stdout], [], [], left)[0]:
+                lines += os.read(process.stdout.fileno(), 1 << 16)
+        process.send_signal(signal.SIGKILL)
+        when = time.time()
+        return lines + process.communicate()[0], when
+
+
 def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
-    """Twenty processes, killed at random moments: every file opens, and holds what came a second before."""
+    """Twenty processes, four at a time, killed at random moments: every file opens, with what came a second before."""
     rng = random.Random(7)
-    for batch in range(5):
-        writers = []
-        for k in range(4):
-            stem = str(tmp_path / f"log{batch}-{k}")
-            code = WRITER.format(tests=str(Path(__file__).parent), stem=stem, pause=rng.choice([0.0, 0.001, 0.01]))
-            writers.append((stem, subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)))
-        for stem, process in writers:
-            assert process.stdout is not None
-            assert select.select([process.stdout], [], [], 60)[0], "no scan came"
-            lines, end = b"", time.monotonic() + rng.uniform(0.05, 1.6)
-            while (left := end - time.monotonic()) > 0:
-                if select.select([process.stdout], [], [], left)[0]:
-                    lines += os.read(process.stdout.fileno(), 1 << 16)
-            process.send_signal(signal.SIGKILL)
-            killed = time.time()
-            lines += process.communicate()[0]
-            said = [line.split() for line in lines[: lines.rfind(b"\n")].splitlines()]
-            safe = max((int(scan) for scan, when in said if float(when) < killed - 1.0), default=-1)
-            last = max(int(scan) for scan, _ in said)
-            for suffix in (".csv", ".parquet"):
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", CutShort)
-                    log = load_log(stem + suffix)
-                assert log.scan.tolist() == list(range(len(log)))
-                assert safe < len(log) <= last + 2, (suffix, safe, last)
-            decoder = Decoder()
-            kept = [m for _, _, frame in read_mcap(stem + ".mcap") for m in decoder.feed(frame)]
-            assert decoder.counts.rejected == 0
-            assert [m.sequence for m in kept] == list(range(len(kept)))
-            assert max((m.scan for m in kept if isinstance(m, Group)), default=-1) >= safe
-            for file in tmp_path.glob(f"{Path(stem).name}*"):
-                file.unlink()
+    stems = [str(tmp_path / f"log{k}") for k in range(20)]
+    pauses = [rng.choice([0.0, 0.001, 0.01]) for _ in stems]
+    moments = [rng.uniform(0.05, 1.6) for _ in stems]
+    with ThreadPoolExecutor(4) as pool:
+        told = list(pool.map(killed, stems, pauses, moments))
+    for stem, (lines, when_killed) in zip(stems, told, strict=True):
+        said = [line.split() for line in lines[: lines.rfind(b"\n")].splitlines()]
+        safe = max((int(scan) for scan, when in said if float(when) < when_killed - 1.0), default=-1)
+        last = max(int(scan) for scan, _ in said)
+        for suffix in (".csv", ".parquet"):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", CutShort)
+                log = load_log(stem + suffix)
+            assert log.scan.tolist() == list(range(len(log)))
+            assert safe < len(log) <= last + 2, (suffix, safe, last)
+        decoder = Decoder()
+        kept = [m for _, _, frame in read_mcap(stem + ".mcap") for m in decoder.feed(frame)]
+        assert decoder.counts.rejected == 0
+        assert [m.sequence for m in kept] == list(range(len(kept)))
+        assert max((m.scan for m in kept if isinstance(m, Group)), default=-1) >= safe

@@ -103,8 +103,9 @@ def expected(office, log):
     return build_map(office.ring, log, method="hough")
 
 
-@pytest.mark.parametrize("link", [*LINKS, "file"])
-@pytest.mark.parametrize("record", ["rec.csv", "rec.parquet"])
+@pytest.mark.parametrize(
+    ("link", "record"), [*((link, "rec.csv") for link in LINKS), (LINKS[0], "rec.parquet"), ("file", "rec.parquet")]
+)
 def test_a_stream_is_the_log(link, record, office, log, log_file, expected, tmp_path):
     """Echoes within 0.1 mm, the same map, and nothing lost, over every link; and the record is the log again."""
     path, map_path = tmp_path / record, tmp_path / "map.geojson"
@@ -385,9 +386,9 @@ COMMAND = [sys.executable, "-c", "import sys; from jaxsonar.cli import main; sys
 
 
 @pytest.fixture(scope="module")
-def command(tmp_path_factory):
-    """Starts the command line; compiled programs are kept between the processes of this file, and in no other place."""
-    own = {"PYTHONPATH": str(Path(__file__).parents[1]), "XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
+def command():
+    """Starts the command line; compiled programs are kept where all tests keep them."""
+    own = {"PYTHONPATH": str(Path(__file__).parents[1])}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 
     def start(*arguments, **environment):
