@@ -45,7 +45,7 @@ def slam(options: argparse.Namespace) -> None:
                 sigma=options.sigma,
                 window=options.window,
                 slip=slip_of(options.odometry),
-                smooth=not options.no_smoothing,
+                smooth=options.smoothing,
                 speed=options.speed,
                 scale=options.scale,
                 progress=progress,
@@ -73,6 +73,7 @@ def slam(options: argparse.Namespace) -> None:
             withdrawn=_rows(withdrawn, found),
             title=f"{_count(len(trajectory), 'pose')}, {_count(len(found.world), 'wall')} from {_plain(options.log)}",
         )
+    said = json.dumps(_as_json(found, against), allow_nan=False, indent=1) + "\n"
     save_map(found.world, options.output)
     if options.trajectory:
         save_trajectory(trajectory, options.trajectory)
@@ -82,8 +83,7 @@ def slam(options: argparse.Namespace) -> None:
         figures.save(figure, options.figure)
     if options.json:
         with open_output(options.json) as file:
-            json.dump(_as_json(found, against), file, allow_nan=False, indent=1)
-            file.write("\n")
+            file.write(said)
     if left_out:
         _say_left_out(ring.name, left_out)
     for line in _told(found, against):
@@ -195,7 +195,11 @@ def add_commands(
     )
     run.add_argument("--speed", action="store_true", help="estimate the speed of sound, too")
     run.add_argument("--scale", action="store_true", help="estimate the scales of the odometry, too")
-    run.add_argument("--no-smoothing", action="store_true", help="poses as a robot has them on its way, not adjusted")
+    run.add_argument(
+        "--smoothing",
+        action=argparse.BooleanOptionalAction,
+        help="adjust all poses and reflectors in the end (default: up to 2000 scans; minutes for a thousand)",
+    )
 
     where = command("localize", "Where the robot is in a known map.")
     where.add_argument("log", type=file, metavar="LOG", help="scan log of a short path, .csv or .parquet")
@@ -291,7 +295,7 @@ def _as_json(found: "Slam", against: "dict[str, TrajectoryErrors | None] | None"
         said |= {
             "sigma": smoothed.sigma,
             "explained": smoothed.used,
-            "speed_of_sound": smoothed.ring.speed_of_sound,
+            "speed_of_sound": float(smoothed.ring.speed_of_sound),
             "speed_of_sound_sd": smoothed.speed_of_sound_sd,
             "scale": smoothed.scale,
             "scale_sd": smoothed.scale_sd,

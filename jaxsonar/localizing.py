@@ -60,6 +60,7 @@ _TOGETHER = 6  # scans whose walls and corners choose among the hypotheses
 _CLOSER = 4  # steps of Gauss and Newton before that
 _NEAR = 3.5  # standard deviations of a rough pose within which hypotheses are looked for
 _BESIDE = 0.3  # m; a wall is heard only where it was seen
+_MEETS, _SQUARE = 0.05, float(np.radians(3.0))  # m, rad; walls whose ends are so near and so square make a corner
 _MOST = 32  # reflectors that are looked at from a pose
 
 
@@ -224,12 +225,16 @@ class _Map(NamedTuple):
         wall_cov = np.zeros((len(world), 2, 2))
         wall_cov[:, 0, 0] = np.maximum(across, _FINE[0] ** 2)
         wall_cov[:, 1, 1] = np.maximum(turn, _FINE[1]) ** 2
+        points = world.points
         point_cov = np.where(np.isfinite(world.point_cov), world.point_cov, np.eye(2) * _MAP[0] ** 2)
         kinds = [kernels.CORNER if kind == "corner" else kernels.EDGE for kind in world.point_kinds]
+        if not kinds:  # a floor plan, say
+            points, point_cov = _corners(world, middle, wall_cov)
+            kinds = [kernels.CORNER] * len(points)
         none = np.zeros(len(kinds))
         return cls(
             np.array([kernels.PLANE] * len(world) + kinds, dtype=np.int32),
-            np.concatenate([middle, world.points]),
+            np.concatenate([middle, points]),
             np.concatenate([world.theta, none]),
             np.concatenate([half, none]),
             np.concatenate([wall_cov, point_cov]),
@@ -262,6 +267,24 @@ class _Map(NamedTuple):
             covariance=whole,
             scans=np.full(len(rows), 2, np.int64),
         )
+
+
+def _corners(
+    world: GlobalMap, middle: Float[np.ndarray, "walls 2"], wall_cov: Float[np.ndarray, "walls 2 2"]
+) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 2"]]:
+    """Where walls of a map meet at right angles, and how well that is known."""
+    gap = np.linalg.norm(world.segments[:, None, :, None] - world.segments[None, :, None], axis=-1).min(axis=(2, 3))
+    square = np.abs(np.cos(world.theta[:, None] - world.theta)) < np.sin(_SQUARE)
+    points, covs = [], []
+    for pair in np.argwhere(np.triu((gap < _MEETS) & square, 1)):
+        normal = unit(world.theta[pair])
+        point = np.linalg.solve(normal, (normal * middle[pair]).sum(-1))
+        along = ((point - middle[pair]) * unit(world.theta[pair] + np.pi / 2)).sum(-1)
+        across = wall_cov[pair, 0, 0] + along**2 * wall_cov[pair, 1, 1]
+        turned_back = np.linalg.inv(normal)
+        points.append(point)
+        covs.append(turned_back @ np.diag(across) @ turned_back.T)
+    return np.array(points).reshape(-1, 2), np.array(covs).reshape(-1, 2, 2)
 
 
 class _Run(NamedTuple):
@@ -377,12 +400,13 @@ class _Path:
             alive = _different(alive)
             best = alive[0].nats if alive else 0.0
             behind = BEHIND[0] + BEHIND[1] * max(best, 0.0)
-            # Behind by as much they will be in the end.
-            dropped += [(run, best - run.nats) for run in alive if run.nats < best - behind]
+            # They would have gone on as they began.
+            dropped += [(run, max(run.nats, 0.0) / max(best, 1e-9)) for run in alive if run.nats < best - behind]
             alive = [run for run in alive if run.nats >= best - behind]
             say("hypotheses", number + 1, tried)
         best = alive[0].nats if alive else 0.0
-        return [*alive, *sorted((run._replace(nats=best - lag) for run, lag in dropped), key=lambda run: -run.nats)]
+        fallen = [run._replace(nats=best * share) for run, share in dropped]
+        return [*alive, *sorted(fallen, key=lambda run: -run.nats)]
 
     def near(self, runs: Sequence[_Run], rough: Float[np.ndarray, "3"]) -> list[_Run]:
         """Those near a rough pose, the likeliest first; what leaves a direction open is in that which began with it."""

@@ -7,6 +7,7 @@ room that the pose has left, the robot's usual motion, silence and walls in the 
 assignments that are nearly as likely as the best one agree.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -24,12 +25,12 @@ from .logs import Log
 from .matching import Known, features_of
 from .placing_evidence import LINE_ROOM, POINT_ROOM, contradictions, explained
 from .placing_hypotheses import ELSEWHERE, Motion, Prior, refined
-from .placing_map import Places, Seen, seen_of
-from .poses import relative, wrap_angle
+from .placing_map import Places, Seen, quarter, seen_of, turned
+from .poses import relative, to_world, unit, wrap_angle
 from .ring import Ring
 from .tracking import Track, _Echoes, begin, update
 
-WIDTH, TRIED = 8, 6
+WIDTH, TRIED = 16, 16
 """Assignments that are kept, and places that each tries for a scan."""
 BEHIND = 14.0
 """Nats by which an assignment may be behind the best one, and a place behind the best place, to be looked at."""
@@ -39,7 +40,7 @@ DOUBT = 0.02
 """Largest probability that a placed scan is elsewhere."""
 TEMPER = 1.5
 """Nats are worth so much less than they claim."""
-SURE = (0.04, float(np.radians(2.5)))
+SURE = (0.3, float(np.radians(3.0)))
 """Largest standard deviation of a pose that counts as placed, metres and radians."""
 _FOUND = np.array([0.08, 0.08, np.radians(5.0)])  # m, rad; of a hypothesis before its ranges are looked at
 _BLUR = 0.2  # of local models, for a ring that is calibrated
@@ -47,7 +48,11 @@ _SQUARE = 2.0  # nats; walls are often parallel
 _UNDECIDED = 7.0  # nats that a reflector is worth whose kind is open
 _ALONE = 0.5  # and an echo of none
 _ROOM = 16  # reflectors; powers of two from there on are compiled
+_MAY_BE = 0.25  # probability
+_BEYOND = 0.5  # m
+_WAS, _FINE = -1, 1e-3  # kind of a place where the robot was, and metres by which it is a place of its own
 _GATE = 4.0  # sigma
+_GATES = 12.0, 8.0, 5.0, 4.0, 4.0
 _REACH = 0.85  # of the maximum range; nearer than that walls are surely heard
 
 
@@ -83,6 +88,8 @@ class Run(NamedTuple):
     poses: Float[np.ndarray, "scans 3"]
     """NaN where a scan is left out."""
     nats: float
+    order: tuple[int, ...]
+    """Scans in the order in which they were placed, which is that of their places in the map."""
 
     def same(self, other: "Run") -> bool:
         """Whether both place the same scans, at the same places."""
@@ -167,6 +174,7 @@ class _View:
     def __init__(self, ring: Ring, log: Log, model: LocalModel, row: int, noise: float):
         self.ring, self.scan, self.model, self.row, self.noise = ring, log[row], model, row, noise
         self.seen: Seen = seen_of(model, blur=_BLUR)
+        self.guessed = _with_undecided(self.seen, model)
         self.echoes = _Echoes.of(ring, self.scan, None)
         features = features_of(model)
         claimed = self.echoes.claimed(features, noise)
@@ -186,67 +194,189 @@ class _View:
         poses = np.full((scans, 3), np.nan)
         poses[self.row] = 0.0
         fit = update(self.ring, begin(), self.scan, self.model, row=self.row, sigma=self.noise)
-        return Run(fit.known, poses, 0.0)
+        return Run(_remembered(fit.known), poses, 0.0, (self.row,))
 
     def taken(self, run: Run, prior: Known, nats: float) -> Run:
         """The assignment with this scan, from where it lies."""
-        fit = update(self.ring, Track(prior), self.scan, self.model, row=self.row, sigma=self.noise)
+        # A wall goes on beyond what was seen of it; how far is known when it was seen there.
+        fit = update(self.ring, Track(_longer(prior)), self.scan, self.model, row=self.row, sigma=self.noise)
+        known, ends = fit.known, fit.known.ends.copy()
+        ends[: len(prior)] = prior.ends
+        wall = np.flatnonzero(known.kind == kernels.PLANE)
+        matched = explained(_places(known), self.seen, known.pose[None]).wall[0]
+        for line in np.flatnonzero(matched >= 0):
+            own = wall[matched[line]]
+            tangent = unit(known.parameters[own, 1] + np.pi / 2)
+            along = (to_world(known.pose, self.seen.segment[line]) - known.anchor[own]) @ tangent
+            ends[own] = min(ends[own, 0], along.min()), max(ends[own, 1], along.max())
+        return self._now(run, replace(known, ends=ends), nats)
+
+    def _now(self, run: Run, known: Known, nats: float) -> Run:
+        """With the poses so far where the map has them now."""
         poses = run.poses.copy()
-        poses[self.row] = fit.pose
-        return Run(fit.known, poses, nats)
+        order = [*run.order, self.row]
+        known = _remembered(known)
+        were = np.flatnonzero(known.kind == _WAS)
+        poses[order, :2] = (known.anchor + known.parameters)[were]
+        poses[self.row, 2] = known.pose[2]
+        return Run(known, poses, nats, tuple(order))
 
     def places(self, run: Run) -> list[tuple[Known, float]]:
         """Where it may lie, and the nats for that, against none of what it sees being known."""
         places, prior = _places(run.known), _prior(run.poses, self.row)
         reach = _REACH * float(self.ring.max_range)
         near = places.near(prior.pose[:2], 3 * prior.sigma[0] + 2 * self.seen.radius)
-        poses, nats, _ = refined(self.seen, near, prior, reach)
+        parts = [refined(seen, near, prior, reach) for seen in (self.seen, self.guessed)]
+        poses, nats = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
         some: list[Float[np.ndarray, 3]] = []
         for k in np.argsort(-nats, kind="stable"):
-            if len(some) == TRIED or nats[k] < nats.max() - BEHIND:
+            if len(some) == TRIED or nats[k] < nats.max() - 2 * BEHIND:
                 break
             if not some or not _alike(np.array(some), np.broadcast_to(poses[k], (len(some), 3))).any():
                 some.append(poses[k])
-        judged = [self._judged(run, places, prior, pose, reach) for pose in some]
-        return [one for one in judged if one is not None]
+        return self._judged(run, places, prior, np.array(some).reshape(-1, 3), reach)
 
     def _judged(
-        self, run: Run, places: Places, prior: Prior, pose: Float[np.ndarray, "3"], reach: float
-    ) -> tuple[Known, float] | None:
-        """A belief before this scan is taken in there, and nats; None where the ranges leave the pose open."""
-        covariance = run.known.covariance.copy()
-        covariance[:3], covariance[:, :3] = 0.0, 0.0
-        covariance[:3, :3] = np.diag(_FOUND**2)
-        before = replace(run.known, pose=pose, covariance=covariance)
-        fit = update(self.ring, Track(before), self.scan, self.model, row=self.row, sigma=self.noise, grow=False)
-        now, cov = fit.known, fit.covariance
-        if np.linalg.eigvalsh(cov[:2, :2])[-1] > SURE[0] ** 2 or cov[2, 2] > SURE[1] ** 2:
-            return None
-        moved = (now.parameters - before.parameters).ravel()
-        strain = moved @ np.linalg.solve(covariance[3:, 3:], moved)
-        room = np.linalg.slogdet(now.covariance)[1] - np.linalg.slogdet(covariance[3:, 3:])[1]
-        off = self._off(now) / self.noise
-        explains = off < _GATE
-        fits = (self.worth * explains).sum() - ((off**2 - 1) * explains).sum() / 2
-        at = now.pose[None].copy()
-        wall = explained(places, self.seen, at).wall
-        against = contradictions(
-            places, self.seen, at, wall, reach=reach, came=prior.pose[:2] if prior.path else None
-        )
-        motion = prior.log_density(at)
-        nats = fits + float(motion[0]) + 1.5 * np.log(2 * np.pi) + (room - strain) / 2 - float(against[0])
-        return before, float(nats)
+        self, run: Run, places: Places, prior: Prior, poses: Float[np.ndarray, "poses 3"], reach: float
+    ) -> list[tuple[Known, float]]:
+        """Beliefs before this scan is taken in there, and nats; none where the ranges leave the pose open."""
+        fits = _Fits.of(self.echoes, _longer(run.known), prior, poses, self.noise)
+        spread = np.linalg.inv(fits.information)[:, :3, :3]
+        sure = (np.linalg.eigvalsh(spread[:, :2, :2])[:, -1] < SURE[0] ** 2) & (spread[:, 2, 2] < SURE[1] ** 2)
+        wall = explained(places, self.seen, fits.poses).wall
+        came = prior.pose[:2] if prior.path else None
+        against = contradictions(places, self.seen, fits.poses, wall, reach=reach, came=came)
+        gain = np.where(fits.off < _GATE, self.worth - (fits.off**2 - 1) / 2, 0.0).sum(axis=1)
+        room = 1.5 * np.log(2 * np.pi) - (np.linalg.slogdet(fits.information)[1] + fits.known) / 2
+        nats = gain + prior.log_density(fits.poses) + room - fits.strain / 2 - against
+        out = []
+        for pose, cov, value in zip(fits.poses[sure], spread[sure], nats[sure], strict=True):
+            covariance = run.known.covariance.copy()
+            covariance[:3], covariance[:, :3] = 0.0, 0.0
+            covariance[:3, :3] = np.diag(_FOUND**2) + 4 * cov
+            out.append((replace(run.known, pose=pose, covariance=covariance), float(value)))
+        return out
 
 
-    def _off(self, known: Known) -> Float[np.ndarray, " echoes"]:
-        """How far each echo is off the nearest reflector that its path would hear, metres; infinite for none."""
-        room = power_of_two(len(known), least=_ROOM)
-        short = room - len(known)
-        scene = jax.tree.map(lambda leaf: np.pad(leaf, [(0, short)] + [(0, 0)] * (leaf.ndim - 1)), known.scene)
-        scene = replace(scene, kind=np.append(known.kind, np.full(short, -1, np.int32)))
-        with jax.enable_x64(True):
-            expected = np.asarray(kernels.expected_ranges(known.pose, scene, self.echoes.path))
-        return np.abs(expected - self.echoes.ranges).min(axis=0)[: len(self.echoes)]
+class _Fits(NamedTuple):
+    """Poses adjusted to the ranges of a scan, the reflectors with them."""
+
+    poses: Float[np.ndarray, "poses 3"]
+    off: Float[np.ndarray, "poses echoes"]
+    """Sigma by which echoes are off their nearest reflector; infinite where their paths hear none."""
+    information: Float[np.ndarray, "poses unknowns unknowns"]
+    """Of the pose and of the reflectors' parameters."""
+    known: float
+    """Logarithm of the determinant of the reflectors' covariance before."""
+    strain: Float[np.ndarray, " poses"]
+    """Squared distance of the reflectors from what was known of them, in standard deviations."""
+
+    @classmethod
+    def of(
+        cls, echoes: _Echoes, known: Known, expected: Prior, poses: Float[np.ndarray, "poses 3"], noise: float
+    ) -> "_Fits":
+        """Gauss and Newton; the gate closes."""
+        count, size = len(poses), len(known.covariance)
+        start = np.linalg.inv(known.covariance[3:, 3:])
+        prior = np.zeros((size, size))
+        prior[:3, :3], prior[3:, 3:] = np.diag([*[expected.sigma[0] ** -2] * 2, 1.0]), start
+        middle = np.asarray(echoes.path.midpoint)[: len(echoes)]
+        poses, moved = poses.copy(), np.zeros((count, size - 3))
+        off, information = np.zeros((count, len(echoes))), np.zeros((count, size, size))
+        for gate in _GATES:
+            reaches = _expected(echoes, known, poses)
+            lever = turned(np.broadcast_to(middle, (count, len(echoes), 2)), poses[:, 2, None])
+            at = poses[:, None, :2] + lever
+            nearest = np.abs(reaches - echoes.ranges[: len(echoes)]).argmin(axis=1)
+            reach = np.take_along_axis(reaches, nearest[:, None], axis=1)[:, 0]
+            is_wall = (known.kind == kernels.PLANE)[nearest][..., None]
+            theta = known.parameters[nearest, 1]
+            away = known.anchor[nearest] - at
+            spot = away + known.parameters[nearest]
+            towards = np.where(is_wall, unit(theta), spot / np.linalg.norm(spot, axis=-1, keepdims=True))
+            turn = (unit(theta + np.pi / 2) * away).sum(-1, keepdims=True)
+            own = np.where(is_wall, np.concatenate([np.ones_like(turn), turn], -1), towards)
+            slope = np.zeros((*reach.shape, size))
+            slope[..., :2], slope[..., 2] = -towards, -(towards * quarter(lever)).sum(-1)
+            rows = (np.arange(count)[:, None], np.arange(len(echoes)))
+            slope[(*rows, 3 + 2 * nearest)], slope[(*rows, 4 + 2 * nearest)] = own[..., 0], own[..., 1]
+            # The scene stays where it was; what it moved by is in the residual.
+            with np.errstate(invalid="ignore"):
+                residual = echoes.ranges[: len(echoes)] - reach - (slope[..., 3:] * moved[:, None]).sum(-1)
+            off = np.where(np.isfinite(residual), np.abs(residual), np.inf) / noise
+            used = off < gate
+            residual = np.where(used, residual, 0.0)
+            slope = slope * used[..., None] / noise
+            information = prior + slope.transpose(0, 2, 1) @ slope
+            gradient = (slope * (residual / noise)[..., None]).sum(axis=1)
+            gradient[:, 3:] -= moved @ start
+            gradient[:, :2] -= (poses[:, :2] - expected.pose[:2]) / expected.sigma[0] ** 2
+            if gate == _GATES[-1]:
+                break
+            step = np.linalg.solve(information, gradient[..., None])[..., 0]
+            poses = poses + step[:, :3]
+            moved = moved + step[:, 3:]
+        poses[:, 2] = wrap_angle(poses[:, 2])
+        strain = ((moved @ start) * moved).sum(-1)
+        return cls(poses, off, information, -float(np.linalg.slogdet(start)[1]), strain)
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, None, None))
+def _all_expected(pose, scene, paths):
+    return kernels.expected_ranges(pose, scene, paths)
+
+
+def _expected(echoes: _Echoes, known: Known, poses: Float[np.ndarray, "poses 3"]) -> Float[np.ndarray, "poses rows echoes"]:
+    """Ranges in which the paths of echoes would hear reflectors, metres; infinite where they would not."""
+    short = power_of_two(len(known), least=_ROOM) - len(known)
+    scene = jax.tree.map(lambda leaf: np.pad(leaf, [(0, short)] + [(0, 0)] * (leaf.ndim - 1)), known.scene)
+    scene = replace(scene, kind=np.append(known.kind, np.full(short, -1, np.int32)))
+    padded = np.zeros((TRIED, 3))
+    padded[: len(poses)] = poses
+    with jax.enable_x64(True):
+        expected = np.asarray(_all_expected(padded, scene, echoes.path))
+    return expected[: len(poses), : len(known), : len(echoes)]
+
+
+def _with_undecided(seen: Seen, model: LocalModel) -> Seen:
+    """With what may be a wall as one, and what may be a corner or an edge as that; good for guesses only."""
+    walls = [one for one in model.undecided if one.probability["plane"] > _MAY_BE]
+    theta = np.array([one.theta for one in walls], dtype=np.float64)
+    foot = np.array([one.rho for one in walls], dtype=np.float64)[:, None] * unit(theta)
+    points = [(one, kind) for one in model.undecided for kind in ("corner", "edge") if one.probability[kind] > _MAY_BE]
+    place = np.array([(one.x, one.y) for one, _ in points], dtype=np.float64).reshape(-1, 2)
+    return seen._replace(
+        theta=np.append(seen.theta, theta),
+        segment=np.concatenate([seen.segment, foot[:, None] + 0.1 * np.array([[-1.0], [1.0]]) * unit(theta + np.pi / 2)[:, None]]),
+        sigma=np.concatenate([seen.sigma, np.tile([0.01, np.radians(2.0)], (len(theta), 1))]),
+        trust=np.append(seen.trust, np.full(len(theta), 0.5)),
+        point=np.concatenate([seen.point, place]),
+        kind=np.append(seen.kind, np.array([kind == "corner" for _, kind in points], dtype=bool)),
+        spread=np.append(seen.spread, np.full(len(place), 0.05)),
+    )
+
+
+def _remembered(known: Known) -> Known:
+    """With the robot's place as one of the map that nothing hears, so that it moves with what becomes known later."""
+    size = len(known.covariance)
+    copy = np.concatenate([np.eye(size), np.eye(2, size)])
+    covariance = copy @ known.covariance @ copy.T
+    covariance[size:, size:] += _FINE**2 * np.eye(2)
+    return Known(
+        pose=known.pose,
+        kind=np.append(known.kind, np.int32(_WAS)).astype(np.int32),
+        parameters=np.concatenate([known.parameters, np.zeros((1, 2))]),
+        anchor=np.concatenate([known.anchor, known.pose[None, :2]]),
+        ends=np.concatenate([known.ends, np.zeros((1, 2))]),
+        covariance=covariance,
+        scans=np.append(known.scans, 1),
+    )
+
+
+def _longer(known: Known) -> Known:
+    """Walls as far as they may go on."""
+    return replace(known, ends=known.ends + (known.kind == kernels.PLANE)[:, None] * [-_BEYOND, _BEYOND])
 
 
 def _prior(poses: Float[np.ndarray, "scans 3"], row: int) -> Prior:
@@ -259,7 +389,7 @@ def _prior(poses: Float[np.ndarray, "scans 3"], row: int) -> Prior:
 
 def _places(known: Known) -> Places:
     """A map as what scans are laid on."""
-    wall, point = (np.flatnonzero((known.kind == kernels.PLANE) == flag) for flag in (True, False))
+    wall, point = (np.flatnonzero(flag) for flag in (known.kind == kernels.PLANE, known.kind > kernels.PLANE))
     own = 3 + 2 * np.arange(len(known))[:, None] + [0, 1]
     cov = known.covariance[own[:, :, None], own[:, None, :]]
     places = Places()

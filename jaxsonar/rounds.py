@@ -9,7 +9,8 @@ from .surroundings import surroundings
 
 AGAIN = 0.01
 """Metres; scale of the first association after the map was made anew."""
-_MAPS = 5  # made anew at most, as long as each explains more echoes
+MAPS = 5
+"""Made anew at most, as long as each explains more echoes."""
 _GROWN = 1.005  # by so much
 
 
@@ -32,6 +33,7 @@ def alternated(
     settle: Callable[[State, float], Settled],
     widest: float,
     say: Callable[[str], None],
+    maps: int = MAPS,
 ) -> Round | None:
     """The map so far; echoes to its reflectors and least squares, closer and closer; the same from there.
 
@@ -41,12 +43,13 @@ def alternated(
         settle: lets a state settle, with this scale of the first association (metres).
         widest: that of the first round.
         say: told what is being done.
+        maps: made anew so often at most, as long as each explains more echoes.
 
     Returns:
         The best round, or None where no echo fits the first map.
     """
     found = None
-    for _ in range(_MAPS):
+    for _ in range(maps):
         say("building the map")
         worlds = mapped(state)
         say("least squares")

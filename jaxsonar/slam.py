@@ -37,6 +37,8 @@ from .windows import check_window
 
 REACH = 0.85
 """Of the ring's maximum range; nearer than that walls are surely heard."""
+MOST_SMOOTHED = 2000
+"""Scans; longer logs are smoothed only when asked for."""
 SPARSE = 4.0
 """Echoes that a long wall sends back to a ring; with fewer, scans are gathered over windows."""
 WINDOW = 1.5
@@ -215,7 +217,7 @@ def slam(
     sigma: float | None = None,
     window: float | None = None,
     slip: Slip | None = None,
-    smooth: bool = True,
+    smooth: bool | None = None,
     speed: bool = False,
     scale: bool = False,
     live: bool = False,
@@ -233,7 +235,8 @@ def slam(
         sigma: noise of the ranges, metres; estimated if left out.
         window: metres of path gathered into one local model; 1.5 m for sparse rings if left out.
         slip: how wrong the odometry is.
-        smooth: whether all poses and reflectors are adjusted together in the end.
+        smooth: whether all poses and reflectors are adjusted together in the end; of logs with ``MOST_SMOOTHED`` scans
+            or fewer if left out, since it takes minutes for a thousand.
         speed: whether the smoothing estimates the speed of sound.
         scale: whether it estimates the scales of the odometry.
         live: local models one by one, as a robot makes them, so that ``step_ms`` is all that a step costs.
@@ -267,7 +270,7 @@ def slam(
         parts = place_parts(models, None, blur=BLUR, progress=lambda done, total: say("placing", done, total))
         start, covariance = parts[0], np.full((len(log), 3, 3), np.nan)
     given = odometry if measured else None
-    if smooth:
+    if len(log) <= MOST_SMOOTHED if smooth is None else smooth:
         choices = {"odometry": given, "sigma": sigma, "window": window, "speed": speed, "scale": scale, "slip": slip}
         found = smoothing(ring, log, start, **choices, progress=lambda text: say(text, 0, 0))
         return Slam(found.poses, found.pose_cov, stamps_of(log), found.world, log.pose, ties, took, found)

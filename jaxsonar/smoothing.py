@@ -22,7 +22,7 @@ from .placing import place_more
 from .poses import composed, relative
 from .ring import Ring
 from .ringmodes import SPEED_SD, RingModes, ring_modes
-from .rounds import AGAIN, Round, alternated
+from .rounds import AGAIN, MAPS, Round, alternated
 from .settling import Data, Settled, State, settle
 from .slip import Slip
 from .smoothing_map import settled_map
@@ -41,7 +41,7 @@ _MARGINS = (4.0, 2.0)  # nats; for scans without a place, surely at first
 _BLUR = 0.2  # of local models, for a ring that is calibrated
 _NOISIER = 1.15  # so much more noise, and scans were laid together that do not belong together
 _ODD = 0.4  # of the share of echoes that is explained elsewhere: a scan with less stands in the wrong place
-_MANY, _FEW_STEPS = 100, 6  # scans; from there on rounds of least squares are cut short: the next one goes on
+_MANY, _FEW_STEPS, _FEW_MAPS = 100, 4, 2  # scans; from there on rounds are cut short: the next one goes on
 _LEAST = 3  # echoes that a pose without odometry rests on
 
 
@@ -220,6 +220,7 @@ class _Job:
             settle=lambda state, widest: self._settle(data, state, widest),
             widest=AGAIN,
             say=self.say,
+            maps=_FEW_MAPS if data.scans > _MANY else MAPS,
         )
 
     def _settle(self, data: Data, state: State, widest: float) -> Settled:

@@ -37,7 +37,7 @@ GATE, DOUBT = 4.0, 5.0
 SURE = 2.0
 """Sigma; how well a range must be known from the scan's own features, to take in an echo that none of them has."""
 _NEW = np.array([0.5, 0.3])  # m, rad; a reflector before its first echoes are taken in
-_ROOM, _ECHOES = 16, 32  # reflectors and echoes; powers of two from there on are compiled
+_SEEN, _ROOM, _ECHOES = 16, 32, 64  # features, reflectors, echoes; powers of two from there on are compiled
 _SIGMA, _CREDIT = 0.003, 30.0  # m; noise before any is known, and the echoes that this is worth
 _LEAST_SIGMA = 1e-5
 
@@ -238,7 +238,7 @@ class _Echoes:
         count = len(seen.kind)
         if not count or not self.count:
             return np.full(self.count, -1)
-        room = power_of_two(count, least=_ROOM)
+        room = power_of_two(count, least=_SEEN)
         wall = (seen.kind == kernels.PLANE)[:, None]
         half = np.linalg.norm(seen.segment[:, 1] - seen.segment[:, 0], axis=-1) / 2
         middle = seen.segment.mean(axis=1)

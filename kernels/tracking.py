@@ -84,7 +84,7 @@ def track(
         root = jnp.sqrt(weight / variance)[:, None]
         by_pose, by_own = root * by_pose, root * by_own
         # Rows of the Jacobian have five entries: three of the pose, two of their reflector.
-        spread = prior[:, :3] @ by_pose.T + prior[:, first] * by_own[:, 0] + prior[:, second] * by_own[:, 1]
+        spread = prior[:, :3] @ by_pose.T + prior[:, first] * by_own[None, :, 0] + prior[:, second] * by_own[None, :, 1]
         surprise = by_pose @ spread[:3] + by_own[:, :1] * spread[first] + by_own[:, 1:] * spread[second]
         factor = jax.scipy.linalg.cho_factor(surprise + jnp.eye(len(row), dtype=state.dtype))
         moved = state - mean
@@ -96,9 +96,9 @@ def track(
     allowed = variance * jnp.diag(surprise)
 
     def closer(step, state):
-        scale = _GATE**2 * (variance + allowed * _CLOSER**step)
+        scale = _GATE**2 * (variance + allowed * _CLOSER ** step.astype(mean.dtype))
         residual, *_ = linear(state)
-        return solved(state, known / (1 + residual * residual / scale) ** 2)[0]
+        return solved(state, jnp.where(known, 1 / (1 + residual * residual / scale) ** 2, 0))[0]
 
     state = jax.lax.fori_loop(0, _STEPS, closer, mean)
     residual, *_ = linear(state)
@@ -139,7 +139,7 @@ def expected_ranges(pose: Float[Array, "3"], scene: Scene, paths: EchoPaths) -> 
 def _spread(belief: Belief, paths: EchoPaths) -> Float[Array, "reflectors echoes"]:
     """Variance of the range in which each path would hear each reflector, square metres."""
     count = belief.scene.kind.shape[0]
-    own = 3 + 2 * jnp.arange(count)[:, None] + jnp.arange(2)
+    own = 3 + 2 * jnp.arange(count)[:, None] + jnp.arange(2)[None]
     of_pose, between = belief.covariance[:3, :3], belief.covariance[:3, own]  # (3, reflectors, 2)
     of_own = belief.covariance[own[:, :, None], own[:, None, :]]
 
