@@ -57,7 +57,7 @@ def slam(options: argparse.Namespace) -> None:
 
     # Everything is made before anything is written.
     trajectory = found.trajectory
-    against = None if truth is None else _errors(errors, trajectory, truth, found, options.truth)
+    against = None if truth is None else _errors(errors, trajectory, truth, found, str(options.truth))
     figure = None
     if options.figure:
         from . import figures_slam
@@ -220,12 +220,12 @@ def _pose(text: str) -> tuple[float, float, float]:
     import math
 
     try:
-        x, y, degrees = (float(part) for part in text.split(","))
-        good = all(abs(value) < 1e8 for value in (x, y, degrees))  # False for NaN
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        good = False
-    if not good:
+        numbers = []
+    if len(numbers) != 3 or not all(abs(value) < 1e8 for value in numbers):  # False for NaN
         raise argparse.ArgumentTypeError(f"{text!r} came; allowed are three numbers X,Y,DEG, such as 1.5,-0.2,90")
+    x, y, degrees = numbers
     return x, y, math.radians(degrees)
 
 
@@ -278,7 +278,7 @@ def _rows(ties: list, found: "Slam") -> "np.ndarray":
     """Rows of the trajectory of closures whose scans have poses."""
     import numpy as np
 
-    known = np.isfinite(found.poses).all(axis=1)
+    known = np.asarray(np.isfinite(found.poses).all(axis=1))
     row = np.cumsum(known) - 1
     pairs = [(row[tie.first], row[tie.second]) for tie in ties if known[tie.first] and known[tie.second]]
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)

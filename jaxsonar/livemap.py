@@ -115,8 +115,8 @@ class LiveMap:
             self._mapper.map(self._mapper.including(self._mapper.start(), [warm[0].scan], [warm[0].model]))
             return
         state = self._mapper.start()
-        for one in (*warm, *warm):
-            state, _ = self._mapper.step(state, one.scan, model=one.model)
+        for number, taken in enumerate((*warm, *warm)):
+            state, _ = self._mapper.step(state, replace(taken.scan, scan=number), model=taken.model)
         self._mapper.map(state)
 
     def take(self, raws: Sequence[RawScan]) -> list[LiveScan]:

@@ -169,7 +169,7 @@ def localize(
 
 def _odometry(log: Log, models: Sequence[LocalModel]) -> Float[np.ndarray, "scans 3"]:
     """Of the log, or from the scans themselves where there is none; NaN where a scan has no place."""
-    known = np.isfinite(log.pose).all(axis=1)
+    known = np.asarray(np.isfinite(log.pose).all(axis=1))
     if known.any():
         return np.where(known[:, None], log.pose, np.nan)
     parts = place_parts(models, None, blur=_BLUR) if len(models) > 1 else []
@@ -187,7 +187,7 @@ def _judged(places: Sequence[Place], scans: int, margins: tuple[float, float], l
         share = f": at the best place {100 * places[0].explained:.0f} % of their echoes fit" if places else ""
         return False, f"{of}: no place in the map fits{share}; needed are {100 * least:.0f} %"
     best, others = places[0], [place.nats for place in places[1:]]
-    margin = best.nats - float(logsumexp(others)) if others else np.inf
+    margin = best.nats - float(np.asarray(logsumexp(others))) if others else np.inf
     needed = margins[0] + margins[1] * max(best.nats, 0.0)
     if margin < needed:
         alike = [place for place in places if place.nats > best.nats - needed]

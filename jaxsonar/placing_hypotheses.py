@@ -131,8 +131,8 @@ def only_pose(
     """
     widest = priors[-1]
     near = places.near(widest.pose[:2], 3 * widest.sigma[0] + 2 * seen.radius)
-    found = [refined(seen, near, prior, reach) for prior in priors]
-    poses, nats, information = (np.concatenate(part) for part in zip(*found, strict=True))
+    refined = [_refined(seen, near, prior, reach) for prior in priors]
+    poses, nats, information = (np.concatenate(part) for part in zip(*refined, strict=True))
     if not len(poses):
         return None
     best = int(nats.argmax())
@@ -146,7 +146,7 @@ def only_pose(
     return np.append(poses[best, :2], wrap_angle(float(poses[best, 2])))
 
 
-def refined(
+def _refined(
     seen: Seen, places: Places, prior: Prior, reach: float
 ) -> tuple[Float[np.ndarray, "poses 3"], Float[np.ndarray, " poses"], Float[np.ndarray, "poses 3 3"]]:
     """The best hypotheses under a prior: poses, their evidence in nats, and their information."""

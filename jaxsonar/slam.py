@@ -192,7 +192,7 @@ class Slam:
     odometry: Float[np.ndarray, "scans 3"]
     """The poses of the log."""
     closures: tuple[Tie, ...]
-    step_ms: Float[np.ndarray, " scans"]
+    step_ms: Float[np.ndarray, " steps"]
     """Milliseconds of each scan's step; empty where the log was not taken scan by scan."""
     smoothed: Smoothed | None
     """What the smoothing found; None without it."""
@@ -251,7 +251,8 @@ def slam(
     slip = slip or Slip()
     if not len(log):
         raise SonarError("slam: no scan in the log; allowed is a log with one or more")
-    odometry = np.where(np.isfinite(log.pose).all(axis=1)[:, None], log.pose, np.nan)
+    here = np.asarray(np.isfinite(log.pose).all(axis=1))
+    odometry = np.where(here[:, None], log.pose, np.nan)
     measured = bool(np.isfinite(odometry).any())
     if window is None and float(np.asarray(ring.echo_paths.width).sum() / (2 * np.pi)) < SPARSE:
         window = WINDOW

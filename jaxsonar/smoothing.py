@@ -37,10 +37,10 @@ _ANCHOR, _LOOSE = 1e-5, (30.0, 30.0, 3.0)  # m, rad; the first pose, and all oth
 SPARSE_SIGMA = 0.01
 """Metres; noise that is taken for granted of sparse rings."""
 _NEAR = (0.05, 0.05, 0.05)  # m, rad; how good the start is, in the first round
-_MARGINS = (4.0, 2.0)  # nats; for scans without a place, surely at first
+_MARGINS = (4.0, 2.0)  # nats; for scans without a place, surely at first; without odometry only so
 _BLUR = 0.2  # of local models, for a ring that is calibrated
 _NOISIER = 1.15  # so much more noise, and scans were laid together that do not belong together
-_ODD = 0.4  # of the share of echoes that is explained elsewhere: a scan with less stands in the wrong place
+_ODD = 0.5  # of the share of echoes that is explained elsewhere: a scan with less stands in the wrong place
 _MANY, _FEW_STEPS, _FEW_MAPS = 100, 4, 2  # scans; from there on rounds are cut short: the next one goes on
 _LEAST = 3  # echoes that a pose without odometry rests on
 
@@ -121,7 +121,8 @@ def smooth(
     # 1. Maps and least squares in turn, from the poses as they came.
     best = job.settled(_led(given, measured))
     # 2. The map is better now: scans that had no place may find one.
-    for margin in _MARGINS if models is not None else ():
+    margins = _MARGINS if _placed(measured).any() else _MARGINS[:1]
+    for margin in margins if models is not None else ():
         if _placed(best.poses).all():
             break
         say("looking again for scans without a place")

@@ -7,6 +7,7 @@ taken in by their ranges, and what is new becomes known. Nothing here depends on
 from dataclasses import dataclass, replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -30,7 +31,7 @@ SEEN_TWICE = 2
 """Scans that see a reflector that is kept."""
 LOST = 3
 """Scans in a row that know nothing of what they see, after which the robot is elsewhere than odometry says."""
-ELSEWHERE = (0.5, 0.5)
+ELSEWHERE = (1.5, 1.0)
 """Standard deviation of where that is, metres and radians."""
 GATE, DOUBT = 4.0, 5.0
 """Sigma; how far an echo may be off its reflector, and how near to its range another one's makes it doubtful."""
@@ -152,7 +153,9 @@ def update(
         feature = echoes.claimed(seen, noise)
         found = echoes.tracked(track.known, _of(first.reflector, feature), noise)
         matches = match(echoes.known(track.known, found), seen, full=full)
-        fresh = np.flatnonzero(matches.fresh & grow)
+        strange = len(seen.kind) > 1 and len(track.known) > 1 and not (first.reflector >= 0).any()
+        # What a robot sees that is elsewhere must not become known here.
+        fresh = np.flatnonzero(matches.fresh & (grow and not strange))
         known = _with_new(track.known, seen.take(fresh), np.asarray(found.belief.pose))
         reflector = matches.reflector.copy()
         reflector[fresh] = len(track.known) + np.arange(len(fresh))
@@ -163,7 +166,6 @@ def update(
     explains = np.bincount(every[used], minlength=len(known)) > 0
     known = _seen_farther(known, seen, reflector, explains)
     residual = np.asarray(found.residual)[: len(echoes)][used]
-    strange = len(seen.kind) > 1 and len(track.known) > 1 and not (first.reflector >= 0).any()
     freedom = max(0.0, len(residual) * (1 - 1 / 8))  # what is estimated of a scan takes about an eighth
     return replace(
         track,
@@ -311,7 +313,7 @@ def _geometry(ring: Ring) -> kernels.EchoPaths:
 
 
 def _moved(paths: kernels.EchoPaths, pose: Float[np.ndarray, "echoes 3"]) -> kernels.EchoPaths:
-    moved_paths = jax.vmap(kernels.moved_path)(paths, pose)
+    moved_paths = jax.vmap(kernels.moved_path)(paths, jnp.asarray(pose))
     return jax.tree.map(np.asarray, moved_paths)
 
 

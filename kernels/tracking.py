@@ -144,7 +144,7 @@ def _spread(belief: Belief, paths: EchoPaths) -> Float[Array, "reflectors echoes
     of_own = belief.covariance[own[:, :, None], own[:, None, :]]
 
     def one(reflector, between, of_own, path):
-        _, by_pose, by_own = _echo(belief.pose, reflector, path)
+        _, by_pose, by_own = _echo(jnp.asarray(belief.pose), reflector, path)
         return by_pose @ of_pose @ by_pose + 2 * by_pose @ between @ by_own + by_own @ of_own @ by_own
 
     each_path = jax.vmap(one, in_axes=(None, None, None, 0))
@@ -163,7 +163,7 @@ def _echo(pose: Float[Array, "3"], reflector: Scene, path: EchoPaths):
     )
     theta = reflector.parameters[1]
     n, t, ahead, left = normal(theta), tangent(theta), normal(pose[2]), tangent(pose[2])
-    offset = reflector.anchor - pose[:2]
+    offset = jnp.asarray(reflector.anchor) - pose[:2]
     # A plane is (distance + n . offset, theta - heading), a point the offset to it turned by the heading.
     plane = reflector.kind == PLANE
     across = a * ahead + b * left

@@ -36,7 +36,7 @@ def _checked(of=None, *, typechecker):
         return lambda one: _checked(one, typechecker=typechecker)
     function = vars(of).get("__init__") if dataclasses.is_dataclass(of) and inspect.isclass(of) else of
     if not isinstance(function, types.FunctionType) or not all(map(_plain, function.__annotations__.values())):
-        return _with_shapes(of, typechecker=typechecker)
+        return _with_shapes(of, typechecker=typechecker)  # pyright: ignore
     checked = typechecker(function)
     if function is of:
         return checked
@@ -73,7 +73,11 @@ def short_demo(tmp_path_factory):
     folder, tables, said, run_demo = tmp_path_factory.mktemp("readme"), [], [], demo.run_demo
 
     def run(output, *, on_step, **choices):
-        tables.extend(run_demo(output, on_step=lambda step: (said.append(step), on_step(step)), **choices))
+        def told(step):
+            said.append(step)
+            on_step(step)
+
+        tables.extend(run_demo(output, on_step=told, **choices))
         return tables
 
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):

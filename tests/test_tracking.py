@@ -82,6 +82,7 @@ def case(rng):
 def dense(mean, prior, path, ranges, rows=ROWS):
     """Least squares on prior and ranges, slopes by central differences; the inverse of the information."""
     state, information = mean.copy(), np.linalg.inv(prior)
+    whole = information
     for _ in range(8):
         ways = 1e-6 * np.eye(len(state))
         slope = np.stack(
