@@ -51,7 +51,7 @@ def settled_map(world: GlobalMap, found: Settled) -> GlobalMap:
         scans=tuple(world.scans[k] for k in wall),
         points=anchor[point] + parameters[point],
         point_kinds=tuple(kinds[kind] for kind in np.asarray(scene.kind)[point].tolist()),
-        point_cov=cov[point],
+        point_cov=(cov[point] + cov[point].swapaxes(1, 2)) / 2,  # an inverse is symmetric but for its digits
         point_echoes=echoes[point],
         point_scans=tuple(world.point_scans[k] for k in from_points),
     )

@@ -55,11 +55,11 @@ class Case(NamedTuple):
     model: LocalModel
 
 
-def a_case(ring, room, pose, method="ml"):
+def a_case(ring, room, pose):
     pose = np.asarray(pose, float)
     heard = simulate(ring, room, pose[None], sigma=0.003, seed=1)
     scan = heard.as_log(ring, pose[None])[0]
-    return Case(ring, room, pose, scan, local_model(ring, scan, method=method))
+    return Case(ring, room, pose, scan, local_model(ring, scan))
 
 
 def a_silent_scan():
@@ -103,13 +103,12 @@ def a_map(case):
 GRID = np.full((30, 40), UNKNOWN, np.uint8)
 GRID[5:25, 5:35] = OCCUPIED
 GRID[6:24, 6:34] = FREE
-# Method ml knows no other figures, and compiles for many seconds for every ring.
 CASES = {
     "office": office,
-    "bumper": partial(a_case, BUMPER, WALL, (0.1, 0.2, 0.05), method="hough"),
+    "bumper": partial(a_case, BUMPER, WALL, (0.1, 0.2, 0.05)),
     "poles": partial(a_case, Ring.circular(), POLES, (0.0, 0.0, 2.0)),
-    "one sensor": partial(a_case, LONE, WALL, (0.0, 0.0, 0.0), method="hough"),
-    "back to back": partial(a_case, BACK_TO_BACK, WALL, (0.0, 0.0, 0.0), method="hough"),
+    "one sensor": partial(a_case, LONE, WALL, (0.0, 0.0, 0.0)),
+    "back to back": partial(a_case, BACK_TO_BACK, WALL, (0.0, 0.0, 0.0)),
     "silence": silence,
     "beyond": beyond,
 }

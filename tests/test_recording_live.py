@@ -381,7 +381,7 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
     rng = random.Random(7)
     stems = [str(tmp_path / f"log{k}") for k in range(20)]
     pauses = [rng.choice([0.0, 0.001, 0.01]) for _ in stems]
-    moments = [rng.uniform(0.05, 1.6) for _ in stems]
+    moments = [rng.uniform(0.05, 2.6) for _ in stems]
     with ThreadPoolExecutor(4) as pool:
         told = list(pool.map(killed, stems, pauses, moments))
     for stem, (lines, when_killed) in zip(stems, told, strict=True):
