@@ -23,7 +23,7 @@ seen the edge answers as well."""
 _ROUNDS = 40
 _FINE = 1.5  # covariances of local models are bounds
 _PAIR = float(chi2.ppf(0.999, 2))
-_BESIDE = 0.6  # m; what is seen of a wall may lie this far from what is known of it
+_BESIDE = 0.3  # m; what is seen of a wall may lie this far from what is known of it
 _APART = (0.02, float(np.radians(5.0)))  # m, rad; nearer than this to something known is nothing new
 _JOINT = chi2.ppf(0.999, 2 * np.arange(1, _ROUNDS + 1))
 
