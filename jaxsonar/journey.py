@@ -1,6 +1,6 @@
 """A map that grows while the poses are estimated, too: the evidence of each submap stands where its submap lies."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -56,10 +56,7 @@ class Journey:
         poses = submaps[number].poses if number < len(submaps) else np.array(self.tracked.track.poses)
         # A submap begins with the scan that the one before ends with.
         world = composed(base, poses[-len(part) :])
-        scans = [
-            Scan(scan.scan, scan.stamp, pose, scan.tx, scan.rx, scan.range, scan.amplitude)
-            for (scan, _), pose in zip(part, world, strict=True)
-        ]
+        scans = [replace(scan, pose=pose) for (scan, _), pose in zip(part, world, strict=True)]
         return gather_evidence(ring, Log.from_scans(scans), [model for _, model in part])
 
 

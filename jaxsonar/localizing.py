@@ -23,7 +23,7 @@ from .matching import Known, features_of
 from .motion import moved, step_variance
 from .placing import place_parts
 from .placing_evidence import explained
-from .placing_hypotheses import hypotheses
+from .placing_hypotheses import hypotheses, thinned
 from .placing_map import Places, Seen, seen_of, turned
 from .poses import relative, unit, wrap_angle
 from .ring import Ring
@@ -61,6 +61,7 @@ _CLOSER = 4  # steps of Gauss and Newton before that
 _NEAR = 3.5  # standard deviations of a rough pose within which hypotheses are looked for
 _BESIDE = 0.3  # m; a wall is heard only where it was seen
 _MEETS, _SQUARE = 0.05, float(np.radians(3.0))  # m, rad; walls whose ends are so near and so square make a corner
+_CELL = (0.1, float(np.radians(4.0)))  # m, rad; hypotheses so near are one before they are scored
 _MOST = 32  # reflectors that are looked at from a pose
 
 
@@ -372,7 +373,7 @@ class _Path:
                 found = found[near & (np.abs(wrap_angle(away[:, 2])) < _NEAR * ROUGH[1])]
             if not len(found):
                 continue
-            found = _thinned(found)
+            found = thinned(found, _CELL)
             parts = np.array_split(found, -(-len(found) // 4096))
             evidence = np.concatenate([explained(places, seen, part).evidence for part in parts])
             best = found[np.argsort(-evidence, kind="stable")[: 4 * KEPT]]
@@ -380,7 +381,7 @@ class _Path:
         if not some:
             return []
         # What all of these scans say of them, as odometry has them.
-        poses = _thinned(np.concatenate(some))
+        poses = thinned(np.concatenate(some), _CELL)
         evidence = sum(explained(places, views[row], _followed_by(poses, steps[row])).evidence for row in views)
         kept: list[Float[np.ndarray, 3]] = []
         for k in np.argsort(-np.asarray(evidence), kind="stable"):
@@ -511,9 +512,3 @@ def _places(known: _Map) -> Places:
     places.point, places.kind = known.anchor[point], known.kind[point] == kernels.CORNER
     places.spread = np.sqrt(np.trace(known.cov[point], axis1=1, axis2=2) / 2)
     return places
-
-
-def _thinned(poses: Float[np.ndarray, "poses 3"]) -> Float[np.ndarray, "kept 3"]:
-    """One pose of each cell of 10 cm and 4 deg."""
-    cell = np.round(np.concatenate([poses[:, :2] / 0.1, wrap_angle(poses[:, 2:]) / np.radians(4.0)], axis=-1))
-    return poses[np.sort(np.unique(cell, axis=0, return_index=True)[1])]

@@ -8,14 +8,14 @@ from jaxtyping import Float
 from . import kernels
 from .loops_matching import blocks
 from .placing_evidence import explained
-from .placing_hypotheses import hypotheses
+from .placing_hypotheses import hypotheses, thinned
 from .placing_map import Places, Seen
 from .poses import wrap_angle
 from .submaps import Submap
 
 FLOOR = (0.03, np.radians(1.5), 0.04)
 """Added to the noise of walls (across, direction) and points while poses are rough: metres, radians, metres."""
-CELL = (0.06, np.radians(2.0))
+CELL = (0.06, float(np.radians(2.0)))
 """Starts nearer to each other than this are one."""
 SCORED, KEPT = 1500, 16
 """Starts that are scored and refined at most, and those that come out of it."""
@@ -46,7 +46,7 @@ def starts(earlier: Submap, newest: Submap, prior: Prior) -> Float[np.ndarray, "
     places, seen = _places(earlier), _seen(newest)
     poses = hypotheses(seen, places, prior.pose)
     poses = poses[prior.distance(poses) < SIGMAS**2]
-    poses = _different(poses)
+    poses = thinned(poses, CELL)
     score = explained(places, seen, poses[:SCORED]).evidence - prior.distance(poses[:SCORED]) / 2
     poses = poses[np.argsort(-score, kind="stable")[: 4 * KEPT]]
     information = np.linalg.inv(prior.covariance)
@@ -55,13 +55,7 @@ def starts(earlier: Submap, newest: Submap, prior: Prior) -> Float[np.ndarray, "
         gradient = result.gradient + prior.offset(poses) @ information
         poses = poses - np.linalg.solve(result.information + information, gradient[..., None])[..., 0]
     score = explained(places, seen, poses).evidence - prior.distance(poses) / 2
-    return _different(poses[np.argsort(-score, kind="stable")])[:KEPT]
-
-
-def _different(poses: Float[np.ndarray, "poses 3"]) -> Float[np.ndarray, "kept 3"]:
-    """The first pose of each cell, in their order."""
-    cell = np.round(np.concatenate([poses[:, :2] / CELL[0], wrap_angle(poses[:, 2:]) / CELL[1]], axis=-1))
-    return poses[np.sort(np.unique(cell, axis=0, return_index=True)[1])]
+    return thinned(poses[np.argsort(-score, kind="stable")], CELL)[:KEPT]
 
 
 def _seen(submap: Submap) -> Seen:

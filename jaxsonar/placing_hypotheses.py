@@ -169,6 +169,12 @@ def _refined(
     return poses, result.evidence + prior.log_density(poses) + room - against, information
 
 
+def thinned(poses: Float[np.ndarray, "poses 3"], cell: tuple[float, float]) -> Float[np.ndarray, "kept 3"]:
+    """The first pose of each cell of so many metres and radians, in their order."""
+    number = np.round(np.concatenate([poses[:, :2] / cell[0], wrap_angle(poses[:, 2:]) / cell[1]], axis=-1))
+    return poses[np.sort(np.unique(number, axis=0, return_index=True)[1])]
+
+
 def hypotheses(seen: Seen, places: Places, expected: Float[np.ndarray, "3"]) -> Float[np.ndarray, "poses 3"]:
     """Poses worth a look, the expected one included: two lines, a line and a point, two points, or one line."""
     alike = np.nonzero(seen.kind[:, None] == places.kind)

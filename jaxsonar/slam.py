@@ -5,7 +5,7 @@ a submap is finished --submaps.py--> SubmapGraph (loops*.py): joined, closed, wi
 the log is finished --smoothing.py--> all poses and reflectors on the raw ranges
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import NamedTuple
@@ -22,14 +22,14 @@ from .local import LocalModel, check_method, local_model, local_models
 from .logs import Log, Scan
 from .loops import SubmapGraph
 from .loops_verified import ACCEPTED, Decision
-from .mapping import build_map
+from .mapping import assemble, build_map, gather_evidence
 from .maps import GlobalMap
 from .motion import placed
 from .placing import place_parts
-from .poses import composed, relative, wrap_angle
+from .poses import composed, relative, rotation, wrap_angle
 from .ring import Ring
 from .slip import Slip
-from .smoothing import Smoothed
+from .smoothing import BLUR, Smoothed
 from .smoothing import smooth as smoothing
 from .tracking import LOST, Track, advance, begin, finished, update
 from .trajectory import Trajectory, stamps_of
@@ -150,19 +150,22 @@ class Tracker:
         for number, (rows, own, own_cov) in enumerate(parts):
             for k, row in enumerate(rows.tolist()):
                 pose[row], cov[row] = placed(state.graph.poses[number], base_cov[number], own[k], own_cov[k])
-        turn = np.eye(3)
-        c, s = np.cos(state.start[2]), np.sin(state.start[2])
-        turn[:2, :2] = [[c, -s], [s, c]]
-        return composed(state.start, pose), turn @ cov @ turn.T
+        return _from_start(state.start, pose, cov)
 
     def _here(self, state: TrackerState) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
         number = len(state.graph.submaps)
         base_cov = state.graph.last_covariance
         pose, cov = placed(state.graph.poses[number], base_cov, state.track.pose, state.track.covariance)
-        origin = np.zeros((3, 3))
-        turned, _ = placed(state.start, origin, pose, cov)
-        _, cov = placed(np.append(np.zeros(2), state.start[2]), origin, np.zeros(3), cov)
-        return turned, cov
+        return _from_start(state.start, pose, cov)
+
+
+def _from_start(
+    start: Float[np.ndarray, "3"], pose: Float[np.ndarray, "*scans 3"], cov: Float[np.ndarray, "*scans 3 3"]
+) -> tuple[Float[np.ndarray, "*scans 3"], Float[np.ndarray, "*scans 3 3"]]:
+    """Poses of the first scan's frame and their covariances in the world."""
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(start[2])
+    return composed(start, pose), turn @ cov @ turn.T
 
 
 class Tie(NamedTuple):
@@ -258,6 +261,7 @@ def slam(
         window = WINDOW
     ties: tuple[Tie, ...] = ()
     took = np.zeros(0)
+    models: list[LocalModel] | None = None
     if window is not None:
         if not measured:
             raise SonarError(
@@ -265,7 +269,7 @@ def slam(
             )
         start, covariance = odometry, np.full((len(log), 3, 3), np.nan)
     elif measured:
-        start, covariance, ties, took = _tracked(ring, log, odometry, sigma, slip, live, say)
+        start, covariance, ties, took, models = _tracked(ring, log, sigma, slip, live, say)
     else:
         models = list(local_models(ring, log, sigma=sigma))
         parts = place_parts(models, None, blur=BLUR, progress=lambda done, total: say("placing", done, total))
@@ -273,41 +277,39 @@ def slam(
     given = odometry if measured else None
     if len(log) <= MOST_SMOOTHED if smooth is None else smooth:
         choices = {"odometry": given, "sigma": sigma, "window": window, "speed": speed, "scale": scale, "slip": slip}
-        found = smoothing(ring, log, start, **choices, progress=lambda text: say(text, 0, 0))
+        found = smoothing(ring, log, start, **choices, models=models, progress=lambda text: say(text, 0, 0))
         return Slam(found.poses, found.pose_cov, stamps_of(log), found.world, log.pose, ties, took, found)
     say("building the map", 0, 0)
-    world = build_map(ring, replace(log, pose=start), sigma=sigma, window=window)
+    at = replace(log, pose=start)
+    world = build_map(ring, at, window=window) if models is None else assemble(gather_evidence(ring, at, models))
     return Slam(start, covariance, stamps_of(log), world, log.pose, ties, took, None)
 
 
-BLUR = 0.2
-"""Of local models where scans are placed without odometry: of a ring that is calibrated (``placing``)."""
-
-
 def _tracked(
-    ring: Ring,
-    log: Log,
-    odometry: Float[np.ndarray, "scans 3"],
-    sigma: float | None,
-    slip: Slip,
-    live: bool,
-    say: Callable[[str, int, int], None],
-) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"], tuple[Tie, ...], Float[np.ndarray, " scans"]]:
+    ring: Ring, log: Log, sigma: float | None, slip: Slip, live: bool, say: Callable[[str, int, int], None]
+) -> tuple[
+    Float[np.ndarray, "scans 3"],
+    Float[np.ndarray, "scans 3 3"],
+    tuple[Tie, ...],
+    Float[np.ndarray, " scans"],
+    list[LocalModel],
+]:
+    """Poses, covariances, closures, milliseconds of each step, and the local models."""
     tracker = Tracker(ring=ring, sigma=sigma, slip=slip)
     state, took = tracker.start(), np.zeros(len(log))
-    models: Sequence[LocalModel | None] = [None] * len(log)
-    if not live:
-        models = []
-        for model in local_models(ring, log, sigma=sigma):
-            models.append(model)
-            say("local models", len(models), len(log))
+    models: list[LocalModel] = []
+    for model in () if live else local_models(ring, log, sigma=sigma):
+        models.append(model)
+        say("local models", len(models), len(log))
     for row in range(len(log)):
         begun = perf_counter()
-        state, _ = tracker.step(state, log[row], model=models[row])
+        state, step = tracker.step(state, log[row], model=None if live else models[row])
         took[row] = 1e3 * (perf_counter() - begun)
+        if live:
+            models.append(step.model)
         say("tracking", row + 1, len(log))
     state = tracker.finish(state)
-    return *tracker.poses(state), ties_of(state.graph), took
+    return *tracker.poses(state), ties_of(state.graph), took, models
 
 
 def ties_of(graph: SubmapGraph) -> tuple[Tie, ...]:

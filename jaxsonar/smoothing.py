@@ -29,6 +29,8 @@ from .smoothing_map import settled_map
 from .surroundings import seen_world, surroundings
 from .windows import check_window
 
+BLUR = 0.2
+"""Of local models where scans are placed: of a ring that is calibrated (``placing``)."""
 SCALE_SD = 0.05
 """Relative; wheels and track of an odometry that was never calibrated."""
 _TOGETHER = 4  # echoes of one reflector in a scan
@@ -38,7 +40,6 @@ SPARSE_SIGMA = 0.01
 """Metres; noise that is taken for granted of sparse rings."""
 _NEAR = (0.05, 0.05, 0.05)  # m, rad; how good the start is, in the first round
 _MARGINS = (4.0, 2.0)  # nats; for scans without a place, surely at first; without odometry only so
-_BLUR = 0.2  # of local models, for a ring that is calibrated
 _NOISIER = 1.15  # so much more noise, and scans were laid together that do not belong together
 _ODD = 0.5  # of the share of echoes that is explained elsewhere: a scan with less stands in the wrong place
 _MANY, _FEW_STEPS, _FEW_MAPS = 100, 4, 2  # scans; from there on rounds are cut short: the next one goes on
@@ -87,6 +88,7 @@ def smooth(
     speed: bool = False,
     scale: bool = False,
     slip: Slip | None = None,
+    models: Sequence[LocalModel] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Smoothed:
     """Adjust all poses, walls and corners to the ranges.
@@ -104,6 +106,7 @@ def smooth(
         speed: whether the speed of sound is estimated.
         scale: whether the scales of the odometry's ways and turns are.
         slip: noise of the odometry; as ``Slip()`` if left out.
+        models: the local models of the scans, if they are known already; not with a window.
         progress: told what is being done.
 
     Raises:
@@ -113,8 +116,7 @@ def smooth(
     say = progress or (lambda text: None)
     sigma = SPARSE_SIGMA if sigma is None and window is not None else sigma
     modes = _modes(ring, speed=speed, scale=scale)
-    models = None
-    if window is None:
+    if window is None and models is None:
         say("local models")
         models = list(local_models(ring, log, sigma=sigma))
     job = _Job(ring, log, measured, modes, slip or Slip(), sigma, window, models, int(_placed(given).argmax()), say)
@@ -126,7 +128,7 @@ def smooth(
         if _placed(best.poses).all():
             break
         say("looking again for scans without a place")
-        more = place_more(models or [], best.poses, measured, margin=margin, blur=_BLUR)
+        more = place_more(models or [], best.poses, measured, margin=margin, blur=BLUR)
         if _placed(more).sum() > _placed(best.poses).sum():
             fit = job.settled(more)
             best = fit if fit.round.used > best.round.used and fit.sigma < _NOISIER * best.sigma else best

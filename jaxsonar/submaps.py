@@ -11,6 +11,9 @@ from jaxtyping import Float, Int
 
 from jaxsonar import kernels
 
+from .placing_map import tangent_of
+from .poses import unit
+
 
 @dataclass(frozen=True, eq=False)
 class Submap:
@@ -51,7 +54,7 @@ class Submap:
         """Both ends of every wall, metres."""
         row = self.walls
         theta = self.parameters[row, 1]
-        normal, along = np.stack([np.cos(theta), np.sin(theta)], -1), np.stack([-np.sin(theta), np.cos(theta)], -1)
+        normal, along = unit(theta), tangent_of(theta)
         middle = self.anchor[row] + self.parameters[row, :1] * normal
         return middle[:, None] + self.ends[row][..., None] * along[:, None]
 

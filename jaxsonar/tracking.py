@@ -18,7 +18,7 @@ from .local import LocalModel
 from .logs import Scan
 from .matching import Features, Known, features_of, match
 from .motion import moved, step_variance
-from .poses import relative, rotation, to_world, unit
+from .poses import relative, to_world, unit
 from .ring import Ring
 from .slip import Slip
 from .submaps import Submap
@@ -41,6 +41,7 @@ _NEW = np.array([0.5, 0.3])  # m, rad; a reflector before its first echoes are t
 _SEEN, _ROOM, _ECHOES = 16, 32, 64  # features, reflectors, echoes; powers of two from there on are compiled
 _SIGMA, _CREDIT = 0.003, 30.0  # m; noise before any is known, and the echoes that this is worth
 _LEAST_SIGMA = 1e-5
+_LEFT = 7 / 8  # of the echoes of a scan, the rest is what is estimated of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,18 +167,18 @@ def update(
     explains = np.bincount(every[used], minlength=len(known)) > 0
     known = _seen_farther(known, seen, reflector, explains)
     residual = np.asarray(found.residual)[: len(echoes)][used]
-    freedom = max(0.0, len(residual) * (1 - 1 / 8))  # what is estimated of a scan takes about an eighth
+    squares = float(residual @ residual)
     return replace(
         track,
         known=known,
         rows=(*track.rows, row),
         poses=(*track.poses, known.pose),
         covs=(*track.covs, known.covariance[:3, :3]),
-        squares=track.squares + float(residual @ residual) if freedom else track.squares,
-        free=track.free + freedom,
+        squares=track.squares + squares,
+        free=track.free + len(residual) * _LEFT,
         strange=track.strange + 1 if strange else 0,
         explained=len(residual),
-        squared=float(residual @ residual) / noise**2,
+        squared=squares / noise**2,
     )
 
 
@@ -241,17 +242,7 @@ class _Echoes:
         if not count or not self.count:
             return np.full(self.count, -1)
         room = power_of_two(count, least=_SEEN)
-        wall = (seen.kind == kernels.PLANE)[:, None]
-        half = np.linalg.norm(seen.segment[:, 1] - seen.segment[:, 0], axis=-1) / 2
-        middle = seen.segment.mean(axis=1)
-        normal = unit(seen.place[:, 1])
-        distance = seen.place[:, 0] - (normal * middle).sum(-1)
-        scene = kernels.Scene(
-            kind=_pad(seen.kind, room, -1),
-            parameters=_pad(np.where(wall, np.stack([distance, seen.place[:, 1]], -1), 0.0), room),
-            anchor=_pad(np.where(wall, middle, seen.place), room),
-            ends=_pad(np.where(wall, half[:, None] * [-1.0, 1.0], 0.0), room),
-        )
+        scene = _in_room(scene_of(seen, np.zeros(3)), room)
         expected = np.asarray(kernels.expected_ranges(np.zeros(3), scene, self.path))[:count, : self.count]
         off = np.abs(expected - self.ranges[: self.count])
         best = off.argmin(axis=0)
@@ -266,12 +257,7 @@ class _Echoes:
         covariance[:used, :used] = known.covariance
         belief = kernels.Belief(
             known.pose,
-            kernels.Scene(
-                _pad(known.kind, room, -1),
-                _pad(known.parameters, room),
-                _pad(known.anchor, room),
-                _pad(known.ends, room),
-            ),
+            _in_room(known.scene, room),
             covariance,
         )
         rows = _pad(row.astype(np.int32), len(self.ranges), -1)
@@ -317,32 +303,45 @@ def _moved(paths: kernels.EchoPaths, pose: Float[np.ndarray, "echoes 3"]) -> ker
     return jax.tree.map(np.asarray, moved_paths)
 
 
+def scene_of(seen: Features, pose: Float[np.ndarray, "3"]) -> kernels.Scene:
+    """What a scan sees as reflectors of the frame that its pose is of; walls are anchored in their middle."""
+    segment = to_world(pose, seen.segment)
+    middle, half = segment.mean(axis=1), np.linalg.norm(segment[:, 1] - segment[:, 0], axis=-1) / 2
+    theta = seen.place[:, 1] + pose[2]
+    normal = unit(theta)
+    distance = seen.place[:, 0] + normal @ pose[:2] - (normal * middle).sum(-1)
+    wall = (seen.kind == kernels.PLANE)[:, None]
+    return kernels.Scene(
+        kind=seen.kind,
+        parameters=np.where(wall, np.stack([distance, theta], -1), 0.0),
+        anchor=np.where(wall, middle, to_world(pose, seen.place)),
+        ends=np.where(wall, half[:, None] * [-1.0, 1.0], 0.0),
+    )
+
+
+def _in_room(scene: kernels.Scene, room: int) -> kernels.Scene:
+    """With room for so many reflectors."""
+    rest = (_pad(np.asarray(leaf), room) for leaf in (scene.parameters, scene.anchor, scene.ends))
+    return kernels.Scene(_pad(np.asarray(scene.kind), room, -1), *rest)
+
+
 def _with_new(known: Known, new: Features, pose: Float[np.ndarray, "3"]) -> Known:
     """Reflectors that are seen for the first time, as wide as before their first echo."""
     count = len(new.kind)
     if not count:
         return known
-    turned = rotation(pose[2])
-    segment = to_world(pose, new.segment)
-    middle, half = segment.mean(axis=1), np.linalg.norm(segment[:, 1] - segment[:, 0], axis=-1) / 2
-    theta = new.place[:, 1] + pose[2]
-    normal = unit(theta)
-    rho = new.place[:, 0] + normal @ pose[:2]
-    wall = (new.kind == kernels.PLANE)[:, None]
-    points = pose[:2] + new.place @ turned.T
+    scene = scene_of(new, pose)
     size = len(known.covariance)
     covariance = np.zeros((size + 2 * count,) * 2)
     covariance[:size, :size] = known.covariance
-    wide = np.where(wall, _NEW, _NEW[0]).ravel()
+    wide = np.where((new.kind == kernels.PLANE)[:, None], _NEW, _NEW[0]).ravel()
     covariance[np.arange(size, size + 2 * count), np.arange(size, size + 2 * count)] = wide**2
     return Known(
         pose=known.pose,
-        kind=np.concatenate([known.kind, new.kind]).astype(np.int32),
-        parameters=np.concatenate(
-            [known.parameters, np.where(wall, np.stack([rho - (normal * middle).sum(-1), theta], -1), 0.0)]
-        ),
-        anchor=np.concatenate([known.anchor, np.where(wall, middle, points)]),
-        ends=np.concatenate([known.ends, np.where(wall, half[:, None] * [-1.0, 1.0], 0.0)]),
+        kind=np.concatenate([known.kind, scene.kind]).astype(np.int32),
+        parameters=np.concatenate([known.parameters, scene.parameters]),
+        anchor=np.concatenate([known.anchor, scene.anchor]),
+        ends=np.concatenate([known.ends, scene.ends]),
         covariance=covariance,
         scans=np.concatenate([known.scans, np.zeros(count, np.int64)]),
     )

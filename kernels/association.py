@@ -5,10 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .paths import EchoPaths, Sensors, chord_squared, echo_paths
+from .paths import WIDER, EchoPaths, Sensors, echo_paths, widened
 from .scene import AnyArray, Reflection, Scene, audible, expected_report, take
-
-_WIDER = 1.2  # cones, for sensors that look a little elsewhere than they should
 
 
 class Candidates(eqx.Module):
@@ -57,9 +55,7 @@ def associate(
         reported: half path lengths as reported, metres; NaN where there is no echo.
         near: rows of the candidates that each scan may hear; -1 for none.
     """
-    paths = echo_paths(sensors)
-    half_beam = jnp.minimum(_WIDER * 2 * jnp.arcsin(jnp.sqrt(paths.cone) / 2), jnp.pi / 2)
-    paths = eqx.tree_at(lambda p: p.cone, paths, chord_squared(half_beam))
+    paths = widened(echo_paths(sensors), WIDER)
 
     def report(pose, reflection, first, second, path: EchoPaths):
         reach, share, _ = audible(pose, reflection, first, second, path)

@@ -153,9 +153,14 @@ def lowpass(votes: Num[Array, "theta rho"], settings: HoughSettings) -> Float[Ar
     wide = jnp.zeros((rows + 2 * half, columns)).at[half : half + rows].set(smooth)
     wide = wide.at[:half].set(smooth[rows - half :]).at[half + rows :].set(smooth[:half])
     smooth = sum((tap * wide[k : k + rows] for k, tap in enumerate(taps)), start=jnp.zeros(()))
-    before = jnp.roll(smooth[:, :half][:, ::-1], rows // 2, axis=0)  # (-rho, theta) is (rho, theta + pi)
+    before = _before(smooth, half)
     wide = jnp.zeros((rows, columns + 2 * half)).at[:, half : half + columns].set(smooth).at[:, :half].set(before)
     return sum((tap * wide[:, k : k + columns] for k, tap in enumerate(taps)), start=jnp.zeros(()))
+
+
+def _before(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "theta width"]:
+    """So many columns before the first one: (-rho, theta) is (rho, theta + pi)."""
+    return jnp.roll(cells[:, :width][:, ::-1], len(cells) // 2, axis=0)
 
 
 def bordered(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "rows columns"]:
@@ -164,7 +169,7 @@ def bordered(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "rows
     One array in memory, so that what reads it with all its neighbors is one loop.
     """
     rows, columns = cells.shape
-    before = jnp.roll(cells[:, :width][:, ::-1], rows // 2, axis=0)  # (-rho, theta) is (rho, theta + pi)
+    before = _before(cells, width)
     wide = jnp.zeros((rows + 2 * width, columns + 2 * width), cells.dtype)
     wide = wide.at[width:-width, width:-width].set(cells).at[width:-width, :width].set(before)
     return wide.at[:width].set(wide[rows : rows + width]).at[rows + width :].set(wide[width : 2 * width])

@@ -7,6 +7,9 @@ from jaxtyping import Array, Float, Int
 
 from .geometry import normal, tangent, wrap_angle
 
+WIDER = 1.2
+"""By so much the cones are taken to be wider where echoes are laid to reflectors."""
+
 
 class Sensors(eqx.Module):
     """What the kernels know of a ring. Every field is a leaf: change a pose and nothing is compiled anew."""
@@ -51,6 +54,12 @@ class EchoPaths(eqx.Module):
 def chord_squared(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Squared distance of two unit vectors this angle apart (radians, at most pi counts), without cancellation."""
     return 4 * jnp.sin(jnp.minimum(angle, jnp.pi) / 2) ** 2
+
+
+def widened(paths: EchoPaths, factor: float) -> EchoPaths:
+    """The same paths with wider cones, half a plane at most: for sensors that look elsewhere than they should."""
+    half_beam = jnp.minimum(factor * 2 * jnp.arcsin(jnp.sqrt(paths.cone) / 2), jnp.pi / 2)
+    return eqx.tree_at(lambda p: p.cone, paths, chord_squared(half_beam))
 
 
 def moved_path(path: EchoPaths, pose: Float[Array, "3"]) -> EchoPaths:

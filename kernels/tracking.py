@@ -12,12 +12,11 @@ from jaxtyping import Array, Float, Int
 from . import reflectors
 from .explanation import CORNER, EDGE, PLANE
 from .geometry import dot, normal, tangent
-from .paths import EchoPaths, chord_squared
+from .paths import WIDER, EchoPaths, widened
 from .scene import AnyArray, Scene, seen_from
 
 _STEPS, _CLOSER = 4, 0.05  # variance that the belief allows shrinks so much with each step
 _GATE = 4.0  # sigma; an echo farther off is as likely false
-_WIDER = 1.2  # cones, for sensors that look a little elsewhere than they should
 _SLACK = 0.05  # m; farther behind what was seen of a wall an echo is more likely of its edge
 
 
@@ -119,8 +118,7 @@ def expected_ranges(pose: Float[Array, "3"], scene: Scene, paths: EchoPaths) -> 
         scene: (reflectors,) in that frame; a wall is heard up to 5 cm behind what was seen of it.
         paths: (echoes,) in the robot frame, their cones a little widened here.
     """
-    half_beam = jnp.minimum(_WIDER * 2 * jnp.arcsin(jnp.sqrt(paths.cone) / 2), jnp.pi / 2)
-    paths = eqx.tree_at(lambda p: p.cone, paths, chord_squared(half_beam))
+    paths = widened(paths, WIDER)
 
     def one(reflector: Scene, path: EchoPaths):
         local = seen_from(pose, reflector)
