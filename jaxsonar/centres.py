@@ -79,11 +79,22 @@ def mean_lines(
         count: of means; NaN for those that no line belongs to.
     """
     number, rho, x, y = (np.bincount(own, values, minlength=count) for values in (lines, rho, normal_x, normal_y))
-    rho = np.divide(rho, number, out=np.full(count, np.nan), where=number > 0)
-    theta = np.arctan2(np.where(rho < 0, -y, y), np.where(rho < 0, -x, x))  # (-rho, n) is (rho, -n)
+    side = np.where(rho < 0, -1.0, 1.0)  # (-rho, n) is (rho, -n)
+    theta = np.arctan2(side * y, side * x)
     theta[theta >= np.pi] = -np.pi
-    theta[number == 0] = np.nan
-    return np.abs(rho), theta, number.astype(np.int64)
+    none = number == 0
+    theta[none] = np.nan
+    rho = np.abs(rho) / np.where(none, np.nan, number)
+    return rho, theta, number.astype(np.int64)
+
+
+class NormalSums(NamedTuple):
+    """Sums over the normals of the first k points of every path, k from 0 to all: those of a run are a difference."""
+
+    x: Float[np.ndarray, "paths points_and_one"]
+    """Of their cosines."""
+    y: Float[np.ndarray, "paths points_and_one"]
+    """Of their sines."""
 
 
 class _Runs(NamedTuple):
@@ -124,20 +135,38 @@ def _runs(
     begins[::width] |= piece.ravel() == 0
     first = np.flatnonzero(begins)
     used = np.flatnonzero(label[first])
-    points, total = np.diff(first, append=rho.size)[used], np.add.reduceat(rho, first)[used]
-    first = first[used]
-    label, behind, (at, within) = label[first].astype(np.int64), behind[first], np.divmod(first, width)
+    end = np.empty_like(first)
+    end[:-1], end[-1] = first[1:], rho.size
+    first, points, total = first[used], (end - first)[used], np.add.reduceat(rho, first)[used]
+    label, behind, at = label[first].astype(np.int64), behind[first], first // width
     scan, echo = at // owner.shape[1], owner.ravel()[at]
-    # Normals of an arc are equidistant, so the sum of a run's has the direction of its middle.
-    theta = np.asarray(arcs.arcs.theta, np.float64)
     path = step.path[scan, echo]
-    half = np.maximum((theta[:, -1] - theta[:, 0]) / (2 * theta.shape[1] - 2), 1e-9)[path]
-    middle = theta[path, piece.ravel()[at] * width + within] + (points - 1) * half
+    begin = piece.ravel()[at] * width + first - at * width
+    sums = _normal_sums(arcs)
+    normal_x, normal_y = (total[path, begin + points] - total[path, begin] for total in sums)
     if step.pose is not None:
-        middle = middle + step.pose[scan, echo, 2]
-    side = np.where(behind, -1, 1) * np.sign(label)
-    long = side * np.sin(points * half) / np.sin(half)
-    return _Runs(scan, echo, label, points, side * total, long * np.cos(middle), long * np.sin(middle))
+        turn = unit(step.pose[scan, echo, 2])
+        normal_x, normal_y = (
+            turn[:, 0] * normal_x - turn[:, 1] * normal_y,
+            turn[:, 1] * normal_x + turn[:, 0] * normal_y,
+        )
+    side = np.where(behind ^ (label < 0), -1.0, 1.0)
+    return _Runs(scan, echo, label, points, side * total, side * normal_x, side * normal_y)
+
+
+_latest: list[tuple[kernels.RingArcs, NormalSums]] = []
+
+
+def _normal_sums(arcs: kernels.RingArcs) -> NormalSums:
+    """The latest are kept, so that a stream of single scans makes them once."""
+    for known, sums in tuple(_latest):
+        if known is arcs:
+            return sums
+    theta = np.asarray(arcs.arcs.theta, np.float64)
+    normals = np.stack([np.cos(theta), np.sin(theta)])
+    sums = NormalSums(*np.cumsum(np.pad(normals, ((0, 0), (0, 0), (1, 0))), axis=-1))
+    _latest[:] = [(arcs, sums)]
+    return sums
 
 
 def sensors_of(arcs: kernels.RingArcs, step: Step) -> Float[np.ndarray, "scans echoes 2"]:
@@ -161,11 +190,14 @@ def _extents(
     segments = np.full((rho.size, 2, 2), np.nan, np.float32)
     line, echo = np.divmod(np.flatnonzero(involved), involved.shape[2])
     if len(line):
-        rho, x, y = rho.ravel()[:, None], np.cos(theta).ravel()[:, None], np.sin(theta).ravel()[:, None]
+        x, y = np.cos(theta).ravel(), np.sin(theta).ravel()
         sensor = sensors[line // involved.shape[1], echo]
-        foot = sensor[:, 1] * x[line, 0] - sensor[:, 0] * y[line, 0]
-        first = np.flatnonzero(np.diff(line, prepend=-1))
-        ends = np.stack([np.minimum.reduceat(foot, first), np.maximum.reduceat(foot, first)], axis=-1)
+        foot = sensor[:, 1] * x[line] - sensor[:, 0] * y[line]
+        first = np.flatnonzero(np.concatenate([[True], line[1:] != line[:-1]]))
         own = line[first]
-        segments[own] = np.stack([rho[own] * x[own] - ends * y[own], rho[own] * y[own] + ends * x[own]], axis=-1)
+        rho, x, y = rho.ravel()[own], x[own], y[own]
+        for side, outermost in enumerate((np.minimum, np.maximum)):
+            end = outermost.reduceat(foot, first)
+            segments[own, side, 0] = rho * x - end * y
+            segments[own, side, 1] = rho * y + end * x
     return segments.reshape(*involved.shape[:2], 2, 2)

@@ -27,20 +27,23 @@ def label_components(
     cell = np.flatnonzero(occupied)
     cell += cell // (rows * columns) * columns  # among the labels, which have a row more
     row, column = np.divmod(cell, columns)
-    place = np.cumsum(np.minimum(np.diff(row, prepend=-2), 2))
+    place = np.full(len(cell), 2)
+    np.minimum(row[1:] - row[:-1], 2, out=place[1:])
+    place = np.cumsum(place)
     image = np.zeros((int(place[-1]) + 1 if len(place) else 1, columns), np.uint8)
     image[place, column] = 1
     small, kind = (np.int16, cv2.CV_16U) if len(cell) < 1 << 15 else (np.int32, cv2.CV_32S)
     total, parts = cv2.connectedComponentsWithAlgorithm(image, 8, kind, cv2.CCL_BBDT)  # the fastest here
     labels = np.zeros((scans, rows + 1, columns), small)
-    labels.ravel()[cell] = parts[place, column]
+    part = np.asarray(parts)[place, column]
+    labels.ravel()[cell] = part
 
     theta_seam = _touching(labels[:, 0], labels[:, rows - 1], wrap=False)
-    edge = labels[:, :rows, 0]
-    rho_seam = _touching(edge, np.roll(edge, rows // 2, axis=1), wrap=True)
+    edge, half = labels[:, :rows, 0], rows // 2
+    rho_seam = _touching(edge, np.concatenate([edge[:, half:], edge[:, :half]], axis=1), wrap=True)
     # From parts, as OpenCV numbers them, to components, and back to their cells.
     component_of = _joined(np.concatenate([theta_seam, rho_seam], axis=1), total)
-    component = component_of[labels.ravel()[cell]]
+    component = component_of[part]
     first = np.full(total, labels.size)
     first[component[::-1]] = cell[::-1]  # the last to write is the first cell
     order = np.argsort(first)[: np.count_nonzero(first < labels.size)]  # by scan, and within a scan by first cell
@@ -74,6 +77,8 @@ def _touching(
 ) -> Int[np.ndarray, "2 pairs"]:
     """Pairs of labels that touch: cell k of one side touches cells k-1, k and k+1 of the other."""
     scan, cell = np.nonzero(one)
+    if not len(cell) or not other.any():
+        return np.zeros((2, 0), one.dtype)
     near = cell + np.array([[-1], [0], [1]])
     beyond = other[scan, near % one.shape[1]]
     touch = beyond != 0

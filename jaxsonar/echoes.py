@@ -193,6 +193,9 @@ class FlatEchoes:
         """
         least = 64 if self.pose is None else 256
         fit, floor, worth = (power_of_two, least, 0) if dear else (room_for, least // 2, _WORTH_A_SHAPE)
+        if len(block) == 1:
+            yield block, fit(int(need[0]), least=least)
+            return
         distinct, which = np.unique(need, return_inverse=True)
         columns = np.array([fit(count, least=floor) for count in distinct.tolist()])[which]
         waiting = block[:0]

@@ -286,6 +286,7 @@ def _extracted_model(
 ) -> LocalModel:
     step = extracted.step
     index = windows.last[step.scans[row]]
+    paths, alone = ring.paths, () if windows.gap else (int(log.scan[index]),)
     lines = tuple(
         Line(
             rho=wall.rho,
@@ -293,8 +294,8 @@ def _extracted_model(
             segment=wall.segment,
             votes=wall.votes,
             echoes=len(wall.echoes),
-            paths=ring.paths[np.unique(step.path[row, wall.echoes])],
-            scans=tuple(log.scan[np.unique(windows.scan[step.echo[row, wall.echoes]])].tolist()),
+            paths=paths[_distinct(step.path[row, wall.echoes])],
+            scans=alone or tuple(log.scan[np.unique(windows.scan[step.echo[row, wall.echoes]])].tolist()),
         )
         for wall in walls
     )
@@ -323,11 +324,11 @@ def _explained_models(
 
 
 def _explained_model(ring: Ring, explained: Explained, row: int, scan: int, stamp: float) -> LocalModel:
-    step, found, decided = explained.step, explained.found, explained.decided[row]
+    step, found, decided, paths = explained.step, explained.found, explained.decided[row], ring.paths
     lines, points, undecided = [], [], []
     for k in np.flatnonzero(found.kind[row] >= 0):
         own = np.flatnonzero(found.involved[row, k])
-        seen: dict[str, Any] = {"echoes": len(own), "paths": ring.paths[np.unique(step.path[row, own])]}
+        seen: dict[str, Any] = {"echoes": len(own), "paths": paths[_distinct(step.path[row, own])]}
         a, b = found.parameters[row, k].tolist()
         cov = np.asarray(found.covariance[row, k], dtype=np.float64)
         probability: dict[str, float] = dict(zip(KINDS, found.probability[row, k].tolist(), strict=True))
@@ -352,6 +353,11 @@ def _explained_model(ring: Ring, explained: Explained, row: int, scan: int, stam
         empty = "no wall, only corners, edges and what is undecided" if others else "no reflector explains the echoes"
         empty = "no echo within the maximum range" if _heard(ring, step, row) == 0 else empty
     return LocalModel(scan, stamp, tuple(lines), empty, tuple(points), tuple(undecided), float(found.sigma[row]))
+
+
+def _distinct(index: Int[np.ndarray, " some"]) -> Int[np.ndarray, " distinct"]:
+    """Each of some small whole numbers once, ascending."""
+    return np.flatnonzero(np.bincount(index))
 
 
 def _heard(ring: Ring, step: Step, row: int) -> int:

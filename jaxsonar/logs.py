@@ -65,7 +65,16 @@ class Scan:
 
     def as_log(self) -> "Log":
         """A log of this scan alone."""
-        return Log.from_scans([self])
+        return Log(
+            scan=np.array([self.scan]),
+            stamp=np.array([self.stamp], dtype=np.float64),
+            pose=np.asarray(self.pose)[None],
+            start=np.array([0, np.size(self.tx)]),
+            tx=self.tx,
+            rx=self.rx,
+            range=self.range,
+            amplitude=self.amplitude,
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,6 +134,8 @@ class Log:
         self._refuse_echo(np.isinf(self.amplitude), "amplitude")
         self._refuse_scan(np.isinf(self.stamp), "stamp")
         self._refuse_scan(~(np.all(np.isfinite(self.pose), axis=-1) | np.all(np.isnan(self.pose), axis=-1)), "pose")
+        if len(self) < 2:
+            return
         order = np.argsort(self.scan, kind="stable")
         came_back = np.zeros(len(self), dtype=bool)
         came_back[order[1:]] = np.diff(self.scan[order]) == 0

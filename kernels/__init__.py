@@ -36,7 +36,6 @@ from .extraction import Voted as Voted
 from .extraction import accumulators as accumulators
 from .extraction import lines_of_scan as lines_of_scan
 from .extraction import moved_arcs as moved_arcs
-from .extraction import occupied_cells as occupied_cells
 from .extraction import points_of_widest_arc as points_of_widest_arc
 from .extraction import ring_arcs as ring_arcs
 from .extraction import vote as vote

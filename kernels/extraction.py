@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,8 +22,8 @@ PIECE = 16
 """Points in a piece of an arc."""
 
 
-class Echoes(eqx.Module):
-    """Echoes of scans, packed: real ones first, then padding."""
+class Echoes(NamedTuple):
+    """Echoes of scans, packed: real ones first, then padding. A tuple, which JAX takes apart without Python's help."""
 
     path: Int[AnyArray, "*scans echoes"]
     """Row of the ring's ``paths``; 0 where there is no echo."""
@@ -165,7 +165,7 @@ def over_scans(one_scan: Callable, *scans):
     )
 
 
-class Voted(eqx.Module):
+class Voted(NamedTuple):
     """What a batch of scans voted for (paper, section 4, up to the threshold)."""
 
     occupied: Bool[Array, "*scans theta rho"]
@@ -195,12 +195,6 @@ def vote(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -> Voted:
         return smooth > level  # highly occupied cells
 
     return Voted(over_scans(one_scan, lines.cell, ring.level * gathered), lines.cell, lines.rho)
-
-
-@partial(jax.jit, static_argnames="settings")
-def occupied_cells(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -> Bool[Array, "scans theta rho"]:
-    """The highly occupied cells alone; arguments as ``vote``."""
-    return vote(ring, echoes, settings=settings).occupied
 
 
 @partial(jax.jit, static_argnames="settings")

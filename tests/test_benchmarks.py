@@ -57,7 +57,7 @@ def of_product(ring, ranges):
     for step in FlatEchoes.from_dense(ring, ranges).steps(SETTINGS.cells, pieces=pieces_of(ring, SETTINGS)):
         real = slice(0, len(step.scans))
         votes[step.scans] = np.asarray(kernels.accumulators(arcs, step.packed, settings=SETTINGS)[0])[real]
-        high[step.scans] = np.asarray(kernels.occupied_cells(arcs, step.packed, settings=SETTINGS))[real]
+        high[step.scans] = np.asarray(kernels.vote(arcs, step.packed, settings=SETTINGS).occupied)[real]
     return votes, high.astype(bool)
 
 

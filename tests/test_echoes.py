@@ -61,7 +61,7 @@ def test_steps_hold_every_echo_of_every_scan_once(seed, scans, dear, cut):
 def test_pieces_vote_as_whole_arcs_do():
     arcs, flat = arcs_of(RING, SETTINGS), FlatEchoes.from_dense(RING, some_ranges(20))
     for step in flat.steps(SETTINGS.cells, pieces=pieces_of(RING, SETTINGS)):
-        whole = dataclasses.replace(step.packed, piece=None, owner=None)
+        whole = step.packed._replace(piece=None, owner=None)
         cut, uncut = (kernels.accumulators(arcs, one, settings=SETTINGS) for one in (step.packed, whole))
         jax.tree.map(np.testing.assert_array_equal, cut, uncut)
 

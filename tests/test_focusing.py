@@ -49,7 +49,7 @@ def test_slopes_agree_forward_in_reverse_and_with_finite_differences(rng, world)
     with jax.enable_x64(True):
         echoes = packed(log, dtype=np.float64)
         if not world:
-            echoes = dataclasses.replace(echoes, pose=None)
+            echoes = echoes._replace(pose=None)
         sensors = as_floats(RING.sensors, np.float64)
         given = {name: getattr(sensors, name) for name in PARAMETERS}
         # Off the cells' borders, off the symmetry of the ring, and never one step from the rim of a detection range.

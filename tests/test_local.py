@@ -270,11 +270,12 @@ def primitives(jaxpr):
 
 
 def test_one_jitted_step_from_echoes_to_cells(faw_ring):
-    """Votes, low pass and threshold are one program: no call of the host in it, and nothing but the cells leaves it."""
+    """Votes, low pass and threshold are one program: no call of the host in it, cells and points come out."""
     echoes = kernels.Echoes(jnp.zeros((2, 64), jnp.int32), jnp.full((2, 64), jnp.nan, jnp.float32))
-    step = partial(kernels.occupied_cells, settings=HoughSettings())
+    step = partial(kernels.vote, settings=HoughSettings())
     program = jax.make_jaxpr(step)(arcs_of(faw_ring, HoughSettings()), echoes)
-    assert [(out.shape, str(out.dtype)) for out in program.out_avals] == [((2, 100, 100), "bool")]
+    came = [(out.shape, str(out.dtype)) for out in program.out_avals]
+    assert came == [((2, 100, 100), "bool"), ((2, 64, 64), "int32"), ((2, 64, 64), "float32")]
     inside = set(primitives(program.jaxpr))
     assert {"sqrt", "gt"} <= inside
     assert any("scatter" in name for name in inside)

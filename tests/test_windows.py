@@ -106,7 +106,7 @@ def test_turning_the_frame_by_whole_cells_turns_the_cells(rng):
     for step in (0, 7, 50):
         motion = np.array([0, 0, step * SETTINGS.theta_cell])
         turned = packed([(composed(motion, pose), path, reach) for pose, path, reach in echoes], gathered=2.0)
-        cells = np.asarray(kernels.occupied_cells(arcs, turned, settings=SETTINGS))
+        cells = np.asarray(kernels.vote(arcs, turned, settings=SETTINGS).occupied)
         results.append(np.roll(cells[0], -step, axis=0))
     assert results[0].any()
     # A point on the border of two cells may round into the other one in single precision.
@@ -138,8 +138,8 @@ def test_scans_of_a_moving_robot_vote_for_the_wall_in_the_frame_of_the_last_pose
 def test_the_same_echoes_several_times_over_and_gathered_so_often_are_the_same_cells(rng, times):
     echoes = [*mixed_echoes(rng)][: ROOM // 4]
     arcs = arcs_of(RING, SETTINGS)
-    once = kernels.occupied_cells(arcs, packed(echoes, gathered=1.0), settings=SETTINGS)
-    often = kernels.occupied_cells(arcs, packed(echoes * times, gathered=float(times)), settings=SETTINGS)
+    once = kernels.vote(arcs, packed(echoes, gathered=1.0), settings=SETTINGS).occupied
+    often = kernels.vote(arcs, packed(echoes * times, gathered=float(times)), settings=SETTINGS).occupied
     assert once.any()
     np.testing.assert_array_equal(often, once)
 
@@ -148,7 +148,7 @@ def test_the_same_echoes_several_times_over_and_gathered_so_often_are_the_same_c
 def test_gathered_is_a_factor_of_the_threshold(rng, gathered):
     echoes, arcs = mixed_echoes(rng), arcs_of(RING, SETTINGS)
     _, smooth = kernels.accumulators(arcs, packed(echoes, gathered=gathered), settings=SETTINGS)
-    came = kernels.occupied_cells(arcs, packed(echoes, gathered=gathered), settings=SETTINGS)
+    came = kernels.vote(arcs, packed(echoes, gathered=gathered), settings=SETTINGS).occupied
     np.testing.assert_array_equal(came, np.asarray(smooth) > np.float32(arcs.level) * np.float32(gathered))
 
 
