@@ -35,15 +35,14 @@ def label_components(
     small, kind = (np.int16, cv2.CV_16U) if len(cell) < 1 << 15 else (np.int32, cv2.CV_32S)
     total, parts = cv2.connectedComponentsWithAlgorithm(image, 8, kind, cv2.CCL_BBDT)  # the fastest here
     labels = np.zeros((scans, rows + 1, columns), small)
-    part = np.asarray(parts)[place, column]
-    labels.ravel()[cell] = part
+    labels.ravel()[cell] = parts[place, column]
 
     theta_seam = _touching(labels[:, 0], labels[:, rows - 1], wrap=False)
     edge, half = labels[:, :rows, 0], rows // 2
     rho_seam = _touching(edge, np.concatenate([edge[:, half:], edge[:, :half]], axis=1), wrap=True)
     # From parts, as OpenCV numbers them, to components, and back to their cells.
     component_of = _joined(np.concatenate([theta_seam, rho_seam], axis=1), total)
-    component = component_of[part]
+    component = component_of[labels.ravel()[cell]]
     first = np.full(total, labels.size)
     first[component[::-1]] = cell[::-1]  # the last to write is the first cell
     order = np.argsort(first)[: np.count_nonzero(first < labels.size)]  # by scan, and within a scan by first cell
