@@ -265,11 +265,17 @@ def explain(
         )
 
     def nothing(packed: Echoes) -> Explanation:
-        shapes = jax.eval_shape(one_scan, packed)
-        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        noise = jnp.where(jnp.isfinite(sigma), sigma, expected.sigma).astype(zeros.sigma.dtype)
-        filled = jnp.full_like(zeros.kind, -1), jnp.full_like(zeros.evidence, -jnp.inf), noise
-        return eqx.tree_at(lambda e: (e.kind, e.evidence, e.sigma), zeros, filled)
+        size, real = expected.reflectors, packed.range.dtype
+        return Explanation(
+            kind=jnp.full(size, -1),
+            parameters=jnp.zeros((size, 2), real),
+            covariance=jnp.zeros((size, 2, 2), real),
+            probability=jnp.zeros((size, 3), real),
+            evidence=jnp.full(size, -jnp.inf, real),
+            involved=jnp.zeros((size, len(packed.path)), bool),
+            segment=jnp.zeros((size, 2, 2), real),
+            sigma=jnp.where(jnp.isfinite(sigma), sigma, jnp.asarray(expected.sigma, real)),
+        )
 
     def one_or_none(packed: Echoes) -> Explanation:  # padding costs nothing where scans come one after the other
         return jax.lax.cond(jnp.isfinite(packed.range).any(), one_scan, nothing, packed)

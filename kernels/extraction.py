@@ -158,11 +158,13 @@ def lines_of_scan(ring: RingArcs, echoes: Echoes, settings: HoughSettings) -> Ta
 
 def over_scans(one_scan: Callable, *scans):
     """One scan after the other where caches are small (CPU), all at once where cores are many (GPU)."""
-    return jax.lax.platform_dependent(
-        *scans,
-        cpu=lambda *s: jax.lax.map(lambda scan: one_scan(*scan), s),
-        default=lambda *s: jax.vmap(one_scan)(*s),
-    )
+
+    def in_turn(*scans):
+        return jax.lax.map(lambda scan: one_scan(*scan), scans)
+
+    if jax.default_backend() == "cpu":  # nothing else is there, as a rule: the other way need not be traced
+        return in_turn(*scans)
+    return jax.lax.platform_dependent(*scans, cpu=in_turn, default=jax.vmap(one_scan))
 
 
 class Voted(NamedTuple):
