@@ -36,6 +36,8 @@ ONE_THREAD = {
     "OPENCV_FOR_THREADS_NUM": "1",
 }
 """Environment of a worker: there is one for every core, so each keeps to one thread."""
+KEPT_MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20)}
+"""Environment of a worker, read by glibc as it starts: what one step frees is there for the next one."""
 
 
 @dataclass(frozen=True)

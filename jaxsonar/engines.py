@@ -14,7 +14,7 @@ from socket import socketpair
 from jaxsonar.hardware.errors import SonarError
 
 from .batch_shards import Shard
-from .batch_worker import ONE_THREAD, Result
+from .batch_worker import KEPT_MEMORY, ONE_THREAD, Result
 from .files import shown
 
 STARTED_BY = "import sys; from jaxsonar.batch_worker import serve; serve(int(sys.argv[1]))"
@@ -94,7 +94,7 @@ class _Worker:
         ours, theirs = socketpair()
         flags = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD['XLA_FLAGS']}".strip()
         path = os.pathsep.join(entry for entry in sys.path if entry)
-        environment = os.environ | ONE_THREAD | {"XLA_FLAGS": flags, "PYTHONPATH": path}
+        environment = os.environ | ONE_THREAD | KEPT_MEMORY | {"XLA_FLAGS": flags, "PYTHONPATH": path}
         if device is not None:
             environment["CUDA_VISIBLE_DEVICES"] = device
         if crowded:  # several share a GPU: none may take most of its memory at once

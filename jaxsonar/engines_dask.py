@@ -17,7 +17,7 @@ from typing import Any
 from jaxsonar.hardware.errors import SonarError
 
 from .batch_shards import Shard
-from .batch_worker import ONE_THREAD, Result, do
+from .batch_worker import KEPT_MEMORY, ONE_THREAD, Result, do
 from .engines import cores, gpus
 from .files import reason, shown
 
@@ -46,7 +46,8 @@ def run_dask(
     """
     dask, distributed = _dask()
     with ExitStack() as stack:
-        stack.enter_context(dask.config.set({"distributed.worker.multiprocessing-method": "spawn"}))
+        spawned = {"worker.multiprocessing-method": "spawn", "nanny.pre-spawn-environ": KEPT_MEMORY}
+        stack.enter_context(dask.config.set({f"distributed.{key}": value for key, value in spawned.items()}))
         devices: list[str] = []
         cluster = scheduler
         if scheduler is None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks import growth, page, suite_figures, timing
+from benchmarks import growth, million, page, suite_figures, timing
 from benchmarks.peers import FusedPeer, NumpyPeer, PointSetPeer, RasterPeer
 from benchmarks.scans import batch, echoes_of, single_scans
 from benchmarks.suite import RATIO, Metric, Options, Results, failures, load_baseline, ratios, save_baseline
@@ -277,3 +277,13 @@ def test_workloads_are_listed(capsys):
     command.main(["--list"])
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(command.WORKLOADS)
     assert all(set(names) <= set(command.WORKLOADS) for names in command.SHORT.values())
+
+
+def test_a_run_that_was_killed_and_went_on_has_the_tables_of_one_that_was_not(tmp_path):
+    whole, killed = million.measure(tmp_path, scans=96, each=48, engines=["local"])
+    assert whole["same"]
+    assert killed["same"]
+    assert killed["exit"] == 0
+    assert whole["rate"] > 0
+    (tmp_path / "killed" / "lines" / "other.parquet").write_bytes(b"")
+    assert not million.same(tmp_path / "local", tmp_path / "killed")
