@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -147,17 +148,20 @@ def settings_for(
     """
     reach = float(np.linalg.norm(ring.position, axis=1).max() + ring.max_range) + (window or 0.0)
     if settings is None:
-        settings = kernels.HoughSettings()
-        if window is not None:
-            settings = replace(settings, threshold=WINDOW_THRESHOLD)
-        needed = int(np.ceil(reach / settings.rho_cell))
-        return replace(settings, rho_cells=max(settings.rho_cells, needed))
+        return _reaching(reach, windows=window is not None)
     if settings.max_rho < reach:
         raise SonarError(
             f"settings: rho_cells {settings.rho_cells} x rho_cell {settings.rho_cell:g} m = {settings.max_rho:g} m; "
             f"allowed is {reach:.3f} m or more, the reach of {ring.name!r}"
         )
     return settings
+
+
+@lru_cache(maxsize=8)
+def _reaching(reach: float, *, windows: bool) -> kernels.HoughSettings:
+    """The paper's settings for lines up to this distance, metres; asked for with every scan."""
+    settings = kernels.HoughSettings(threshold=WINDOW_THRESHOLD) if windows else kernels.HoughSettings()
+    return replace(settings, rho_cells=max(settings.rho_cells, int(np.ceil(reach / settings.rho_cell))))
 
 
 _latest: list[tuple[Ring, kernels.HoughSettings, kernels.RingArcs, Int[np.ndarray, " paths"]]] = []
