@@ -134,7 +134,7 @@ class Tracker:
 
     def finish(self, state: TrackerState) -> TrackerState:
         """Look for closures of the submap that is being made, too; the next scan begins another one."""
-        if not state.track.rows:
+        if len(state.track.rows) < 2:  # a single scan is in the submap before as well
             return state
         graph = state.graph.copy()
         graph.add(finished(state.track))
