@@ -43,7 +43,7 @@ class Plan:
     def __init__(self, sizes: Int[np.ndarray, " blocks"], pairs: Int[np.ndarray, "pairs 2"]):
         self.sizes = np.asarray(sizes, dtype=np.int64)
         count = len(self.sizes)
-        self.begin = np.append(0, np.cumsum(self.sizes))
+        self.begin: Int[np.ndarray, " ends"] = np.append(0, np.cumsum(self.sizes))
         low, high = np.divmod(np.unique(pairs.min(axis=1) * count + pairs.max(axis=1)), count)
         pairs = np.stack([low, high], axis=1)[low != high]
         order = _order(count, pairs)
@@ -60,7 +60,7 @@ class Plan:
                 later[up] |= later[turn] - {up}
         self.fronts: list[_Front] = []
         self._at: list[dict[int, int]] = []  # by turn: the column at which each later turn's unknowns begin
-        stored, rows_of = 0, [np.arange(self.begin[block], self.begin[block + 1]) for block in order]
+        stored, rows_of = 0, [int(self.begin[block]) + np.arange(int(self.sizes[block])) for block in order]
         for turn in range(count):
             block, own = int(order[turn]), int(self.sizes[order[turn]])
             column, at = own, {turn: 0}

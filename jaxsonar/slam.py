@@ -239,7 +239,7 @@ def slam(
         window: metres of path gathered into one local model; 1.5 m for sparse rings if left out.
         slip: how wrong the odometry is.
         smooth: whether all poses and reflectors are adjusted together in the end; of logs with ``MOST_SMOOTHED`` scans
-            or fewer if left out, since it takes minutes for a thousand.
+            or fewer if left out, since it takes about a minute for a thousand.
         speed: whether the smoothing estimates the speed of sound.
         scale: whether it estimates the scales of the odometry.
         live: local models one by one, as a robot makes them, so that ``step_ms`` is all that a step costs.

@@ -39,7 +39,7 @@ SURE = 2.0
 """Sigma; how well a range must be known from the scan's own features, to take in an echo that none of them has."""
 HEARD = 0.85
 """Of the ring's maximum range; walls nearer than this are heard."""
-_OFF, _MISSED = 0.1, 2  # m; a wall's echo may be so far from where it is due; sensors that must have missed one
+_OFF, _FACING = 0.1, 6  # m; a wall's echo may be so far from where it is due; sensors that face walls, to tell
 _NEW = np.array([0.5, 0.3])  # m, rad; a reflector before its first echoes are taken in
 _SEEN, _ROOM, _ECHOES = 16, 32, 64  # features, reflectors, echoes; powers of two from there on are compiled
 _SIGMA, _CREDIT = 0.003, 30.0  # m; noise before any is known, and the echoes that this is worth
@@ -215,10 +215,10 @@ def finished(track: Track, *, lost: bool = False) -> Submap:
 
 
 def _silent(ring: Ring, known: Known, scan: Scan, path_pose: Float[np.ndarray, "paths 3"] | None) -> bool:
-    """Whether sensors that face known walls hear nothing of them, more often than something.
+    """Whether most of the sensors that face known walls hear nothing from there.
 
-    That a scan knows nothing of what it sees is no proof that the robot is elsewhere: around a corner all is new. Only
-    direct echoes speak, and only where none is nearer, so that the wall cannot be hidden.
+    That a scan knows nothing of what it sees is no proof that the robot is elsewhere: around a corner all is new, and
+    few of the walls that are known are faced.
     """
     room = power_of_two(len(known), least=_ROOM)
     direct = np.flatnonzero(ring.paths[:, 0] == ring.paths[:, 1])
@@ -235,8 +235,8 @@ def _silent(ring: Ring, known: Known, scan: Scan, path_pose: Float[np.ndarray, "
     due = np.where(due < HEARD * float(ring.max_range), due, np.inf)
     facing = np.isfinite(due)
     first, due = first[direct][facing], due[facing]
-    heard, missed = np.abs(first - due) < _OFF, first > due + _OFF
-    return int(missed.sum()) >= _MISSED and missed.sum() > heard.sum()
+    heard = int((np.abs(first - due) < _OFF).sum())
+    return len(due) >= _FACING and len(due) - heard > heard
 
 
 @dataclass(frozen=True, eq=False)
