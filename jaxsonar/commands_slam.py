@@ -198,7 +198,7 @@ def add_commands(
     run.add_argument(
         "--smoothing",
         action=argparse.BooleanOptionalAction,
-        help="adjust all poses and reflectors in the end (default: up to 2000 scans; minutes for a thousand)",
+        help="adjust all poses and reflectors in the end (default: up to 2000 scans; a minute for a thousand)",
     )
 
     where = command("localize", "Where the robot is in a known map.")

@@ -6,6 +6,7 @@ Geman and McClure's loss; the scale of that loss halves until it is four sigma, 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 
+from .adjusting import adjust as sparsely
 from .echoes import FlatEchoes, power_of_two
 from .logs import Log
 from .poses import relative
@@ -35,6 +37,8 @@ _ANCHOR, _LOOSE = 1e-5, 1.0  # m, rad; the first pose of a path, and all others
 _BESIDE = 0.5  # m; beyond the maximum range, for poses and reflectors that are not yet where they should be
 _HALVINGS = 12
 _LAST_ROUNDS = 3
+_ENOUGH = 0.01  # decrease of half a sum of squares in units of sigma: far less than anything is known to
+_FEW, _ROWS = 16, 256  # echoes of a row, and rows in steps of which there is room
 _JUDGED, _MISFIT = 8, 1.1  # echoes and share; from there on a point must fit as well as the walls do
 _OTHER_KIND = 0.97  # of the sum of squares; a corner that is an edge, or the other way round
 
@@ -65,6 +69,9 @@ class Data:
     together: int = 1
     """Echoes of one reflector that a scan must have for them to count. A pose that hardly anything holds in one
     direction goes where one or two echoes of something that is not in the map fit a reflector that is."""
+    sparse: bool = False
+    """Whether poses and reflectors are eliminated in any order (``adjusting``), as suits many of both; covariances are
+    no part of the result then."""
 
     @classmethod
     def of(
@@ -150,6 +157,19 @@ class Data:
         """Number of scans."""
         return int((self.world >= 0).sum())
 
+    @cached_property
+    def packed(self) -> tuple[Int[np.ndarray, "rows few"], Int[np.ndarray, "rows few"]]:
+        """Scan and column of every echo, in rows of a few echoes of one scan; padded with echoes that are none."""
+        count = np.isfinite(self.reported).sum(axis=1)
+        rows = np.repeat(np.arange(len(count)), -(-count // _FEW))
+        first = np.concatenate([np.arange(0, n, _FEW) for n in count.tolist()])
+        scan = np.zeros(-(-max(len(rows), 1) // _ROWS) * _ROWS, dtype=np.int64)
+        begin = np.full(len(scan), self.path.shape[1])
+        scan[: len(rows)], begin[: len(rows)] = rows, first
+        columns = begin[:, None] + np.arange(_FEW)
+        # Beyond the last column stands the last one again: it is found to be the same.
+        return np.broadcast_to(scan[:, None], columns.shape), np.minimum(columns, self.path.shape[1] - 1)
+
     def placed(self, logs: Sequence[Log], poses: Float[np.ndarray, "scans 3"]) -> list[Log]:
         """The logs with these poses; scans that are not used have none."""
         out = []
@@ -216,8 +236,21 @@ def settle(
         left = int(found.used.sum()) - 2 * reflectors - known - 3 * data.scans * poses_free
         if sigma is None and left > 0:
             noise = max(float(np.sqrt((found.residual**2).sum() / left)), LEAST_SIGMA)
-        state = _without_misfits(_of_better_kind(found), found)
+        state = _without_misfits(_of_better_kind(found, data), found)
     return _round(ring, data, modes, state, noise, poses_free)
+
+
+def approach(
+    ring: Ring,
+    data: Data,
+    modes: RingModes,
+    state: State,
+    *,
+    widest: float,
+    sigma: float | None = None,
+) -> State:
+    """Close the gate around a start, as ``settle``, but without its last rounds: a better start, poses free."""
+    return _closed(ring, data, modes, state, widest=widest, poses_free=True, sigma=sigma)[0]
 
 
 def _closed(
@@ -292,17 +325,23 @@ def _associated(
 ) -> tuple[Bool[np.ndarray, "scans echoes"], Int[np.ndarray, "scans echoes"], kernels.Reflection]:
     """Which echoes are within the gate of a reflector, with no second one near, and where they come from."""
     around = state.around
+    # Scans have very different numbers of echoes: in rows of a few echoes each there is little padding.
+    rows, columns = data.packed
+    scan = rows[:, 0]
+    near = around.near(state.poses, data.world, float(ring.max_range) + _BESIDE)
     found = kernels.associate(
         kernels.moved_sensors(ring.sensors, jnp.asarray(ring_change(modes, state))),
         _arrays(around.scene),
         _arrays(around.candidates),
-        jnp.asarray(state.poses),
-        jnp.asarray(data.world),
-        jnp.asarray(data.path),
-        jnp.asarray(data.reported),
-        jnp.asarray(around.near(state.poses, data.world, float(ring.max_range) + _BESIDE)),
+        jnp.asarray(state.poses[scan]),
+        jnp.asarray(data.world[scan]),
+        jnp.asarray(data.path[rows, columns]),
+        jnp.asarray(data.reported[rows, columns]),
+        jnp.asarray(near[scan]),
     )
-    candidate, residual, rival = (np.asarray(column) for column in (found.candidate, found.residual, found.rival))
+    candidate, residual, rival = np.full(data.path.shape, -1), *np.full((2, *data.path.shape), np.inf)
+    for whole, part in zip((candidate, residual, rival), (found.candidate, found.residual, found.rival), strict=True):
+        whole[rows, columns] = np.asarray(part)
     used = (candidate >= 0) & (np.abs(residual) < gate) & (rival > doubt) & np.isfinite(data.reported)
     candidate = np.where(candidate >= 0, candidate, 0)
     kind, first, second = (
@@ -333,14 +372,17 @@ def _adjusted(
     poses_free: bool,
 ) -> tuple[State, kernels.Problem, kernels.Adjusted]:
     problem = problem_of(ring, data, modes, state, reflection, weight)
-    found = kernels.adjust(problem, _unknowns(state), poses_free=poses_free, most=data.steps)
+    if data.sparse:
+        found = sparsely(problem, _unknowns(state), poses_free=poses_free, most=data.steps, enough=_ENOUGH)
+    else:
+        found = kernels.adjust(problem, _unknowns(state), poses_free=poses_free, most=data.steps)
     now = found.unknowns
     scene = eqx.tree_at(lambda s: s.parameters, state.around.scene, np.asarray(now.scene))
     moved = State(np.asarray(now.modes), np.asarray(now.poses), state.around._replace(scene=scene))
     return moved, problem, found
 
 
-def _of_better_kind(found: Settled) -> State:
+def _of_better_kind(found: Settled, data: Data) -> State:
     """Corners that fit better as edges, and edges that fit better as corners, become these."""
     state, problem, used, residual = found.state, found.problem, found.used, found.residual
     around = state.around
@@ -360,7 +402,8 @@ def _of_better_kind(found: Settled) -> State:
             kernels.moved_sensors(problem.sensors, problem.modes @ jnp.asarray(state.coordinates)),
         ),
     )
-    fitted = kernels.adjust(other, _unknowns(state), poses_free=False).unknowns
+    adjust = sparsely if data.sparse else kernels.adjust
+    fitted = adjust(other, _unknowns(state), poses_free=False).unknowns
     then = np.where(used, np.asarray(kernels.residuals(other, fitted)), 0)
     mine = used & single
     sums = [np.bincount(first[mine], weights=left[mine] ** 2, minlength=len(kind)) for left in (residual, then)]

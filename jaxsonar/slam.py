@@ -134,7 +134,7 @@ class Tracker:
 
     def finish(self, state: TrackerState) -> TrackerState:
         """Look for closures of the submap that is being made, too; the next scan begins another one."""
-        if not state.track.rows:
+        if len(state.track.rows) < 2:  # a single scan is in the submap before as well
             return state
         graph = state.graph.copy()
         graph.add(finished(state.track))
@@ -239,7 +239,7 @@ def slam(
         window: metres of path gathered into one local model; 1.5 m for sparse rings if left out.
         slip: how wrong the odometry is.
         smooth: whether all poses and reflectors are adjusted together in the end; of logs with ``MOST_SMOOTHED`` scans
-            or fewer if left out, since it takes minutes for a thousand.
+            or fewer if left out, since it takes about a minute for a thousand.
         speed: whether the smoothing estimates the speed of sound.
         scale: whether it estimates the scales of the odometry.
         live: local models one by one, as a robot makes them, so that ``step_ms`` is all that a step costs.

@@ -12,9 +12,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
+from .adjusting import known
 from .local import LocalModel, check_sigma, local_models
 from .logs import Log
 from .maps import GlobalMap
@@ -23,7 +23,7 @@ from .poses import composed, relative
 from .ring import Ring
 from .ringmodes import SPEED_SD, RingModes, ring_modes
 from .rounds import AGAIN, MAPS, Round, alternated
-from .settling import Data, Settled, State, settle
+from .settling import Data, Settled, State, approach, settle
 from .slip import Slip
 from .smoothing_map import settled_map
 from .surroundings import seen_world, surroundings
@@ -42,7 +42,7 @@ _NEAR = (0.05, 0.05, 0.05)  # m, rad; how good the start is, in the first round
 _MARGINS = (4.0, 2.0)  # nats; for scans without a place, surely at first; without odometry only so
 _NOISIER = 1.15  # so much more noise, and scans were laid together that do not belong together
 _ODD = 0.5  # of the share of echoes that is explained elsewhere: a scan with less stands in the wrong place
-_MANY, _FEW_STEPS, _FEW_MAPS = 100, 4, 2  # scans; from there on rounds are cut short: the next one goes on
+_MANY, _FEW_STEPS, _FEW_MAPS = 100, 8, 2  # scans; from there on rounds are cut short: the next one goes on
 _LEAST = 3  # echoes that a pose without odometry rests on
 
 
@@ -175,7 +175,7 @@ class _Job:
     def _settled(self, poses: Float[np.ndarray, "scans 3"]) -> _Fit:
         log = replace(self.log, pose=poses)
         data = _free(Data.of(self.ring, [log], [self.odometry], self.slip, silent=True), self.first)
-        data = replace(data, together=_TOGETHER if self.window is None else 1)
+        data = replace(data, together=_TOGETHER if self.window is None else 1, sparse=True)
         if data.scans > _MANY:
             data = replace(data, steps=_FEW_STEPS)
         found = self._alternated(data, log)
@@ -216,9 +216,11 @@ class _Job:
         near = replace(data, anchored=np.maximum(data.anchored, 1 / np.square(_NEAR)))
         state = State(np.zeros(self.modes.columns.shape[1]), data.poses, surroundings([], tied=False))
         self.say("first map")
-        around = surroundings([self._mapped(data, log, state)], tied=False)
+        start = state._replace(around=surroundings([self._mapped(data, log, state)], tied=False))
+        with jax.enable_x64(True):
+            start = approach(self.ring, near, self.modes, start, widest=_WIDEST, sigma=self.sigma)
         return alternated(
-            self._settle(near, state._replace(around=around), _WIDEST).state,
+            start,
             mapped=lambda state: [self._mapped(data, log, state)],
             settle=lambda state, widest: self._settle(data, state, widest),
             widest=AGAIN,
@@ -240,21 +242,20 @@ class _Job:
         """With covariances."""
         found, rows = fit.round.settled, fit.data.rows[0]
         with jax.enable_x64(True):
-            cov = np.asarray(kernels.pose_covariances(found.problem, found.adjusted.unknowns))
+            cov = known(found.problem, found.adjusted.unknowns)
         pose_cov = np.full((len(self.log), 3, 3), np.nan)
-        pose_cov[rows] = cov[: len(rows)]
+        pose_cov[rows] = cov.poses[: len(rows)]
         pose_cov[np.isnan(fit.poses[:, 0])] = np.nan
-        shared, columns = np.asarray(found.adjusted.covariance), self.modes.columns
-        size = columns.shape[1]
-        change, known = columns @ found.state.coordinates, columns @ shared[:size, :size] @ columns.T
-        sd, count = np.sqrt(np.maximum(np.diag(known), 0)), self.ring.count
+        columns, count = self.modes.columns, self.ring.count
+        change = columns @ found.state.coordinates
+        sd = np.sqrt(np.maximum(np.diag(columns @ cov.modes @ columns.T), 0))
         scaled = len(change) > 3 * count + 1
         ring = self._heard_with(found.state)
         return Smoothed(
             poses=fit.poses,
             pose_cov=pose_cov,
             heard=fit.heard,
-            world=settled_map(fit.round.worlds[0], found),
+            world=settled_map(fit.round.worlds[0], found, cov.reflectors),
             used=float(found.used.sum() / max(fit.data.echoes, 1)),
             sigma=found.sigma,
             ring=ring,

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from jaxsonar import kernels
 
@@ -12,19 +12,16 @@ from .poses import unit, wrap_angle
 from .settling import LEAST_ECHOES, Settled
 
 
-def settled_map(world: GlobalMap, found: Settled) -> GlobalMap:
+def settled_map(world: GlobalMap, found: Settled, cov: Float[np.ndarray, "reflectors 2 2"]) -> GlobalMap:
     """The map with the reflectors that it settled to; those that hardly an echo is left of are gone.
 
     Args:
         world: the map that the reflectors are from (``surroundings``, the only world).
         found: the end of the settling.
+        cov: of the parameters of each reflector by itself, metres and radians.
     """
     scene, walls = found.state.around.scene, len(world)
     count = walls + len(world.points)
-    modes = found.problem.modes.shape[1]
-    cov = np.asarray(found.adjusted.covariance)[modes:, modes:]
-    own = np.arange(2 * count).reshape(count, 2)
-    cov = cov[own[:, :, None], own[:, None, :]]  # of each reflector by itself
     parameters, anchor = np.asarray(scene.parameters)[:count], np.asarray(scene.anchor)[:count]
     echoes = _echoes(found, count)
     kept = np.flatnonzero(echoes >= LEAST_ECHOES)
@@ -51,7 +48,7 @@ def settled_map(world: GlobalMap, found: Settled) -> GlobalMap:
         scans=tuple(world.scans[k] for k in wall),
         points=anchor[point] + parameters[point],
         point_kinds=tuple(kinds[kind] for kind in np.asarray(scene.kind)[point].tolist()),
-        point_cov=(cov[point] + cov[point].swapaxes(1, 2)) / 2,  # an inverse is symmetric but for its digits
+        point_cov=cov[point],
         point_echoes=echoes[point],
         point_scans=tuple(world.point_scans[k] for k in from_points),
     )

@@ -37,6 +37,9 @@ GATE, DOUBT = 4.0, 5.0
 """Sigma; how far an echo may be off its reflector, and how near to its range another one's makes it doubtful."""
 SURE = 2.0
 """Sigma; how well a range must be known from the scan's own features, to take in an echo that none of them has."""
+HEARD = 0.85
+"""Of the ring's maximum range; walls nearer than this are heard."""
+_OFF, _FACING = 0.1, 6  # m; a wall's echo may be so far from where it is due; sensors that face walls, to tell
 _NEW = np.array([0.5, 0.3])  # m, rad; a reflector before its first echoes are taken in
 _SEEN, _ROOM, _ECHOES = 16, 32, 64  # features, reflectors, echoes; powers of two from there on are compiled
 _SIGMA, _CREDIT = 0.003, 30.0  # m; noise before any is known, and the echoes that this is worth
@@ -155,6 +158,7 @@ def update(
         found = echoes.tracked(track.known, _of(first.reflector, feature), noise)
         matches = match(echoes.known(track.known, found), seen, full=full)
         strange = len(seen.kind) > 1 and len(track.known) > 1 and not (first.reflector >= 0).any()
+        strange = strange and _silent(ring, track.known, scan, path_pose)
         # What a robot sees that is elsewhere must not become known here.
         fresh = np.flatnonzero(matches.fresh & (grow and not strange))
         known = _with_new(track.known, seen.take(fresh), np.asarray(found.belief.pose))
@@ -208,6 +212,31 @@ def finished(track: Track, *, lost: bool = False) -> Submap:
         poses=np.array(track.poses).reshape(-1, 3),
         pose_cov=np.array(track.covs).reshape(-1, 3, 3),
     )
+
+
+def _silent(ring: Ring, known: Known, scan: Scan, path_pose: Float[np.ndarray, "paths 3"] | None) -> bool:
+    """Whether most of the sensors that face known walls hear nothing from there.
+
+    That a scan knows nothing of what it sees is no proof that the robot is elsewhere: around a corner all is new, and
+    few of the walls that are known are faced.
+    """
+    room = power_of_two(len(known), least=_ROOM)
+    direct = np.flatnonzero(ring.paths[:, 0] == ring.paths[:, 1])
+    paths = jax.tree.map(lambda leaf: leaf[direct], _geometry(ring))
+    if path_pose is not None:
+        paths = _moved(paths, path_pose[direct])
+    first = np.full(len(ring.paths), np.inf)
+    row = ring.path_index[scan.tx, scan.rx]
+    reach = np.asarray(ring.corrected(scan.range, scan.tx, scan.rx), dtype=np.float64)
+    np.minimum.at(first, row[row >= 0], np.where(reach > 0, reach, np.inf)[row >= 0])
+    due = np.asarray(kernels.expected_ranges(known.pose, _in_room(known.scene, room), paths))[: len(known)]
+    often = (known.kind == kernels.PLANE) & (known.scans >= SEEN_TWICE)
+    due = np.where(often[:, None], due, np.inf).min(axis=0)
+    due = np.where(due < HEARD * float(ring.max_range), due, np.inf)
+    facing = np.isfinite(due)
+    first, due = first[direct][facing], due[facing]
+    heard = int((np.abs(first - due) < _OFF).sum())
+    return len(due) >= _FACING and len(due) - heard > heard
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,12 +3,14 @@
 from .adjustment import Adjusted as Adjusted
 from .adjustment import Heard as Heard
 from .adjustment import Problem as Problem
+from .adjustment import Slopes as Slopes
 from .adjustment import Unknowns as Unknowns
 from .adjustment import adjust as adjust
 from .adjustment import cost as cost
 from .adjustment import moved_sensors as moved_sensors
 from .adjustment import pose_covariances as pose_covariances
 from .adjustment import residuals as residuals
+from .adjustment import slopes as slopes
 from .arcs import Arc as Arc
 from .arcs import arc as arc
 from .arcs import arc_point as arc_point

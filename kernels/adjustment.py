@@ -82,7 +82,7 @@ class Adjusted(eqx.Module):
     before: Float[Array, ""]
     """The same at the start."""
     covariance: Float[Array, "shared shared"]
-    """Of modes and scene parameters, poses accounted for."""
+    """Of modes and scene parameters, poses accounted for; (0, 0) where it was not asked for."""
     steps: Int[Array, ""]
     """Steps taken."""
 
@@ -166,6 +166,57 @@ def adjust(problem: Problem, unknowns: Unknowns, *, poses_free: bool, most: int 
     found, value, _, count, _ = jax.lax.while_loop(lambda state: (state[3] < most) & ~state[4], step, start)
     known = eliminated(_linearised(problem, found, poses_free), jnp.zeros_like(value)).shared
     return Adjusted(found, value, before, jnp.linalg.inv(known), count)
+
+
+class Slopes(eqx.Module):
+    """The problem taken apart at a point: what is left of every term, and how the expected report or slip grows."""
+
+    left: Float[Array, " echoes"]
+    """Reported minus expected range, metres."""
+    by_modes: Float[Array, "echoes modes"]
+    by_pose: Float[Array, "echoes 3"]
+    by_first: Float[Array, "echoes 2"]
+    by_second: Float[Array, "echoes 2"]
+    """0 but for wall to wall."""
+    slip: Float[Array, "steps 3"]
+    """How far every pose is from where the odometry has it, seen from the one before: metres and radians."""
+    slip_by_here: Float[Array, "steps 3 3"]
+    slip_by_there: Float[Array, "steps 3 3"]
+    slip_by_modes: Float[Array, "steps 3 modes"]
+
+
+@jax.jit
+def slopes(problem: Problem, unknowns: Unknowns, scan: Int[Array, " echoes"], echo: Int[Array, " echoes"]) -> Slopes:
+    """Residuals and slopes of chosen echoes, and of all odometry.
+
+    Args:
+        problem: echoes and odometry; weights are not looked at.
+        unknowns: where the slopes are taken.
+        scan: row of each of the echoes.
+        echo: its column.
+    """
+    sensors = moved_sensors(problem.sensors, problem.modes @ unknowns.modes)
+    scene = _at(problem.scene, unknowns.scene)
+    count = sensors.heading.shape[0]
+    heard, modes = problem.heard, problem.modes
+    place = modes[count + 1 : 3 * count + 1].reshape(count, 2, -1)
+
+    def one(scan, echo):
+        path, reported = heard.path[scan, echo], heard.reported[scan, echo]
+        reflection = jax.tree.map(lambda leaf: leaf[scan, echo], heard.reflection)
+        local, reflectors = _locally(sensors, scene, path, reflection, unknowns.poses[scan])
+        report, slope = jax.value_and_grad(_report)(local, reflectors, reflection.kind)
+        tx, rx = sensors.tx[path], sensors.rx[path]
+        by_modes = slope.offset / 2 * (modes[tx] + modes[rx]) + slope.speed * modes[count]
+        by_modes += slope.tx @ place[tx] + slope.rx @ place[rx]
+        return reported - report, by_modes, slope.pose, slope.first, slope.second
+
+    steps = (unknowns.poses[:-1], unknowns.poses[1:], problem.odometry[:-1])
+    axes, scale = (0, 0, 0, None), _odometry_scale(problem, unknowns)
+    slip = jax.vmap(_slip, in_axes=axes)(*steps, scale)
+    here, there, by_scale = jax.vmap(jax.jacfwd(_slip, argnums=(0, 1, 3)), in_axes=axes)(*steps, scale)
+    by_modes = by_scale @ modes[-2:] if _has_scale(problem) else jnp.zeros((*slip.shape, modes.shape[1]), slip.dtype)
+    return Slopes(*jax.vmap(one)(scan, echo), slip, here, there, by_modes)
 
 
 @jax.jit

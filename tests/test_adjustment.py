@@ -11,7 +11,7 @@ import optimistix as optx
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from jaxsonar import Ring, kernels
+from jaxsonar import Ring, adjusting, kernels
 from jaxsonar.kernels import CORNER, EDGE, PLANE, SECOND, Heard, Problem, Reflection, Scene, Unknowns
 
 RING = Ring.circular(count=6, neighbors=1, radius=0.25)
@@ -248,6 +248,29 @@ def test_the_covariance_is_that_of_the_dense_equations(rng, linked):
     np.testing.assert_allclose(found.covariance / scale, shared / scale, atol=1e-6)
     pulled = whole.T @ np.asarray(dense(found.unknowns, problem))
     assert np.abs(pulled * np.sqrt(np.diag(covariance))).max() < 1e-3  # standard deviations from the minimum
+
+
+def test_sparse_elimination_finds_the_same(rng, linked):
+    """Steps, cost and covariances are those of the dense block of all reflectors, for echoes of all kinds."""
+    problem, start, _ = a_problem(rng, linked=linked)
+    one, other = adjusted(problem, start), adjusting.adjust(problem, start, poses_free=True)
+    assert_same(one.unknowns, other.unknowns, atol=1e-8)
+    assert float(one.cost) == pytest.approx(float(other.cost), rel=1e-9)
+    assert float(one.before) == pytest.approx(float(other.before), rel=1e-12)
+    known = adjusting.known(problem, one.unknowns)
+    modes = problem.modes.shape[1]
+    np.testing.assert_allclose(known.modes, one.covariance[:modes, :modes], rtol=1e-5, atol=1e-10)
+    np.testing.assert_allclose(known.poses, kernels.pose_covariances(problem, one.unknowns), rtol=1e-5, atol=1e-10)
+    for k, cov in enumerate(known.reflectors):
+        own = slice(modes + 2 * k, modes + 2 * k + 2)
+        np.testing.assert_allclose(cov, one.covariance[own, own], rtol=1e-5, atol=1e-10)
+
+
+def test_sparse_elimination_with_poses_held(rng):
+    problem, start, _ = a_problem(rng)
+    found = adjusting.adjust(problem, start, poses_free=False)
+    assert_same(held(problem, start).unknowns, found.unknowns, atol=1e-8)
+    np.testing.assert_array_equal(found.unknowns.poses, start.poses)
 
 
 def test_held_poses_stay_and_the_covariance_knows(rng):

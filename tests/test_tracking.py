@@ -6,14 +6,14 @@ import jax
 import numpy as np
 import pytest
 
-from jaxsonar import Ring, kernels, simulate
+from jaxsonar import Ring, Room, kernels, local_model, simulate
 from jaxsonar.matching import Features, Known, match, seen_from
 from jaxsonar.motion import moved, placed, step_variance
 from jaxsonar.office import load_office
 from jaxsonar.poses import composed, rotation, unit, wrap_angle
 from jaxsonar.simulate import Kind
 from jaxsonar.slip import Slip
-from jaxsonar.tracking import Track, begin, finished
+from jaxsonar.tracking import Track, begin, finished, update
 
 RING = Ring.circular()
 PLANE, CORNER, EDGE = kernels.PLANE, kernels.CORNER, kernels.EDGE
@@ -328,6 +328,20 @@ def test_corners_are_no_walls():
 
 
 # Submaps
+
+
+@pytest.mark.parametrize(("distance", "carried"), [(8.0, False), (0.8, True)])
+def test_only_walls_that_should_be_heard_tell_that_the_robot_was_carried(distance, carried):
+    """Around a corner all is new, and becomes known; where walls that face the ring are silent it is elsewhere."""
+    x, y = 1.5, 1.3
+    room = Room(np.array([[[x, -y], [x, y]], [[x, y], [-x, y]], [[-x, y], [-x, -y]], [[-x, -y], [x, -y]]]))
+    scan = simulate(RING, room, np.zeros((1, 3)), sigma=SIGMA, seed=1).as_log(RING, np.zeros((1, 3)))[0]
+    known = replace(known_of([(distance, 0.0), (distance, 2.0)]), scans=np.array([5, 5]))
+    with jax.enable_x64(False):
+        model = local_model(RING, scan, method="hough")
+    track = update(RING, Track(known), scan, model, row=7)
+    assert track.strange == int(carried)
+    assert (len(track.known) == 2) == carried
 
 
 def test_a_submap_forgets_what_one_scan_saw():
