@@ -22,8 +22,9 @@ from rich.table import Table
 from jaxsonar import GlobalMap, Room, SonarError
 from jaxsonar.evaluation import evaluate
 from jaxsonar.files import atomic_write, make_folder
-from jaxsonar.poses import relative
+from jaxsonar.poses import relative, wrap_angle
 from jaxsonar.rooms import lines_in
+from jaxsonar.slam import Tie
 from jaxsonar.trajectory import Trajectory, errors
 
 from .accuracy import versions, without_nan
@@ -47,8 +48,7 @@ class Run:
     trajectory: Trajectory
     """Of the scans that could be placed, by their stamps."""
     world: GlobalMap
-    closures: Sequence[tuple[int, int, str, Float[np.ndarray, "3"]]]
-    """First and second scan, state, and the pose of the second one in the frame of the first."""
+    closures: Sequence[Tie]
     step_ms: Float[np.ndarray, " scans"]
     """Of everything that a scan costs while the robot drives."""
 
@@ -60,8 +60,7 @@ def run_slam(scene: Scene, seed: int, way: str) -> Run:
 
     slip = Slip(place=DISTANCE, heading=TURN, turn=DISTANCE)
     got = slam(scene.ring, scene.log(seed), slip=slip, live=True, **WAYS[way])
-    ties = [(int(one.first), int(one.second), str(one.state), np.asarray(one.pose)) for one in got.closures]
-    return Run(got.trajectory, got.world, ties, np.asarray(got.step_ms))
+    return Run(got.trajectory, got.world, got.closures, np.asarray(got.step_ms))
 
 
 def run_one_scan(scene: Scene, seed: int) -> Trajectory:
@@ -156,7 +155,7 @@ def outcome(scene: Scene, way: str, least: Bound, *, seed: int = 0) -> Outcome:
     if not len(got.trajectory):
         return replace(base, failed="no scan was placed")
     own, best = errors(got.trajectory, truth, align="first"), errors(got.trajectory, truth)
-    counted = [one for one in got.closures if one[2] == "counted"]
+    counted = [one for one in got.closures if one.state == "counted"]
     return replace(
         base,
         placed=own.poses / len(truth),
@@ -166,17 +165,19 @@ def outcome(scene: Scene, way: str, least: Bound, *, seed: int = 0) -> Outcome:
         relative=own.relative,
         nees=own.nees,
         made=len(counted),
-        wrong=sum(wrong(scene.poses, first, second, pose) for first, second, _, pose in counted),
-        withdrawn=sum(one[2] == "withdrawn" for one in got.closures),
+        wrong=sum(wrong(scene.poses, one) for one in counted),
+        withdrawn=sum(one.state == "withdrawn" for one in got.closures),
         seconds=seconds,
         **_map_measures(scene, got.world),
         **_times(got.step_ms),
     )
 
 
-def wrong(poses: Float[np.ndarray, "scans 3"], first: int, second: int, pose: Float[np.ndarray, "3"]) -> bool:
-    """Whether a closure says something else than the truth does."""
-    off = relative(relative(poses[first], poses[second]), pose)
+def wrong(poses: Float[np.ndarray, "scans 3"], tie: Tie) -> bool:
+    """Whether a closure says something else than the truth does, in what it determines."""
+    off = tie.pose - relative(poses[tie.first], poses[tie.second])
+    off[2] = wrap_angle(float(off[2]))
+    off = tie.determined @ (tie.determined.T @ off)
     return bool(np.hypot(off[0], off[1]) > WRONG[0] or abs(off[2]) > WRONG[1])
 
 

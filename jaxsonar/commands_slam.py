@@ -289,7 +289,10 @@ def _as_json(found: "Slam", against: "dict[str, TrajectoryErrors | None] | None"
     said: dict[str, Any] = {
         "scans": len(found.poses),
         "left_out": found.left_out.tolist(),
-        "closures": [tie._asdict() | {"pose": tie.pose.tolist()} for tie in found.closures],
+        "closures": [
+            tie._asdict() | {"pose": tie.pose.tolist(), "determined": tie.determined.T.tolist()}
+            for tie in found.closures
+        ],
     }
     if smoothed is not None:
         said |= {

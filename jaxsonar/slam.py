@@ -179,6 +179,9 @@ class Tie(NamedTuple):
     """The later submap in the frame of the earlier one."""
     state: str
     """"counted", "withdrawn", "refused" or "proposed": not sure enough to count."""
+    determined: Float[np.ndarray, "3 rank"]
+    """Unit vectors of (x, y, theta) that it determines, earlier frame; parallel walls leave one open, which is as
+    everything else has it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,5 +325,5 @@ def ties_of(graph: SubmapGraph) -> tuple[Tie, ...]:
         off[2] = wrap_angle(float(off[2]))
         pose = now + basis @ (basis.T @ off)  # what the walls leave open is as the graph has it
         state = "counted" if one.state == ACCEPTED else one.state
-        ties.append(Tie(first[one.earlier], first[one.newest], pose, state))
+        ties.append(Tie(first[one.earlier], first[one.newest], pose, state, basis))
     return tuple(ties)

@@ -15,8 +15,9 @@ from benchmarks import slam, slam_scenes
 from benchmarks.slam_bound import Bound, _links, _Slopes, bound, pose_bound
 from benchmarks.slam_scenes import CLEARANCE, DISTANCE, STEP, TURN, TURNING, Scene, clearance, corridor, loop, one_scan
 from jaxsonar import GlobalMap, Room
-from jaxsonar.poses import relative, wrap_angle
+from jaxsonar.poses import relative
 from jaxsonar.simulate import Kind
+from jaxsonar.slam import Tie
 from jaxsonar.trajectory import Trajectory
 
 PLACES = {
@@ -167,11 +168,14 @@ def fake(scene, off):
     covariance[0] = 0
     right = relative(scene.poses[1], scene.poses[9])
     closures = [
-        SimpleNamespace(first=1, second=9, state="counted", pose=right + np.array([0.02, 0, 0])),
-        SimpleNamespace(first=1, second=9, state="counted", pose=right + np.array([0.5, 0, 0])),
-        SimpleNamespace(first=1, second=9, state="counted", pose=right + np.array([0, 0, np.pi / 2])),
-        SimpleNamespace(first=1, second=9, state="withdrawn", pose=right + np.array([0.5, 0, 0])),
-        SimpleNamespace(first=1, second=9, state="proposed", pose=right),
+        Tie(1, 9, right + off, state, np.eye(3))
+        for off, state in (
+            (np.array([0.02, 0, 0]), "counted"),
+            (np.array([0.5, 0, 0]), "counted"),
+            (np.array([0, 0, np.pi / 2]), "counted"),
+            (np.array([0.5, 0, 0]), "withdrawn"),
+            (np.zeros(3), "proposed"),
+        )
     ]
     steps = np.concatenate([[900.0], np.linspace(1, 3, len(poses) - 1)])
     trajectory = Trajectory(scene.heard.stamps, poses, covariance)
@@ -220,7 +224,14 @@ def test_a_run_that_fails_is_told(office, monkeypatch):
 def test_wrong_closures_are_those_that_are_off():
     poses = np.array([[0.0, 0, 0], [1.0, 1, np.pi / 2]])
     right = relative(poses[0], poses[1])
-    assert not slam.wrong(poses, 0, 1, right + np.array([0.1, 0.1, 0.1]))
-    assert slam.wrong(poses, 0, 1, right + np.array([0.0, 0.31, 0.0]))
-    assert slam.wrong(poses, 0, 1, right + np.array([0.0, 0.0, np.radians(11)]))
-    assert not slam.wrong(poses, 0, 1, np.append(right[:2], wrap_angle(right[2] + 2 * np.pi)))
+
+    def wrong(off, determined):
+        return slam.wrong(poses, Tie(0, 1, right + off, "counted", determined))
+
+    whole, along_x = np.eye(3), np.eye(3)[:, 1:]  # walls along x leave x open
+    assert not wrong([0.1, 0.1, 0.1], whole)
+    assert wrong([0.0, 0.31, 0.0], whole)
+    assert wrong([0.0, 0.0, np.radians(11)], whole)
+    assert not wrong([0.0, 0.0, 2 * np.pi], whole)
+    assert not wrong([5.0, 0.1, 0.1], along_x)
+    assert wrong([5.0, 0.31, 0.0], along_x)
