@@ -41,7 +41,7 @@ def peers_figure(results: Results) -> Figure:
         axes.plot(goals, place, ls="", marker="|", ms=16, mew=2.5, color=figures.PALETTE[5], label="target")
         both = np.append(values, goals[np.isfinite(goals)])
         axes.set_xlim(min(0.5, float(np.nanmin(both)) / 2), float(np.nanmax(both)) * 3)
-        beyond = np.fmax(values, np.where(goals > values, np.where(goals < 1.6 * values, goals, 0), 0))
+        beyond = np.fmax(values, np.where(goals > values, np.where(goals < 2.5 * values, goals, 0), 0))
         for y, value, x in zip(place, values, beyond, strict=True):
             axes.annotate(f"{value:.3g} x", (x, y), (6, 0), textcoords="offset points", va="center", bbox=BACKED)
         axes.set_yticks(place, [BARS[one.key] for one in rows])
