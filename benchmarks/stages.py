@@ -56,7 +56,7 @@ def hough_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None 
 
 
 def ml_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = None) -> Stages:
-    """A batch by maximum likelihood; ``candidates`` is what of it are votes and low pass."""
+    """A batch by maximum likelihood."""
     settings = settings or HoughSettings()
     arcs, expected = arcs_of(ring, settings), kernels.Expectations()
     packed = [step.packed for step in _steps(ring, FlatEchoes.from_dense(ring, ranges), settings, dear=True)]

@@ -15,7 +15,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from jaxsonar.files import atomic_write
+from jaxsonar.files import atomic_write, reason
+from jaxsonar.hardware.errors import SonarError
 
 BASELINE = Path(__file__).with_name("baseline.json")
 RATIO = "x"
@@ -104,8 +105,12 @@ class Results:
 
     @classmethod
     def load(cls, path: Path) -> "Results":
-        """What ``save`` wrote."""
-        told = json.loads(path.read_text(encoding="utf-8"))
+        """What ``save`` wrote.
+
+        Raises:
+            SonarError: this is something else.
+        """
+        told = _read(path, "metrics", "environment", "options")
         names = {one.name for one in fields(Metric)}
         metrics = []
         for told_of in told["metrics"]:
@@ -184,8 +189,23 @@ def save_baseline(results: Results, path: Path = BASELINE) -> None:
 
 
 def load_baseline(path: Path = BASELINE) -> dict[str, Any]:
-    """What ``save_baseline`` wrote."""
-    return json.loads(path.read_text(encoding="utf-8"))
+    """What ``save_baseline`` wrote.
+
+    Raises:
+        SonarError: this is something else.
+    """
+    return _read(path, "ratios")
+
+
+def _read(path: Path, *keys: str) -> dict[str, Any]:
+    """A JSON object that has these keys."""
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as failure:
+        raise SonarError(f"{path}: {reason(failure)}; needed is a file that this suite wrote") from None
+    if not isinstance(told, dict) or not set(keys) <= set(told):
+        raise SonarError(f"{path}: no {', '.join(keys)} in it; needed is a file that this suite wrote")
+    return told
 
 
 def failures(metrics: Mapping[str, Metric], baseline: Mapping[str, Any], only: Iterable[str] = ()) -> dict[str, str]:

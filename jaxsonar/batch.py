@@ -104,6 +104,10 @@ def batch(
     job = job_of(ring, method=method, settings=settings, sigma=sigma)
     logs = find_inputs(inputs)
     check_extras(logs)
+    if engine == "dask":
+        from .engines_dask import check_dask
+
+        check_dask()
     with opened(output, _run(job, method, sigma, settings, shard_scans)) as manifest:
         manifest.check_all_came(log.source for log in logs)
         # Which scans there are, and in which shards: a matter of the inputs alone.
@@ -185,7 +189,9 @@ def _check(engine: str, scheduler: str | None, workers: int | None, scans: int) 
     if engine not in ENGINES:
         raise SonarError(f"engine '{shown(engine)}' came; allowed is {' or '.join(ENGINES)}")
     if scheduler is not None and engine != "dask":
-        raise SonarError(f"scheduler {shown(scheduler)} came with engine {engine}; allowed is it with engine dask")
+        raise SonarError(
+            f"scheduler {shown(scheduler)} came with engine {engine}; allowed is --scheduler with --engine dask"
+        )
     if scheduler is not None and workers is not None:
         raise SonarError(f"workers {workers} came with a scheduler; allowed are they without: a cluster has its own")
     if workers is not None and workers < 1:

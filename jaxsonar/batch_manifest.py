@@ -151,6 +151,8 @@ def opened(folder: str | os.PathLike[str], run: Line) -> Iterator[Manifest]:
         lines = _lines(folder)
         if not lines and any((folder / name).exists() and any((folder / name).iterdir()) for name in TABLES):
             raise SonarError(f"{shown(folder)}: tables without a {NAME} lie there; allowed is a new folder for -o")
+        if not any("shard" in line for line in lines):
+            lines = []  # begun, but nothing came of it: there is nothing to go on with
         if lines:
             _check_same(folder, lines[0], run)
         for name in TABLES:

@@ -94,7 +94,7 @@ class _Worker:
         ours, theirs = socketpair()
         flags = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD['XLA_FLAGS']}".strip()
         path = os.pathsep.join(entry for entry in sys.path if entry)
-        environment = os.environ | ONE_THREAD | KEPT_MEMORY | {"XLA_FLAGS": flags, "PYTHONPATH": path}
+        environment = KEPT_MEMORY | os.environ | ONE_THREAD | {"XLA_FLAGS": flags, "PYTHONPATH": path}
         if device is not None:
             environment["CUDA_VISIBLE_DEVICES"] = device
         if crowded:  # several share a GPU: none may take most of its memory at once

@@ -8,7 +8,7 @@ import secrets
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib import metadata
 from itertools import islice
@@ -45,15 +45,21 @@ def run_dask(
         SonarError: the extra is missing, the cluster does not answer, has no worker, or other versions than we have.
     """
     dask, distributed = _dask()
+    if scheduler is not None:
+        _check_address(distributed, scheduler)
     with ExitStack() as stack:
-        spawned = {"worker.multiprocessing-method": "spawn", "nanny.pre-spawn-environ": KEPT_MEMORY}
-        stack.enter_context(dask.config.set({f"distributed.{key}": value for key, value in spawned.items()}))
+        stack.enter_context(dask.config.set({"distributed.worker.multiprocessing-method": "spawn"}))
         devices: list[str] = []
         cluster = scheduler
         if scheduler is None:
             devices = gpus()
             # A shard whose worker dies is tried once more, as the local engine does it.
             stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": 1}))
+            # What a process must know as it starts goes through our own environment, which Dask leaves changed.
+            early = KEPT_MEMORY | {key: value for key, value in ONE_THREAD.items() if key != "XLA_FLAGS"} | os.environ
+            early = {key: early[key] for key in (*KEPT_MEMORY, *ONE_THREAD) if key != "XLA_FLAGS"}
+            stack.enter_context(dask.config.set({"distributed.nanny.pre-spawn-environ": early}))
+            stack.enter_context(_left_as_it_was(early))
             count = min(workers or len(devices) or cores(), len(shards))
             with _deaf_to_ctrl_c():
                 cluster = _local(distributed, count)
@@ -119,6 +125,28 @@ def _local(distributed: Any, workers: int) -> Any:
     )
 
 
+def _check_address(distributed: Any, scheduler: str) -> None:
+    """Before a client is made: one that cannot be is not given up for a minute."""
+    try:
+        distributed.comm.registry.get_backend(distributed.comm.parse_address(scheduler)[0])
+    except ValueError as failure:
+        allowed = "an address as a Dask scheduler gives it, tcp://HOST:PORT"
+        raise SonarError(f"--scheduler {shown(scheduler)}: {reason(failure)}; allowed is {allowed}") from None
+
+
+@contextmanager
+def _left_as_it_was(keys: Iterable[str]) -> Iterator[None]:
+    """Our own environment, in some of its variables, is in the end what it was."""
+    before = {key: os.environ.get(key) for key in keys}
+    try:
+        yield
+    finally:
+        for key, value in before.items():
+            os.environ.pop(key, None)
+            if value is not None:
+                os.environ[key] = value
+
+
 @contextmanager
 def _deaf_to_ctrl_c() -> Iterator[None]:
     """Processes that are started meanwhile leave Ctrl-C to us; they would each tell of it at length."""
@@ -146,6 +174,11 @@ def _check_versions(client: Any) -> None:
         raise
     except Exception as failure:  # it has no jaxsonar, say
         raise SonarError(f"a worker of the cluster: {reason(failure)}; needed is {here} on each") from None
+
+
+def check_dask() -> None:
+    """Raise a SonarError if the extra is missing."""
+    _dask()
 
 
 def _dask() -> tuple[Any, Any]:

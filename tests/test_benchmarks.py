@@ -283,7 +283,7 @@ def test_a_run_that_was_killed_and_went_on_has_the_tables_of_one_that_was_not(tm
     whole, killed = million.measure(tmp_path, scans=96, each=48, engines=["local"])
     assert whole["same"]
     assert killed["same"]
-    assert killed["exit"] == 0
+    assert "not in its middle" in killed["run"] or 0 < killed["shards"] < 2
     assert whole["rate"] > 0
     (tmp_path / "killed" / "lines" / "other.parquet").write_bytes(b"")
     assert not million.same(tmp_path / "local", tmp_path / "killed")
