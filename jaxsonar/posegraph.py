@@ -101,6 +101,20 @@ class Graph:
         cov = cov + mixed + mixed.swapaxes(1, 2)
         return seen, (cov + cov.swapaxes(1, 2)) / 2
 
+    def between(self, nodes: Int[np.ndarray, " chosen"]) -> Float[np.ndarray, "chosen chosen 3 3"]:
+        """Covariance of each of these nodes as seen from each of them, as ``relative`` has it."""
+        count = len(nodes)
+        joint = self.joint(nodes).reshape(count, 3, count, 3).swapaxes(1, 2)
+        own = joint[np.arange(count), np.arange(count)]
+        out = np.zeros_like(joint)
+        for k, node in enumerate(nodes):
+            here = np.broadcast_to(self.poses[node], (count, 3))
+            by_first, by_second = _jacobians(here, relative(here, self.poses[nodes]))
+            mixed = by_first @ joint[k] @ by_second.swapaxes(1, 2)
+            cov = by_first @ own[k] @ by_first.swapaxes(1, 2) + by_second @ own @ by_second.swapaxes(1, 2)
+            out[k] = cov + mixed + mixed.swapaxes(1, 2)
+        return (out + out.swapaxes(2, 3)) / 2
+
 
 def solve(poses: Float[np.ndarray, "nodes 3"], links: Sequence[Link]) -> Graph:
     """The poses that satisfy the links best: Gauss-Newton, damped (Levenberg-Marquardt) where a step does not help.

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from .maps import GlobalMap
 from .settling import Settled, State
-from .surroundings import surroundings
+from .surroundings import Surroundings, surroundings
 
 AGAIN = 0.01
 """Metres; scale of the first association after the map was made anew."""
@@ -34,6 +34,7 @@ def alternated(
     widest: float,
     say: Callable[[str], None],
     maps: int = MAPS,
+    around: Callable[[list[GlobalMap]], Surroundings] | None = None,
 ) -> Round | None:
     """The map so far; echoes to its reflectors and least squares, closer and closer; the same from there.
 
@@ -44,17 +45,18 @@ def alternated(
         widest: that of the first round.
         say: told what is being done.
         maps: made anew so often at most, as long as each explains more echoes.
+        around: makes the reflectors of maps; all scans of a world may hear all of them if left out.
 
     Returns:
         The best round, or None where no echo fits the first map.
     """
+    around = around or (lambda worlds: surroundings(worlds, tied=False))
     found = None
     for _ in range(maps):
         say("building the map")
         worlds = mapped(state)
         say("least squares")
-        around = state._replace(around=surroundings(worlds, tied=False))
-        settled = settle(around, widest if found is None else AGAIN)
+        settled = settle(state._replace(around=around(worlds)), widest if found is None else AGAIN)
         before = 0 if found is None else found.used
         if settled.used.sum() <= before:
             break

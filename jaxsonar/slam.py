@@ -25,6 +25,7 @@ from .loops_verified import ACCEPTED, Decision
 from .mapping import assemble, build_map, gather_evidence
 from .maps import GlobalMap
 from .motion import placed
+from .passages import Passages
 from .placing import place_parts
 from .poses import composed, relative, rotation, wrap_angle
 from .ring import Ring
@@ -265,6 +266,7 @@ def slam(
     ties: tuple[Tie, ...] = ()
     took = np.zeros(0)
     models: list[LocalModel] | None = None
+    passages: Passages | None = None
     if window is not None:
         if not measured:
             raise SonarError(
@@ -272,7 +274,7 @@ def slam(
             )
         start, covariance = odometry, np.full((len(log), 3, 3), np.nan)
     elif measured:
-        start, covariance, ties, took, models = _tracked(ring, log, sigma, slip, live, say)
+        start, covariance, ties, took, models, passages = _tracked(ring, log, sigma, slip, live, say)
     else:
         models = list(local_models(ring, log, sigma=sigma))
         parts = place_parts(models, None, blur=BLUR, progress=lambda done, total: say("placing", done, total))
@@ -280,7 +282,9 @@ def slam(
     given = odometry if measured else None
     if len(log) <= MOST_SMOOTHED if smooth is None else smooth:
         choices = {"odometry": given, "sigma": sigma, "window": window, "speed": speed, "scale": scale, "slip": slip}
-        found = smoothing(ring, log, start, **choices, models=models, progress=lambda text: say(text, 0, 0))
+        found = smoothing(
+            ring, log, start, **choices, models=models, passages=passages, progress=lambda text: say(text, 0, 0)
+        )
         return Slam(found.poses, found.pose_cov, stamps_of(log), found.world, log.pose, ties, took, found)
     say("building the map", 0, 0)
     at = replace(log, pose=start)
@@ -296,8 +300,9 @@ def _tracked(
     tuple[Tie, ...],
     Float[np.ndarray, " scans"],
     list[LocalModel],
+    Passages | None,
 ]:
-    """Poses, covariances, closures, milliseconds of each step, and the local models."""
+    """Poses, covariances, closures, milliseconds of each step, the local models, and what is known to each other."""
     tracker = Tracker(ring=ring, sigma=sigma, slip=slip)
     state, took = tracker.start(), np.zeros(len(log))
     models: list[LocalModel] = []
@@ -312,7 +317,19 @@ def _tracked(
             models.append(step.model)
         say("tracking", row + 1, len(log))
     state = tracker.finish(state)
-    return *tracker.poses(state), ties_of(state.graph), took, models
+    return *tracker.poses(state), ties_of(state.graph), took, models, passages_of(state)
+
+
+def passages_of(state: TrackerState) -> Passages | None:
+    """The submaps of a run that is finished, as seen from each other; None where there is none."""
+    nodes = np.arange(len(state.graph.submaps))
+    if not len(nodes):
+        return None
+    part = np.full(state.scans, -1)
+    for number, one in enumerate(state.graph.submaps):
+        part[one.rows] = number
+    part = np.maximum(np.maximum.accumulate(part), 0)
+    return Passages(part, composed(state.start, state.graph.poses[nodes]), state.graph.graph.between(nodes))
 
 
 def ties_of(graph: SubmapGraph) -> tuple[Tie, ...]:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.stats import chi2
 
 from jaxsonar.hardware.errors import SonarError
 
@@ -18,15 +19,16 @@ from .adjusting import known
 from .local import LocalModel, check_sigma, local_models
 from .logs import Log
 from .maps import GlobalMap
+from .passages import Passages
 from .placing import place_more
-from .poses import composed, relative
+from .poses import composed, relative, wrap_angle
 from .ring import Ring
 from .ringmodes import SPEED_SD, RingModes, ring_modes
 from .rounds import AGAIN, MAPS, Round, alternated
 from .settling import Data, Settled, State, approach, settle
 from .slip import Slip
 from .smoothing_map import settled_map
-from .surroundings import seen_world, surroundings
+from .surroundings import Surroundings, seen_world, surroundings
 from .windows import check_window
 
 BLUR = 0.2
@@ -43,6 +45,10 @@ _MARGINS = (4.0, 2.0)  # nats; for scans without a place, surely at first; witho
 _NOISIER = 1.15  # so much more noise, and scans were laid together that do not belong together
 _ODD = 0.5  # of the share of echoes that is explained elsewhere: a scan with less stands in the wrong place
 _MANY, _FEW_STEPS, _FEW_MAPS = 100, 8, 2  # scans; from there on rounds are cut short: the next one goes on
+_RARE = 0.01  # chance that any step of a run slips farther than one that is taken for broken
+_AROUND = 6  # scans on either side of a broken step, some of which are wrong
+_NONE = np.zeros(0, dtype=np.int64)
+_GROWN = 1.005  # more echoes so many times are no more
 _LEAST = 3  # echoes that a pose without odometry rests on
 
 
@@ -89,6 +95,7 @@ def smooth(
     scale: bool = False,
     slip: Slip | None = None,
     models: Sequence[LocalModel] | None = None,
+    passages: Passages | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Smoothed:
     """Adjust all poses, walls and corners to the ranges.
@@ -107,6 +114,7 @@ def smooth(
         scale: whether the scales of the odometry's ways and turns are.
         slip: noise of the odometry; as ``Slip()`` if left out.
         models: the local models of the scans, if they are known already; not with a window.
+        passages: which scans are known to each other so well that they hear the same walls; all of them if left out.
         progress: told what is being done.
 
     Raises:
@@ -119,7 +127,9 @@ def smooth(
     if window is None and models is None:
         say("local models")
         models = list(local_models(ring, log, sigma=sigma))
-    job = _Job(ring, log, measured, modes, slip or Slip(), sigma, window, models, int(_placed(given).argmax()), say)
+    job = _Job(
+        ring, log, measured, modes, slip or Slip(), sigma, window, models, passages, int(_placed(given).argmax()), say
+    )
     # 1. Maps and least squares in turn, from the poses as they came.
     best = job.settled(_led(given, measured))
     # 2. The map is better now: scans that had no place may find one.
@@ -163,22 +173,43 @@ class _Job:
     sigma: float | None
     window: float | None
     models: Sequence[LocalModel] | None
+    passages: Passages | None
     first: int
     """Row of the scan that stays where it is."""
     say: Callable[[str], None]
 
     def settled(self, poses: Float[np.ndarray, "scans 3"]) -> _Fit:
-        """Poses and reflectors from a start; scans of which hardly an echo fits are taken out, and again."""
-        fit = self._settled(poses)
-        return fit if _placed(fit.poses).sum() == _placed(poses).sum() else self._settled(fit.poses)
+        """Poses and reflectors from a start; scans of which hardly an echo fits are taken out, and again.
 
-    def _settled(self, poses: Float[np.ndarray, "scans 3"]) -> _Fit:
+        Where the odometry from one scan to the next is broken, a few wrong echoes were enough to bend the path, and all
+        scans are sure of it. Then those around it are not heard until the others stand.
+        """
+        fit = self._settled(poses)
+        fit = fit if _placed(fit.poses).sum() == _placed(poses).sum() else self._settled(fit.poses)
+        broken = self._broken(fit)
+        if len(broken):
+            self.say("again, less of what broke the odometry")
+            again = self._settled(np.where(_placed(fit.poses)[:, None], poses, np.nan), broken)
+            if len(self._broken(again)) < len(broken) and again.round.used * _GROWN >= fit.round.used:
+                return again
+        return fit
+
+    def _broken(self, fit: _Fit) -> Int[np.ndarray, " some"]:
+        """Scans from which the odometry to the next one is broken."""
+        data, state, rows = fit.data, fit.round.settled.state, fit.data.rows[0]
+        told, change = data.odometry[:-1].copy(), self.modes.columns @ state.coordinates
+        if len(change) > 3 * self.ring.count + 1:
+            told *= np.exp(-change[[-2, -2, -1]])
+        last = len(rows) - 1
+        return rows[broken_steps(state.poses[: last + 1], told[:last], data.linked[:last])]
+
+    def _settled(self, poses: Float[np.ndarray, "scans 3"], broken: Int[np.ndarray, " some"] = _NONE) -> _Fit:
         log = replace(self.log, pose=poses)
         data = _free(Data.of(self.ring, [log], [self.odometry], self.slip, silent=True), self.first)
         data = replace(data, together=_TOGETHER if self.window is None else 1, sparse=True)
         if data.scans > _MANY:
             data = replace(data, steps=_FEW_STEPS)
-        found = self._alternated(data, log)
+        found = self._alternated(data, log, broken)
         if found is None:
             raise SonarError("smooth: no echo fits the walls; is it the right ring, are poses and units right?")
         rows = data.rows[0]
@@ -209,14 +240,32 @@ class _Job:
         world = seen_world(ring, data.placed([log], state.poses)[0], window=self.window, models=self.models)
         if not len(world):
             raise SonarError("smooth: no wall found; allowed are scans of a place with straight walls in reach")
-        return world
+        return world if self.passages is None else self.passages.parted(world, self._rows)
 
-    def _alternated(self, data: Data, log: Log) -> Round | None:
+    @property
+    def _rows(self) -> dict[int, int]:
+        """Of the scans by their numbers."""
+        return {int(number): row for row, number in enumerate(self.log.scan)}
+
+    def _around(self, data: Data, worlds: list[GlobalMap]) -> Surroundings:
+        """The reflectors of the only map."""
+        around = surroundings(worlds, tied=False)
+        if self.passages is None:
+            return around
+        heard = np.zeros((len(data.poses), len(around.world)), dtype=bool)
+        rows, known = data.rows[0], self.passages.heard_by(worlds[0], self._rows)
+        heard[: len(rows), : known.shape[1]] = known[self.passages.part[rows]]
+        return around._replace(heard_by=heard)
+
+    def _alternated(self, data: Data, log: Log, broken: Int[np.ndarray, " some"]) -> Round | None:
         """Map and least squares in turn; at first the poses stay near where they began, until the map has shape."""
-        near = replace(data, anchored=np.maximum(data.anchored, 1 / np.square(_NEAR)))
+        near = np.maximum(data.anchored, 1 / np.square(_NEAR))
+        near = replace(data, anchored=near, reported=data.reported.copy())
+        unheard = np.abs(data.rows[0][:, None] - broken).min(axis=1, initial=_AROUND + 1) <= _AROUND
+        near.reported[: len(unheard)][unheard] = np.nan
         state = State(np.zeros(self.modes.columns.shape[1]), data.poses, surroundings([], tied=False))
         self.say("first map")
-        start = state._replace(around=surroundings([self._mapped(data, log, state)], tied=False))
+        start = state._replace(around=self._around(data, [self._mapped(data, log, state)]))
         with jax.enable_x64(True):
             start = approach(self.ring, near, self.modes, start, widest=_WIDEST, sigma=self.sigma)
         return alternated(
@@ -226,6 +275,7 @@ class _Job:
             widest=AGAIN,
             say=self.say,
             maps=_FEW_MAPS if data.scans > _MANY else MAPS,
+            around=lambda worlds: self._around(data, worlds),
         )
 
     def _settle(self, data: Data, state: State, widest: float) -> Settled:
@@ -274,6 +324,21 @@ def _modes(ring: Ring, *, speed: bool, scale: bool) -> RingModes:
     columns[:-2, :-2] = modes.columns
     columns[-2:, -2:] = SCALE_SD * np.eye(2)
     return RingModes(columns, (*modes.names, "way", "turn"))
+
+
+def broken_steps(
+    poses: Float[np.ndarray, "scans 3"], odometry: Float[np.ndarray, "steps 3"], linked: Float[np.ndarray, "steps 3"]
+) -> Int[np.ndarray, " some"]:
+    """Steps whose odometry slips farther than any of a hundred runs would.
+
+    Args:
+        poses: world_from_robot.
+        odometry: each next pose in the frame of the one before, as measured.
+        linked: inverse variances of it; 0 where there is none.
+    """
+    slip = relative(poses[:-1], poses[1:]) - odometry
+    slip[:, 2] = wrap_angle(slip[:, 2])
+    return np.flatnonzero((linked * slip**2).sum(axis=-1) > chi2.isf(_RARE / max(len(slip), 1), 3))
 
 
 def _free(data: Data, first: int) -> Data:

@@ -60,6 +60,8 @@ class Surroundings(NamedTuple):
     world: Int[np.ndarray, " reflectors"]
     """Which map each reflector is from; -1 for padding."""
     candidates: kernels.Candidates
+    heard_by: Bool[np.ndarray, "scans reflectors"] | None = None
+    """Which scans may hear each reflector; None: all."""
 
     def near(
         self, poses: Float[np.ndarray, "scans 3"], world: Int[np.ndarray, " scans"], reach: float
@@ -83,6 +85,8 @@ class Surroundings(NamedTuple):
         either = np.minimum(distance[:, np.asarray(reflection.first)], distance[:, np.asarray(reflection.second)])
         heard = (either < reach) & (np.asarray(self.candidates.world) == world[:, None]) & (world >= 0)[:, None]
         heard &= np.asarray(reflection.kind) >= 0
+        if self.heard_by is not None:
+            heard &= self.heard_by[:, np.asarray(reflection.first)]
         room = min(power_of_two(int(heard.sum(axis=1).max(initial=1)), least=_ROOM), heard.shape[1])
         order = np.argsort(~heard, axis=1, kind="stable")[:, :room]
         return np.where(np.take_along_axis(heard, order, axis=1), order, -1).astype(np.int32)

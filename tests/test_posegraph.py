@@ -101,6 +101,14 @@ def test_the_relative_covariance_is_that_of_the_joint_one_through_numerical_deri
     np.testing.assert_allclose(cov[2], 0.0, atol=1e-12)
 
 
+def test_every_pair_is_as_one_of_them_sees_the_other(rng):
+    _, start, links = graph_of(rng)
+    graph, nodes = solve(start, links), np.array([0, 3, 5, 8])
+    between = graph.between(nodes)
+    for k, node in enumerate(nodes):
+        np.testing.assert_allclose(between[k], graph.relative(int(node), nodes)[1], atol=1e-12)
+
+
 def test_the_world_may_be_turned_and_moved(rng):
     _, start, links = graph_of(rng)
     world = np.array([3.0, -2.0, 2.5])
