@@ -193,7 +193,9 @@ def _check(engine: str, scheduler: str | None, workers: int | None, scans: int) 
             f"scheduler {shown(scheduler)} came with engine {engine}; allowed is --scheduler with --engine dask"
         )
     if scheduler is not None and workers is not None:
-        raise SonarError(f"workers {workers} came with a scheduler; allowed are they without: a cluster has its own")
+        raise SonarError(
+            f"workers {workers} came with a scheduler; allowed are workers without one: a cluster has its own"
+        )
     if workers is not None and workers < 1:
         raise SonarError(f"workers {workers} came; allowed is 1 or more")
     if scans < 1:

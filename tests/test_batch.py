@@ -1,6 +1,7 @@
 """Batches: the numbers of local models, the same bytes however the work was done, and nothing lost by a kill."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 import jaxsonar
-from jaxsonar import Log, SonarError, batch, engines, load_log, load_ring, local_models, save_log
+from jaxsonar import Log, SonarError, batch, batch_worker, engines, load_log, load_ring, local_models, save_log
 from jaxsonar.batch_found import tables
 from jaxsonar.batch_manifest import opened
 from jaxsonar.batch_shards import Input, find_inputs, shards_of
@@ -171,8 +172,21 @@ def test_two_workers_write_the_same_bytes(logs, done, tmp_path):
 
 def test_a_dask_cluster_writes_the_same_bytes(logs, done, tmp_path):
     pytest.importorskip("distributed")
+    names = (*batch_worker.KEPT_MEMORY, *batch_worker.ONE_THREAD)
+    before = [os.environ.get(name) for name in names]
     batch([logs], RING, tmp_path, engine="dask", **HOUGH)
     assert contents(tmp_path) == contents(done)
+    assert [os.environ.get(name) for name in names] == before
+
+
+def test_a_folder_in_which_nothing_was_done_is_begun_anew(logs, done, tmp_path):
+    pytest.importorskip("distributed")
+    with pytest.raises(SonarError, match=r"nonsense.*allowed is an address"):
+        batch([logs], RING, tmp_path, engine="dask", scheduler="nonsense://x", method="ml")
+    batch([logs], RING, tmp_path, **HOUGH)
+    assert contents(tmp_path) == contents(done)
+    with pytest.raises(SonarError, match="before"):
+        batch([logs], RING, tmp_path, method="ml")
 
 
 def test_killed_and_taken_up_again_it_is_as_if_nothing_had_been(logs, done, tmp_path):

@@ -287,3 +287,23 @@ def test_a_run_that_was_killed_and_went_on_has_the_tables_of_one_that_was_not(tm
     assert whole["rate"] > 0
     (tmp_path / "killed" / "lines" / "other.parquet").write_bytes(b"")
     assert not million.same(tmp_path / "local", tmp_path / "killed")
+
+
+@pytest.mark.parametrize(
+    "call", [["--from", "{}"], ["--gate", "--baseline", "{}"], ["--only", "latency", "--write", "{}/no.md"]]
+)
+@pytest.mark.parametrize("holds", [None, "{", "[]", "{}"])
+def test_files_that_the_suite_did_not_write_are_refused_before_the_work(call, holds, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command, "measured", lambda *_: pytest.fail("it was measured"))
+    file = tmp_path / "file.json"
+    if holds is not None:
+        file.write_text(holds)
+    assert command.main([*(one.format(file) for one in call), "-o", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "needed is" in said
+
+
+def test_a_baseline_is_what_is_usual():
+    runs = [[Metric("a", value, RATIO), Metric("b", -value, RATIO)] for value in (3.0, 1.0, 2.0)]
+    assert [one.value for one in command.usual(runs)] == [2.0, -2.0]
