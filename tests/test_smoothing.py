@@ -226,7 +226,6 @@ def test_without_echoes_in_one_direction_the_covariance_says_so(corridor):
     assert (np.abs(error(found, log)[:, 1:]) < 5 * sd[:, 1:] + 1e-4).all()
 
 
-@pytest.mark.xfail(reason="the wedge is that of the noise: along a bare corridor poses go off farther than is said")
 def test_along_a_bare_corridor_the_truth_is_within_what_is_said(corridor):
     log, found = corridor
     sd = np.sqrt(np.diagonal(found.pose_cov, axis1=1, axis2=2))
