@@ -45,7 +45,7 @@ def adjust(
         enough: decrease of the cost (half a sum of squares in units of sigma) at which it ends; to the digits if 0.
     """
     equations = _Equations(problem, poses_free)
-    now = _Point(*(np.array(leaf, dtype=np.float64) for leaf in (unknowns.modes, unknowns.poses, unknowns.scene)))
+    now = _Point.of(unknowns)
     slopes = equations.slopes(now)
     before = value = equations.cost(now, slopes)
     damping, least, greatest = _DAMPING
@@ -75,7 +75,7 @@ def adjust(
 def known(problem: kernels.Problem, unknowns: kernels.Unknowns, *, poses_free: bool = True) -> Known:
     """How well everything is known at the minimum of the cost; poses that are held are known exactly."""
     equations = _Equations(problem, poses_free)
-    now = _Point(*(np.array(leaf, dtype=np.float64) for leaf in (unknowns.modes, unknowns.poses, unknowns.scene)))
+    now = _Point.of(unknowns)
     values, _ = equations.linear(now, equations.slopes(now))
     blocks = equations.plan.factor(values).marginals()
     poses, count = np.zeros((len(now.poses), 3, 3)), equations.poses
@@ -92,6 +92,11 @@ class _Point(NamedTuple):
     modes: Float[np.ndarray, " modes"]
     poses: Float[np.ndarray, "scans 3"]
     scene: Float[np.ndarray, "reflectors 2"]
+
+    @classmethod
+    def of(cls, unknowns: kernels.Unknowns) -> "_Point":
+        """The same, in double precision."""
+        return cls(*(np.array(leaf, dtype=np.float64) for leaf in (unknowns.modes, unknowns.poses, unknowns.scene)))
 
 
 class _Part(NamedTuple):
@@ -159,23 +164,24 @@ class _Equations:
 
     def cost(self, at: _Point, slopes: dict[str, Float[np.ndarray, "terms *some"]]) -> float:
         """Half the weighted sum of squares, what was expected included (``kernels.cost``)."""
+        strayed, bent = self._strayed(at)
         total = float((self.weight * slopes["left"][:, 0] ** 2).sum() + (at.modes**2).sum())
-        total += float((self.linked * slopes["slip"] ** 2).sum() + (self._strayed(at)[1] ** 2).sum())
-        return (total + float((self.anchored * self._strayed(at)[0] ** 2).sum())) / 2
+        total += float((self.linked * slopes["slip"] ** 2).sum() + (bent**2).sum())
+        return (total + float((self.anchored * strayed**2).sum())) / 2
 
     def linear(
         self, at: _Point, slopes: dict[str, Float[np.ndarray, "terms *some"]]
     ) -> tuple[Float[np.ndarray, " stored"], Float[np.ndarray, " unknowns"]]:
         """The normal equations there: the matrix as the plan stores it, and the right hand side."""
         plan = self.plan
-        values, side = np.zeros(plan.stored), np.zeros(int(plan.begin[-1]))
+        side = np.zeros(int(plan.begin[-1]))
         places, numbers = [], []
         for one, other, term, place in self.products:
             weight = self.linked[term] if one.startswith("slip") else self.weight[term, None]
             heavy = slopes[one][term] * weight[..., None]
             places.append(place.ravel())
             numbers.append((np.swapaxes(heavy, 1, 2) @ slopes[other][term]).ravel())
-        values += np.bincount(np.concatenate(places), np.concatenate(numbers), minlength=plan.stored)
+        values = np.bincount(np.concatenate(places), np.concatenate(numbers), minlength=plan.stored)
         for block, term, name in self.parts:
             slip = name.startswith("slip")
             pull = -self.linked * slopes["slip"] if slip else self.weight[:, None] * slopes["left"]

@@ -142,8 +142,7 @@ def _runs(
     scan, echo = at // owner.shape[1], owner.ravel()[at]
     path = step.path[scan, echo]
     begin = piece.ravel()[at] * width + first - at * width
-    sums = _normal_sums(arcs)
-    normal_x, normal_y = (total[path, begin + points] - total[path, begin] for total in sums)
+    normal_x, normal_y = (sums[path, begin + points] - sums[path, begin] for sums in _normal_sums(arcs))
     if step.pose is not None:
         turn = unit(step.pose[scan, echo, 2])
         normal_x, normal_y = (

@@ -56,8 +56,8 @@ def run_dask(
             # A shard whose worker dies is tried once more, as the local engine does it.
             stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": 1}))
             # What a process must know as it starts goes through our own environment, which Dask leaves changed.
-            early = KEPT_MEMORY | {key: value for key, value in ONE_THREAD.items() if key != "XLA_FLAGS"} | os.environ
-            early = {key: early[key] for key in (*KEPT_MEMORY, *ONE_THREAD) if key != "XLA_FLAGS"}
+            early = {key: os.environ.get(key, value) for key, value in (KEPT_MEMORY | ONE_THREAD).items()}
+            del early["XLA_FLAGS"]  # they need only be there before JAX is
             stack.enter_context(dask.config.set({"distributed.nanny.pre-spawn-environ": early}))
             stack.enter_context(_left_as_it_was(early))
             count = min(workers or len(devices) or cores(), len(shards))

@@ -6,6 +6,7 @@ a wall that is heard again is another wall, until it is known that it is the sam
 """
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -61,6 +62,12 @@ class Passages:
                 out[:, number] = self._known(world, number, parts).any(axis=1)
         return out
 
+    @cached_property
+    def _from_world(self) -> Float[np.ndarray, "parts 2 2"]:
+        """Turns directions in the world into those that each stretch has."""
+        c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
+        return np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
+
     def _parts(self, scans: tuple[int, ...], rows: dict[int, int]) -> Int[np.ndarray, " some"]:
         return np.unique(self.part[[rows[scan] for scan in scans]]) if scans else np.zeros(0, dtype=np.int64)
 
@@ -69,8 +76,7 @@ class Passages:
 
         Along a wall nothing need be known.
         """
-        c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
-        from_world = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
+        from_world = self._from_world
         if number < len(world):
             first, last = world.segments[number]
             share = ((self.poses[:, :2] - first) @ (last - first)) / max(float(((last - first) ** 2).sum()), 1e-12)

@@ -6,6 +6,7 @@ the scans that had no place, and say how well everything is known.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
@@ -242,7 +243,7 @@ class _Job:
             raise SonarError("smooth: no wall found; allowed are scans of a place with straight walls in reach")
         return world if self.passages is None else self.passages.parted(world, self._rows)
 
-    @property
+    @cached_property
     def _rows(self) -> dict[int, int]:
         """Of the scans by their numbers."""
         return {int(number): row for row, number in enumerate(self.log.scan)}
