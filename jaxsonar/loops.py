@@ -10,16 +10,19 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .loops_closure import REACH, closure
+from .loops_contradictions import Surroundings, Vicinity, surroundings
 from .loops_joining import joined
 from .loops_verified import Closures, Decision, Proposal
 from .posegraph import Graph, Link, solve
-from .poses import composed
+from .poses import composed, relative
 from .submaps import Submap
 
 MOST, LOOKED_AT = 4, 12
 """Earlier submaps that are compared with a new one, and those among which they are chosen."""
 RECENT = 5
 """Submaps not older than this take at most half of these places."""
+BESIDE = 2
+"""So many submaps before and after one are asked what speaks against its place."""
 BEYOND = 3.0
 """Submaps may overlap if they do within so many standard deviations."""
 
@@ -46,6 +49,7 @@ class SubmapGraph:
     def __init__(self, *, reach: float = REACH, most: int = MOST):
         self.reach, self.most = reach, most
         self.submaps: list[Submap] = []
+        self.surroundings: list[Surroundings] = []
         self.chain: list[Link] = []
         self.closures = Closures()
         self.graph = Graph(np.zeros((1, 3)), (), converged=True)
@@ -59,6 +63,7 @@ class SubmapGraph:
         """One that can be added to, while this one stays as it is."""
         twin = SubmapGraph(reach=self.reach, most=self.most)
         twin.submaps, twin.chain, twin.graph = list(self.submaps), list(self.chain), self.graph
+        twin.surroundings = list(self.surroundings)
         twin.closures = self.closures.copy()
         return twin
 
@@ -76,6 +81,7 @@ class SubmapGraph:
         made = len(self.closures.decisions)
         newest = len(self.submaps)
         self.submaps.append(submap)
+        self.surroundings.append(surroundings(submap))
         if newest:
             self.chain[-1] = joined(self.submaps[-2], submap, newest - 1)
         self.chain.append(chain_link(submap, newest))
@@ -91,12 +97,25 @@ class SubmapGraph:
 
     def _closed(self, earlier: int, newest: int) -> bool:
         expected, covariance = self.graph.relative(earlier, np.array([newest]))
-        found = closure(self.submaps[newest], self.submaps[earlier], expected[0], covariance[0], reach=self.reach)
+        around = self._vicinity(earlier, newest - 1), self._vicinity(newest, newest)
+        found = closure(
+            self.submaps[newest], self.submaps[earlier], expected[0], covariance[0], reach=self.reach, around=around
+        )
         if found is None:
             return False
         known = self.submaps[earlier]
         return self.closures.consider(
             self.graph, Proposal(earlier, newest, found, known.anchor[found.pairs.earlier].mean(axis=0))
+        )
+
+    def _vicinity(self, number: int, last: int) -> Vicinity:
+        """Of a submap, with some of those before and after it up to the last one that is asked for."""
+        own = self.graph.poses[number]
+        steps = [sign * step for step in range(1, BESIDE + 1) for sign in (1, -1)]
+        others = [number + step for step in steps if 0 <= number + step <= last]
+        return Vicinity(
+            self.surroundings[number],
+            tuple((relative(own, self.graph.poses[k]), self.surroundings[k]) for k in others),
         )
 
 

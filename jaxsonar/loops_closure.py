@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from . import kernels
-from .loops_contradictions import Surroundings, against, surroundings
+from .loops_contradictions import Vicinity, against, surroundings
 from .loops_doubts import CERTAIN, Doubts, Field, elsewhere, log_density, log_sum
 from .loops_matching import Fit, Pairs, compatible, gains, nearest
 from .loops_starts import SIGMAS, Prior, starts
@@ -88,6 +88,7 @@ def closure(
     covariance: Float[np.ndarray, "3 3"],
     *,
     reach: float = REACH,
+    around: tuple[Vicinity, Vicinity] | None = None,
 ) -> Closure | None:
     """How the newest submap lies on the earlier one, or None where that is open.
 
@@ -97,11 +98,13 @@ def closure(
         expected: earlier_from_newest by what is known without them, metres and radians.
         covariance: of this.
         reach: walls as near as this to the robot are heard, metres.
+        around: what is known about both, and about those along the path beside them; if left out, only of both.
     """
     if min(len(newest), len(earlier)) < 2:
         return None
     prior = Prior(expected, HONEST**2 * covariance + np.diag([1e-4, 1e-4, 1e-5]))
-    around = surroundings(earlier), surroundings(newest)
+    around = around or (Vicinity(surroundings(earlier)), Vicinity(surroundings(newest)))
+    own = around[0].own, around[1].own
     ways: dict[bytes, tuple[Pairs, Fit]] = {}
     for pose in starts(earlier, newest, prior):
         way = _laid(earlier, newest, pose, prior)
@@ -110,7 +113,7 @@ def closure(
     if not ways:
         return None
     poses = np.array([fit.pose for _, fit in ways.values()])
-    spoken = against(*around, poses, slack=TIGHT, reach=reach)
+    spoken = against(*own, poses, slack=TIGHT, reach=reach)
     laid = [
         _Laid(pairs, fit, _nats(earlier, newest, pairs, fit, prior), float(nats), redundant(earlier, pairs))
         for (pairs, fit), nats in zip(ways.values(), spoken, strict=True)
@@ -172,7 +175,7 @@ def _basis(free: Float[np.ndarray, "2"] | None) -> Float[np.ndarray, "3 rank"]:
 
 
 def _judged(
-    best: _Laid, laid: list[_Laid], around: tuple[Surroundings, Surroundings], prior: Prior, reach: float
+    best: _Laid, laid: list[_Laid], around: tuple[Vicinity, Vicinity], prior: Prior, reach: float
 ) -> Closure | None:
     """The closure, if nothing else that was laid comes near it; with its doubts."""
     fit, basis = best.fit, _basis(best.fit.free)
@@ -192,6 +195,9 @@ def _judged(
     across = np.abs(place @ basis[:2]).max(axis=-1) if fit.free is not None else np.linalg.norm(place, axis=-1)
     out = across > NEAR
     unseen = density[out] + np.log(COPY) - (2 if fit.free is None else 1) * np.log(BESIDE)
+    if fit.free is not None:
+        # Corridors do not lie wall on wall: a parallel one is hardly as near as that.
+        unseen += np.log(-np.expm1(-np.square(across[out] / BESIDE)))
     doubts = Doubts(
         np.concatenate([poses[:, :2] - fit.pose[:2], place[out]]),
         np.concatenate([nats, unseen]),
@@ -203,10 +209,10 @@ def _judged(
     )
 
 
-def _both_sides(best: _Laid, around: tuple[Surroundings, Surroundings]) -> bool:
+def _both_sides(best: _Laid, around: tuple[Vicinity, Vicinity]) -> bool:
     """Whether walls on both sides of the robot are among the pairs."""
-    walls = around[0].rows[:, None] == best.pairs.earlier
-    theta = around[0].theta[walls.any(axis=1)]
+    walls = around[0].own.rows[:, None] == best.pairs.earlier
+    theta = around[0].own.theta[walls.any(axis=1)]
     return bool((np.abs(wrap_angle(theta[:, None] - theta)) > np.pi / 2).any())
 
 
@@ -221,7 +227,7 @@ def _apart(pose: Float[np.ndarray, "3"], fit: Fit, basis: Float[np.ndarray, "3 r
 def _corridor(
     earlier: Submap,
     newest: Submap,
-    around: tuple[Surroundings, Surroundings],
+    around: tuple[Vicinity, Vicinity],
     best: _Laid,
     prior: Prior,
     reach: float,
@@ -239,5 +245,5 @@ def _corridor(
     if found is None or found[1].free is None:
         return None
     pose = found[1].pose
-    spoken = float(against(*around, pose[None], slack=TIGHT, reach=reach)[0])
+    spoken = float(against(around[0].own, around[1].own, pose[None], slack=TIGHT, reach=reach)[0])
     return _Laid(*found, _nats(earlier, newest, *found, prior), spoken, True)

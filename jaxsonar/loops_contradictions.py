@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from . import kernels
 from .placing_map import tangent_of, turned
-from .poses import inverse, unit, wrap_angle
+from .poses import composed, inverse, unit, wrap_angle
 from .submaps import Submap
 
 VIEWS = 6
@@ -23,6 +23,8 @@ UNHEARD = np.array([0.0, 1.0, 2.0, 3.0])
 """Nats against a wall that was not heard from 0, 1, 2 and more places."""
 CORNER_SHARE, EDGE_SHARE = 0.6, 0.3
 """The same of corners and of edges, which are faint, as a share."""
+BODY = 0.1
+"""Any robot reaches at least this far from its centre, metres."""
 NEAREST, ASKEW, EDGE = 0.2, np.radians(15.0), 0.15
 """Walls are heard from this far on, taken for each other up to this angle, and not surely there this near to an end."""
 
@@ -47,6 +49,29 @@ class Surroundings(NamedTuple):
     end: Float[np.ndarray, "sights 2"]
     """From the robot to what it heard, nearly."""
 
+    @property
+    def middle_of_path(self) -> Float[np.ndarray, "2"]:
+        """Of the box around the path."""
+        return (self.path.min(axis=0) + self.path.max(axis=0)) / 2
+
+    @property
+    def radius(self) -> float:
+        """Metres from there to the ends of the path, at most."""
+        return float(np.linalg.norm(np.ptp(self.path, axis=0))) / 2
+
+
+class Vicinity(NamedTuple):
+    """Surroundings of a submap and of those along the path just before and after it."""
+
+    own: Surroundings
+    beside: tuple[tuple[Float[np.ndarray, "3"], Surroundings], ...] = ()
+    """The others, the nearest first: own_from_other, and what it is."""
+
+    @property
+    def all(self) -> tuple[tuple[Float[np.ndarray, "3"], Surroundings], ...]:
+        """Its own as well, first."""
+        return (np.zeros(3), self.own), *self.beside
+
 
 def surroundings(submap: Submap) -> Surroundings:
     """Of one submap."""
@@ -55,21 +80,21 @@ def surroundings(submap: Submap) -> Surroundings:
     middle, half = segment.mean(axis=1), np.linalg.norm(segment[:, 1] - segment[:, 0], axis=-1) / 2
     chosen = np.unique(np.linspace(0, max(len(submap.poses) - 1, 0), VIEWS).round().astype(int))
     path = submap.poses[chosen, :2] if len(submap.poses) else np.zeros((1, 2))
-    # Each wall from the place where its foot is on it and near, each point from the nearest place.
+    # Each wall from all places whose foot is on it, each point from the nearest place.
     offset = path[:, None] - middle
     along, distance = (offset * tangent_of(theta)).sum(-1), -(offset * unit(theta)).sum(-1)
     beside = np.where((np.abs(along) <= half + EDGE) & (distance > 0), distance, np.inf)
     targets, starts = [submap.points], [_nearest(path, submap.points)]
-    if len(row):
-        view = beside.argmin(axis=0)
-        good = np.flatnonzero(np.isfinite(beside.min(axis=0)))
-        view = view[good]
-        targets.append(path[view] + distance[view, good, None] * unit(theta[good]))
-        starts.append(path[view])
+    view, wall = np.nonzero(np.isfinite(beside))
+    targets.append(path[view] + distance[view, wall, None] * unit(theta[wall]))
+    starts.append(path[view])
     start, target = np.concatenate(starts), np.concatenate(targets)
     other = np.flatnonzero(submap.kind != kernels.PLANE)
     share = np.where(submap.kind[other] == kernels.CORNER, CORNER_SHARE, EDGE_SHARE) * (submap.scans[other] >= OFTEN)
     sure, end = submap.scans[row] >= OFTEN, start + 0.9 * (target - start)
+    # The robot itself takes room: no wall goes through it either.
+    away = target - start
+    start = start - BODY * away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
     return Surroundings(row, theta, middle, half, sure, submap.points, share, path, start, end)
 
 
@@ -98,6 +123,38 @@ def against(
     """
     back = inverse(poses)
     return _against(newest, earlier, poses, back, slack, reach) + _against(earlier, newest, back, poses, slack, reach)
+
+
+def against_vicinity(
+    earlier: Vicinity,
+    newest: Vicinity,
+    poses: Float[np.ndarray, "poses 3"],
+    *,
+    slack: float,
+    reach: float,
+    enough: float,
+) -> Float[np.ndarray, " poses"]:
+    """The same, and what is known before and after either may speak as well: what speaks most, for walls are in several.
+
+    Args:
+        earlier: of the submap that stays.
+        newest: of the submap that is moved.
+        poses: earlier_from_newest.
+        slack: as for ``against``; it must bear the errors between neighbors as well.
+        reach: walls as near as this are heard, metres.
+        enough: nats above which no more is asked.
+    """
+    nats = np.zeros(len(poses))
+    for stays, mine in earlier.all:
+        for moves, yours in newest.all:
+            asked = np.flatnonzero(nats < enough)
+            there = np.concatenate([_moved(poses[asked], moves[None, :2])[:, 0], poses[asked, 2:] + moves[2]], axis=-1)
+            pose = composed(inverse(stays), there)
+            near = np.linalg.norm(_moved(pose, yours.middle_of_path[None])[:, 0] - mine.middle_of_path, axis=-1)
+            close = near < mine.radius + yours.radius + reach
+            asked, pose = asked[close], pose[close]
+            nats[asked] = np.maximum(nats[asked], against(mine, yours, pose, slack=slack, reach=reach))
+    return np.minimum(nats, enough)
 
 
 def _against(

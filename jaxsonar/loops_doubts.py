@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .loops_contradictions import Surroundings, against
+from .loops_contradictions import Vicinity, against_vicinity
 from .loops_matching import Fit
 from .loops_starts import Prior
 
@@ -58,7 +58,7 @@ def log_density(
 
 
 def elsewhere(
-    fit: Fit, around: tuple[Surroundings, Surroundings], prior: Prior, reach: float
+    fit: Fit, around: tuple[Vicinity, Vicinity], prior: Prior, reach: float
 ) -> tuple[Float[np.ndarray, "cells 2"], Float[np.ndarray, " cells"], Field]:
     """Places within reach of the prior, as offsets from the fit, heading as found.
 
@@ -76,7 +76,7 @@ def elsewhere(
     nats = np.zeros(len(poses))
     # What is far out in the prior does not matter, whatever speaks against it.
     likely = density > density.max() - 12.0
-    nats[likely] = np.minimum(against(*around, poses[likely], slack=LOOSE, reach=reach), CERTAIN)
+    nats[likely] = against_vicinity(*around, poses[likely], slack=LOOSE, reach=reach, enough=CERTAIN)
     offset = at - fit.pose[:2]
     field = Field(offset[0], pitch, nats.reshape(len(step), len(step)))
     return offset, density - nats + 2 * np.log(pitch), field

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 from scipy.special import chdtri
 
-from .loops_closure import COPY, Closure
+from .loops_closure import COPY, HONEST, Closure
 from .loops_doubts import log_sum
 from .posegraph import Graph, Link, relative_jacobians, solve
 from .poses import to_world, wrap_angle
@@ -204,7 +204,7 @@ def _innovation(
         design.append(basis.T @ np.concatenate([by_first, by_second], axis=1))
         noise.append(basis.T @ np.linalg.pinv(one.closure.information, hermitian=True) @ basis)
     whole = block_diag(*design)
-    return np.concatenate(residual), whole @ joint @ whole.T + block_diag(*noise)
+    return np.concatenate(residual), HONEST**2 * whole @ joint @ whole.T + block_diag(*noise)
 
 
 def _bound(proposals: list[Proposal], probability: float) -> float:
