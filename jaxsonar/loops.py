@@ -1,10 +1,13 @@
 """Submaps into one map: the chain of them, closures where the robot comes back, and where every submap lies.
 
-``SubmapGraph`` is all that a front end needs: ``add`` takes a finished submap, and ``poses`` says where all are.
+``SubmapGraph`` is all that a front end needs: ``add`` takes a finished submap, ``work`` does what follows from it piece
+by piece, so that a robot can do one with each scan, and ``poses`` says where all are.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,21 +24,12 @@ MOST, LOOKED_AT = 4, 12
 """Earlier submaps that are compared with a new one, and those among which they are chosen."""
 RECENT = 5
 """Submaps not older than this take at most half of these places."""
+TIED = 2
+"""So many closures of a submap that count are enough."""
 BESIDE = 2
 """So many submaps before and after one are asked what speaks against its place."""
 BEYOND = 3.0
 """Submaps may overlap if they do within so many standard deviations."""
-
-
-class Added(NamedTuple):
-    """What came of a finished submap."""
-
-    base: Float[np.ndarray, "3"]
-    """world_from_submap of the next submap."""
-    closed: bool
-    """Whether any pose but the newest moved because of closures."""
-    decisions: tuple[Decision, ...]
-    """Made on this occasion."""
 
 
 class SubmapGraph:
@@ -53,6 +47,7 @@ class SubmapGraph:
         self.chain: list[Link] = []
         self.closures = Closures()
         self.graph = Graph(np.zeros((1, 3)), (), converged=True)
+        self._todo: tuple[Callable[[SubmapGraph], None], ...] = ()
 
     @property
     def poses(self) -> Float[np.ndarray, "nodes 3"]:
@@ -63,7 +58,7 @@ class SubmapGraph:
         """One that can be added to, while this one stays as it is."""
         twin = SubmapGraph(reach=self.reach, most=self.most)
         twin.submaps, twin.chain, twin.graph = list(self.submaps), list(self.chain), self.graph
-        twin.surroundings = list(self.surroundings)
+        twin.surroundings, twin._todo = list(self.surroundings), self._todo
         twin.closures = self.closures.copy()
         return twin
 
@@ -76,37 +71,67 @@ class SubmapGraph:
         """Of ``poses``."""
         return self.graph.covariance(np.arange(len(self.graph)))
 
-    def add(self, submap: Submap) -> Added:
-        """Take a finished submap: its chain link, walls shared with the one before, closures with earlier ones."""
-        made = len(self.closures.decisions)
+    def add(self, submap: Submap) -> None:
+        """Take a finished submap. Whatever was left to do for the one before is done first."""
+        self.settle()
         newest = len(self.submaps)
         self.submaps.append(submap)
         self.surroundings.append(surroundings(submap))
-        if newest:
-            self.chain[-1] = joined(self.submaps[-2], submap, newest - 1)
         self.chain.append(chain_link(submap, newest))
+        # A new end of the chain pulls at nothing: all others stay where they are.
         poses = np.concatenate([self.poses, composed(self.poses[-1], submap.exit)[None]])
-        self.graph = solve(poses, self.chain + self.closures.links)
-        # Each closure that counts makes the prior of the next ones narrower.
-        closed = False
-        for earlier in candidates(self.graph, self.submaps, newest, most=self.most):
-            if self._closed(int(earlier), newest):
-                self.graph = self.closures.settled(self.graph.poses, self.chain, newest)
-                closed = True
-        return Added(self.poses[-1], closed, tuple(self.closures.decisions[made:]))
+        self.graph = Graph(poses, self.chain + self.closures.links, converged=self.graph.converged)
+        self._todo = (SubmapGraph._join, SubmapGraph._choose) if newest else ()
 
-    def _closed(self, earlier: int, newest: int) -> bool:
+    @property
+    def busy(self) -> bool:
+        """Whether anything is left to do for the newest submap."""
+        return bool(self._todo)
+
+    def work(self) -> tuple[Decision, ...]:
+        """Do the next piece of what is left for the newest submap; the decisions about closures that it came to.
+
+        First the walls that it shares with the one before, then which earlier ones it may overlap, then these one by
+        one, the likeliest first.
+        """
+        made = len(self.closures.decisions)
+        if self._todo:
+            task, *rest = self._todo
+            self._todo = tuple(rest)
+            task(self)
+        return tuple(self.closures.decisions[made:])
+
+    def settle(self) -> tuple[Decision, ...]:
+        """Do all that is left."""
+        made = len(self.closures.decisions)
+        while self.busy:
+            self.work()
+        return tuple(self.closures.decisions[made:])
+
+    def _join(self) -> None:
+        """Put the walls that the newest submap shares with the one before into the chain."""
+        newest = len(self.submaps) - 1
+        self.chain[-2] = joined(self.submaps[-2], self.submaps[-1], newest - 1)
+        self.graph = solve(self.poses, self.chain + self.closures.links)
+
+    def _choose(self) -> None:
+        """See which earlier submaps the newest one may overlap."""
+        chosen = candidates(self.graph, self.submaps, len(self.submaps) - 1, most=self.most)
+        self._todo = tuple(partial(SubmapGraph._compare, earlier=int(earlier)) for earlier in chosen)
+
+    def _compare(self, earlier: int) -> None:
+        """See whether the newest submap lies on an earlier one. What counts makes the prior of the next ones narrower."""
+        newest = len(self.submaps) - 1
         expected, covariance = self.graph.relative(earlier, np.array([newest]))
-        around = self._vicinity(earlier, newest - 1), self._vicinity(newest, newest)
-        found = closure(
-            self.submaps[newest], self.submaps[earlier], expected[0], covariance[0], reach=self.reach, around=around
-        )
+        known, around = self.submaps[earlier], (self._vicinity(earlier, newest - 1), self._vicinity(newest, newest))
+        found = closure(self.submaps[newest], known, expected[0], covariance[0], reach=self.reach, around=around)
         if found is None:
-            return False
-        known = self.submaps[earlier]
-        return self.closures.consider(
-            self.graph, Proposal(earlier, newest, found, known.anchor[found.pairs.earlier].mean(axis=0))
-        )
+            return
+        place = known.anchor[found.pairs.earlier].mean(axis=0)
+        if self.closures.consider(self.graph, Proposal(earlier, newest, found, place)):
+            self.graph = self.closures.settled(self.graph.poses, self.chain, newest)
+            if sum(one.newest == newest for one in self.closures.accepted) >= TIED:
+                self._todo = ()
 
     def _vicinity(self, number: int, last: int) -> Vicinity:
         """Of a submap, with some of those before and after it up to the last one that is asked for."""

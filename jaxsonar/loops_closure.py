@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from . import kernels
 from .loops_contradictions import Vicinity, against, surroundings
-from .loops_doubts import CERTAIN, Doubts, Field, elsewhere, log_density, log_sum
+from .loops_doubts import CERTAIN, NEAR, Doubts, Field, elsewhere, log_density, log_sum
 from .loops_matching import Fit, Pairs, compatible, gains, nearest
 from .loops_starts import SIGMAS, Prior, starts
 from .placing_map import quarter, tangent_of
@@ -39,8 +39,6 @@ ALIKE = 0.4
 """Another pose counts fully if its pairs have this share of the best one's nats: what repeats is no wonder."""
 TIGHT = 0.1
 """Slack of contradictions at a fitted pose, metres."""
-NEAR = 0.45
-"""Doubt begins this far from a pose, metres."""
 
 
 class Closure(NamedTuple):

@@ -16,6 +16,9 @@ STEP, CELLS = 0.4, 10
 LOOSE = 0.3
 """Slack of contradictions on the grid, metres."""
 
+NEAR = 0.45
+"""Doubt begins this far from a pose, metres."""
+
 
 class Doubts(NamedTuple):
     """Where else the newest submap may lie; offsets from the closure's place, in the frame of the earlier submap."""
@@ -76,7 +79,8 @@ def elsewhere(
     nats = np.zeros(len(poses))
     # What is far out in the prior does not matter, whatever speaks against it.
     likely = density > density.max() - 12.0
-    nats[likely] = against_vicinity(*around, poses[likely], slack=LOOSE, reach=reach, enough=CERTAIN)
     offset = at - fit.pose[:2]
+    if (np.linalg.norm(offset[likely], axis=-1) > NEAR).any():
+        nats[likely] = against_vicinity(*around, poses[likely], slack=LOOSE, reach=reach, enough=CERTAIN)
     field = Field(offset[0], pitch, nats.reshape(len(step), len(step)))
     return offset, density - nats + 2 * np.log(pitch), field

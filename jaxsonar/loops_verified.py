@@ -21,10 +21,13 @@ TELLING = 0.15
 SAME_PLACE = 3.0
 """Closures whose reflectors are nearer than this, metres, are of one place: what repeats once, repeats in both."""
 
+REMEMBERED = 16
+"""So many that are proposed only are looked at again when others come."""
+
 PROPOSED, ACCEPTED, REFUSED, WITHDRAWN = "proposed", "accepted", "refused", "withdrawn"
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Proposal:
     """A closure between two nodes of the graph, and what became of it."""
 
@@ -66,7 +69,7 @@ class Closures:
     def copy(self) -> "Closures":
         """One that can go on, while this one stays as it is."""
         twin = Closures()
-        twin.proposals = [replace(one) for one in self.proposals]
+        twin.proposals = list(self.proposals)
         twin.decisions = list(self.decisions)
         return twin
 
@@ -82,32 +85,37 @@ class Closures:
 
     def consider(self, graph: Graph, proposal: Proposal) -> bool:
         """Take up a proposal; whether any closure counts now that did not before."""
-        submap = proposal.newest
+        submap, number = proposal.newest, len(self.proposals)
         self.proposals.append(proposal)
         chi2 = _surprise(graph, proposal)
-        if chi2 > _bound([proposal], UNLIKELY):
-            self._decide(submap, proposal, REFUSED, proposal.closure.odds, chi2)
+        refused = chi2 > _bound([proposal], UNLIKELY)
+        self._decide(submap, number, REFUSED if refused else PROPOSED, proposal.closure.odds, chi2)
+        if refused:
             return False
-        self._decide(submap, proposal, PROPOSED, proposal.closure.odds, chi2)
         before = len(self.accepted)
-        if self._verified(graph, submap, proposal, chi2):
+        if self._verified(graph, submap, number, chi2):
             # What it confirms may count as well.
-            for other in self.proposals:
-                if other.state == PROPOSED:
-                    self._verified(graph, submap, other, _surprise(graph, other))
+            for other in self._open:
+                self._verified(graph, submap, other, _surprise(graph, self.proposals[other]))
         return len(self.accepted) > before
 
-    def _verified(self, graph: Graph, submap: int, proposal: Proposal, chi2: float) -> bool:
+    @property
+    def _open(self) -> list[int]:
+        """The last few that are proposed only."""
+        return [number for number, one in enumerate(self.proposals) if one.state == PROPOSED][-REMEMBERED:]
+
+    def _verified(self, graph: Graph, submap: int, number: int, chi2: float) -> bool:
+        proposal = self.proposals[number]
         odds = proposal.closure.odds
         if odds < SURE:
             # What is in the graph has narrowed the prior already.
             known = {id(link.information) for link in graph.links}
-            others = [one for one in self.proposals if one.state in (PROPOSED, ACCEPTED)]
-            others = [one for one in others if id(one.closure.information) not in known]
-            odds = confirmed(graph, proposal, others)
+            open_ones = [self.proposals[other] for other in self._open]
+            others = [one for one in self.accepted if id(one.closure.information) not in known]
+            odds = confirmed(graph, proposal, open_ones + others)
         counts = odds >= (SURE if odds == proposal.closure.odds else CONFIRMED)
         if counts:
-            self._decide(submap, proposal, ACCEPTED, odds, chi2)
+            self._decide(submap, number, ACCEPTED, odds, chi2)
         return counts
 
     def settled(self, poses: Float[np.ndarray, "nodes 3"], chain: list[Link], submap: int) -> Graph:
@@ -117,7 +125,8 @@ class Closures:
         """
         graph = solve(poses, chain + self.links)
         while True:
-            accepted = self.accepted
+            numbers = [number for number, one in enumerate(self.proposals) if one.state == ACCEPTED]
+            accepted = [self.proposals[number] for number in numbers]
             chi2 = graph.chi2[len(chain) :]
             far = [k for k, one in enumerate(accepted) if chi2[k] > _bound([one], INTOLERABLE)]
             if not far:
@@ -128,12 +137,12 @@ class Closures:
                 if best is None or without.chi2.sum() < best[1].chi2.sum():
                     best = int(k), without
             assert best is not None
-            self._decide(submap, accepted[best[0]], WITHDRAWN, accepted[best[0]].closure.odds, float(chi2[best[0]]))
+            self._decide(submap, numbers[best[0]], WITHDRAWN, accepted[best[0]].closure.odds, float(chi2[best[0]]))
             graph = best[1]
 
-    def _decide(self, submap: int, proposal: Proposal, state: str, odds: float, chi2: float) -> None:
-        proposal.state = state
-        self.decisions.append(Decision(submap, state, proposal.earlier, proposal.newest, float(odds), float(chi2)))
+    def _decide(self, submap: int, number: int, state: str, odds: float, chi2: float) -> None:
+        one = self.proposals[number] = replace(self.proposals[number], state=state)
+        self.decisions.append(Decision(submap, state, one.earlier, one.newest, float(odds), float(chi2)))
 
 
 def confirmed(graph: Graph, proposal: Proposal, others: list[Proposal]) -> float:

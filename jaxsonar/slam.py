@@ -126,19 +126,24 @@ class Tracker:
         lost = track.strange >= LOST
         if track.ends or lost:
             graph = graph.copy()
-            decisions = graph.add(finished(track, lost=lost)).decisions
+            graph.add(finished(track, lost=lost))
             # The next submap begins with the same scan: of its first pose nothing else is known.
             track = update(self.ring, begin(track), scan, model, row=row, **given)
+        elif graph.busy:
+            graph = graph.copy()
+            decisions = graph.work()
         state = TrackerState(track, graph, start, row + 1)
         pose, covariance = self._here(state)
         return state, Step(model, pose, covariance, decisions)
 
     def finish(self, state: TrackerState) -> TrackerState:
         """Look for closures of the submap that is being made, too; the next scan begins another one."""
-        if len(state.track.rows) < 2:  # a single scan is in the submap before as well
-            return state
         graph = state.graph.copy()
+        graph.settle()
+        if len(state.track.rows) < 2:  # a single scan is in the submap before as well
+            return replace(state, graph=graph)
         graph.add(finished(state.track))
+        graph.settle()
         return replace(state, track=begin(state.track), graph=graph)
 
     def poses(self, state: TrackerState) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:

@@ -219,6 +219,7 @@ def around(outline, path, seed, **errors):
     graph = SubmapGraph()
     for one in made:
         graph.add(one)
+        graph.settle()
     return graph, relative(np.broadcast_to(true[0], true.shape), true)
 
 
@@ -236,6 +237,30 @@ def test_a_way_around_a_block_twice_is_closed_rightly(slip):
     off = graph.poses - true
     assert np.linalg.norm(off[:, :2], axis=1).max() < 0.4
     assert graph.covariances().shape == (len(true), 3, 3)
+
+
+def test_work_done_piece_by_piece_comes_to_the_same():
+    corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
+    made, _ = submaps(ring(7, 5, [(0, 1.7, 0.5, 0.2)]), along(*corners, *corners[:2]), np.random.default_rng(3))
+    at_once, slowly = SubmapGraph(), SubmapGraph()
+    for one in made:
+        at_once.add(one)
+        decisions = at_once.settle()
+        slowly.add(one)
+        before, said = slowly, []
+        while slowly.busy:
+            before, slowly = slowly, slowly.copy()
+            said += slowly.work()
+            assert before.busy  # what was copied is as it was
+        assert [vars(one) for one in said] == [vars(one) for one in decisions]
+    assert at_once.closures.accepted
+    np.testing.assert_array_equal(at_once.poses, slowly.poses)
+    # What is left is done before the next one comes.
+    late = SubmapGraph()
+    for one in made:
+        late.add(one)
+    late.settle()
+    np.testing.assert_array_equal(at_once.poses, late.poses)
 
 
 def test_a_wrong_closure_is_withdrawn_and_leaves_no_trace():
