@@ -4,8 +4,6 @@
 by piece, so that a robot can do one with each scan, and ``poses`` says where all are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -120,7 +118,7 @@ class SubmapGraph:
         self._todo = tuple(partial(SubmapGraph._compare, earlier=int(earlier)) for earlier in chosen)
 
     def _compare(self, earlier: int) -> None:
-        """See whether the newest submap lies on an earlier one. What counts makes the prior of the next ones narrower."""
+        """See whether the newest submap lies on an earlier one; what counts makes the next ones' prior narrower."""
         newest = len(self.submaps) - 1
         expected, covariance = self.graph.relative(earlier, np.array([newest]))
         known, around = self.submaps[earlier], (self._vicinity(earlier, newest - 1), self._vicinity(newest, newest))

@@ -134,7 +134,7 @@ def against_vicinity(
     reach: float,
     enough: float,
 ) -> Float[np.ndarray, " poses"]:
-    """The same, and what is known before and after either may speak as well: what speaks most, for walls are in several.
+    """The same, and what is known before and after either may speak: what speaks most, for walls are in several.
 
     Args:
         earlier: of the submap that stays.

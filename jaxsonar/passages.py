@@ -50,7 +50,7 @@ class Passages:
             for k in range(int(group.max(initial=0)) + 1):
                 own = np.isin(of_scan, parts[group == k])
                 (walls if wall else points).append((row, tuple(np.asarray(seen)[own].tolist())))
-        return _taken(world, walls, points)
+        return taken(world, walls, points)
 
     def heard_by(self, world: GlobalMap, rows: dict[int, int]) -> Bool[np.ndarray, "parts reflectors"]:
         """Which stretches may hear each wall and point of such a map."""
@@ -95,7 +95,9 @@ class Passages:
         return variance < np.where(after, _CARRIED, NEAR) ** 2
 
 
-def _taken(world: GlobalMap, walls: list[tuple[int, tuple[int, ...]]], points: list[tuple[int, tuple[int, ...]]]):
+def taken(
+    world: GlobalMap, walls: list[tuple[int, tuple[int, ...]]], points: list[tuple[int, tuple[int, ...]]]
+) -> GlobalMap:
     """A map of these rows of another one, seen by these scans."""
     wall, point = (np.array([row for row, _ in chosen], dtype=np.int64) for chosen in (walls, points))
     chosen = {}

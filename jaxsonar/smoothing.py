@@ -12,17 +12,17 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import chi2
 
 from jaxsonar.hardware.errors import SonarError
 
 from .adjusting import known
+from .breaks import Breaks, broken_steps
 from .local import LocalModel, check_sigma, local_models
 from .logs import Log
 from .maps import GlobalMap
 from .passages import Passages
 from .placing import place_more
-from .poses import composed, relative, wrap_angle
+from .poses import composed, relative
 from .ring import Ring
 from .ringmodes import SPEED_SD, RingModes, ring_modes
 from .rounds import AGAIN, MAPS, Round, alternated
@@ -46,8 +46,7 @@ _MARGINS = (4.0, 2.0)  # nats; for scans without a place, surely at first; witho
 _NOISIER = 1.15  # so much more noise, and scans were laid together that do not belong together
 _ODD = 0.5  # of the share of echoes that is explained elsewhere: a scan with less stands in the wrong place
 _MANY, _FEW_STEPS, _FEW_MAPS = 100, 8, 2  # scans; from there on rounds are cut short: the next one goes on
-_RARE = 0.01  # chance that any step of a run slips farther than one that is taken for broken
-_AROUND = 6  # scans on either side of a broken step, some of which are wrong
+_AGAIN = 2  # times that what broke the odometry is parted, at most
 _NONE = np.zeros(0, dtype=np.int64)
 _GROWN = 1.005  # more echoes so many times are no more
 _LEAST = 3  # echoes that a pose without odometry rests on
@@ -182,17 +181,22 @@ class _Job:
     def settled(self, poses: Float[np.ndarray, "scans 3"]) -> _Fit:
         """Poses and reflectors from a start; scans of which hardly an echo fits are taken out, and again.
 
-        Where the odometry from one scan to the next is broken, a few wrong echoes were enough to bend the path, and all
-        scans are sure of it. Then those around it are not heard until the others stand.
+        Where the odometry from one scan to the next is broken, points of either side were taken for one; then all of it
+        again with those parted, as long as less is broken for it.
         """
         fit = self._settled(poses)
         fit = fit if _placed(fit.poses).sum() == _placed(poses).sum() else self._settled(fit.poses)
-        broken = self._broken(fit)
-        if len(broken):
+        parted = broken = self._broken(fit)
+        for _ in range(_AGAIN):
+            if not len(broken):
+                break
             self.say("again, less of what broke the odometry")
-            again = self._settled(np.where(_placed(fit.poses)[:, None], poses, np.nan), broken)
-            if len(self._broken(again)) < len(broken) and again.round.used * _GROWN >= fit.round.used:
-                return again
+            again = self._settled(np.where(_placed(fit.poses)[:, None], poses, np.nan), parted)
+            left = self._broken(again)
+            if again.round.used * _GROWN < fit.round.used:
+                break
+            fit, broken = again, np.setdiff1d(left, parted)
+            parted = np.union1d(parted, left)
         return fit
 
     def _broken(self, fit: _Fit) -> Int[np.ndarray, " some"]:
@@ -210,7 +214,7 @@ class _Job:
         data = replace(data, together=_TOGETHER if self.window is None else 1, sparse=True)
         if data.scans > _MANY:
             data = replace(data, steps=_FEW_STEPS)
-        found = self._alternated(data, log, broken)
+        found = self._alternated(data, log, Breaks(broken, self._rows))
         if found is None:
             raise SonarError("smooth: no echo fits the walls; is it the right ring, are poses and units right?")
         rows = data.rows[0]
@@ -236,47 +240,48 @@ class _Job:
         odd[self.first] = False
         return odd
 
-    def _mapped(self, data: Data, log: Log, state: State) -> GlobalMap:
+    def _mapped(self, data: Data, log: Log, state: State, breaks: Breaks) -> GlobalMap:
         ring = self._heard_with(state)
         world = seen_world(ring, data.placed([log], state.poses)[0], window=self.window, models=self.models)
         if not len(world):
             raise SonarError("smooth: no wall found; allowed are scans of a place with straight walls in reach")
-        return world if self.passages is None else self.passages.parted(world, self._rows)
+        world = world if self.passages is None else self.passages.parted(world, self._rows)
+        return breaks.parted(world) if len(breaks.steps) else world
 
     @cached_property
     def _rows(self) -> dict[int, int]:
         """Of the scans by their numbers."""
         return {int(number): row for row, number in enumerate(self.log.scan)}
 
-    def _around(self, data: Data, worlds: list[GlobalMap]) -> Surroundings:
-        """The reflectors of the only map."""
+    def _around(self, data: Data, worlds: list[GlobalMap], breaks: Breaks) -> Surroundings:
+        """The reflectors of the only map, and who may hear them."""
         around = surroundings(worlds, tied=False)
-        if self.passages is None:
+        if self.passages is None and not len(breaks.steps):
             return around
-        heard = np.zeros((len(data.poses), len(around.world)), dtype=bool)
-        rows, known = data.rows[0], self.passages.heard_by(worlds[0], self._rows)
-        heard[: len(rows), : known.shape[1]] = known[self.passages.part[rows]]
-        return around._replace(heard_by=heard)
+        world, rows = worlds[0], data.rows[0]
+        heard = breaks.heard_by(world, len(self.log))
+        if self.passages is not None:
+            heard &= self.passages.heard_by(world, self._rows)[self.passages.part]
+        heard_by = np.zeros((len(data.poses), len(around.world)), dtype=bool)
+        heard_by[: len(rows), : heard.shape[1]] = heard[rows]
+        return around._replace(heard_by=heard_by)
 
-    def _alternated(self, data: Data, log: Log, broken: Int[np.ndarray, " some"]) -> Round | None:
+    def _alternated(self, data: Data, log: Log, breaks: Breaks) -> Round | None:
         """Map and least squares in turn; at first the poses stay near where they began, until the map has shape."""
-        near = np.maximum(data.anchored, 1 / np.square(_NEAR))
-        near = replace(data, anchored=near, reported=data.reported.copy())
-        unheard = np.abs(data.rows[0][:, None] - broken).min(axis=1, initial=_AROUND + 1) <= _AROUND
-        near.reported[: len(unheard)][unheard] = np.nan
+        near = replace(data, anchored=np.maximum(data.anchored, 1 / np.square(_NEAR)))
         state = State(np.zeros(self.modes.columns.shape[1]), data.poses, surroundings([], tied=False))
         self.say("first map")
-        start = state._replace(around=self._around(data, [self._mapped(data, log, state)]))
+        start = state._replace(around=self._around(data, [self._mapped(data, log, state, breaks)], breaks))
         with jax.enable_x64(True):
             start = approach(self.ring, near, self.modes, start, widest=_WIDEST, sigma=self.sigma)
         return alternated(
             start,
-            mapped=lambda state: [self._mapped(data, log, state)],
+            mapped=lambda state: [self._mapped(data, log, state, breaks)],
             settle=lambda state, widest: self._settle(data, state, widest),
             widest=AGAIN,
             say=self.say,
             maps=_FEW_MAPS if data.scans > _MANY else MAPS,
-            around=lambda worlds: self._around(data, worlds),
+            around=lambda worlds: self._around(data, worlds, breaks),
         )
 
     def _settle(self, data: Data, state: State, widest: float) -> Settled:
@@ -325,21 +330,6 @@ def _modes(ring: Ring, *, speed: bool, scale: bool) -> RingModes:
     columns[:-2, :-2] = modes.columns
     columns[-2:, -2:] = SCALE_SD * np.eye(2)
     return RingModes(columns, (*modes.names, "way", "turn"))
-
-
-def broken_steps(
-    poses: Float[np.ndarray, "scans 3"], odometry: Float[np.ndarray, "steps 3"], linked: Float[np.ndarray, "steps 3"]
-) -> Int[np.ndarray, " some"]:
-    """Steps whose odometry slips farther than any of a hundred runs would.
-
-    Args:
-        poses: world_from_robot.
-        odometry: each next pose in the frame of the one before, as measured.
-        linked: inverse variances of it; 0 where there is none.
-    """
-    slip = relative(poses[:-1], poses[1:]) - odometry
-    slip[:, 2] = wrap_angle(slip[:, 2])
-    return np.flatnonzero((linked * slip**2).sum(axis=-1) > chi2.isf(_RARE / max(len(slip), 1), 3))
 
 
 def _free(data: Data, first: int) -> Data:

@@ -294,9 +294,10 @@ class _Echoes:
 
     def explained(self, found: kernels.Tracked, claimed: np.ndarray, noise: float) -> np.ndarray:
         """Reflector of every echo that one surely explains, and no other one nearly so; else what claims it."""
-        expected = np.asarray(found.expected)[:, : self.count]
+        predicted = kernels.predict(found.belief, self.path)
+        expected, variance = (np.asarray(one)[:, : self.count] for one in (predicted.expected, predicted.variance))
         # Where the belief leaves room, anything may happen to fit.
-        room = np.where(np.asarray(found.spread)[:, : self.count] < (SURE * noise) ** 2, expected, np.inf)
+        room = np.where(variance < (SURE * noise) ** 2, expected, np.inf)
         off = np.abs(room - self.ranges[: self.count])
         best = off.argmin(axis=0)
         near = off.min(axis=0, initial=np.inf) < GATE * noise

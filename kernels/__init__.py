@@ -71,6 +71,8 @@ from .scene import expected_range as expected_range
 from .scene import expected_report as expected_report
 from .scene import seen_from as seen_from
 from .tracking import Belief as Belief
+from .tracking import Predicted as Predicted
 from .tracking import Tracked as Tracked
 from .tracking import expected_ranges as expected_ranges
+from .tracking import predict as predict
 from .tracking import track as track

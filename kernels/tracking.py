@@ -39,10 +39,15 @@ class Tracked(eqx.Module):
     """Measured minus expected range at the new belief, metres; 0 for echoes of no reflector."""
     used: Float[Array, " echoes"]
     """1 for the echoes that count, 0 for all others."""
+
+
+class Predicted(eqx.Module):
+    """What paths would hear of a belief."""
+
     expected: Float[Array, "reflectors echoes"]
-    """Range in which each path would hear each reflector at the new belief, metres; infinite where it would not."""
-    spread: Float[Array, "reflectors echoes"]
-    """Variance of that, square metres."""
+    """Range in which each path would hear each reflector, metres; infinite where it would not."""
+    variance: Float[Array, "reflectors echoes"]
+    """Of that, square metres."""
 
 
 @jax.jit
@@ -105,8 +110,13 @@ def track(
     state, spread, factor, _ = solved(state, used)
     half = jax.scipy.linalg.solve_triangular(factor[0], spread.T, lower=factor[1], trans=0 if factor[1] else 1)
     found = Belief(state[:3], _with(belief.scene, state[3:]), prior - half.T @ half)
-    expected = expected_ranges(found.pose, found.scene, paths)
-    return Tracked(found, linear(state)[0], used, expected, _spread(found, paths))
+    return Tracked(found, linear(state)[0], used)
+
+
+@jax.jit
+def predict(belief: Belief, paths: EchoPaths) -> Predicted:
+    """What paths (echoes,), in the robot frame, would hear of what a belief has, and how well that is known."""
+    return Predicted(expected_ranges(belief.pose, belief.scene, paths), _variance(belief, paths))
 
 
 @jax.jit
@@ -134,7 +144,7 @@ def expected_ranges(pose: Float[Array, "3"], scene: Scene, paths: EchoPaths) -> 
     return jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None))(scene, paths)
 
 
-def _spread(belief: Belief, paths: EchoPaths) -> Float[Array, "reflectors echoes"]:
+def _variance(belief: Belief, paths: EchoPaths) -> Float[Array, "reflectors echoes"]:
     """Variance of the range in which each path would hear each reflector, square metres."""
     count = belief.scene.kind.shape[0]
     own = 3 + 2 * jnp.arange(count)[:, None] + jnp.arange(2)[None]
