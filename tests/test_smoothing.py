@@ -13,7 +13,7 @@ from jaxsonar.kernels.arrow import Arrow, covariances, eliminated, solved
 from jaxsonar.office import load_office
 from jaxsonar.poses import composed, relative, wrap_angle
 from jaxsonar.slip import Share, Slip
-from jaxsonar.smoothing import Smoothed, broken_steps, smooth
+from jaxsonar.smoothing import Smoothed, smooth
 
 SIGMA = 0.005
 POSES, SHARED = 6, 4
@@ -117,28 +117,6 @@ def test_a_share_is_of_the_way_and_the_turn():
 def test_noise_that_is_none_is_refused(wrong):
     with pytest.raises(SonarError, match="slip"):
         Slip(**wrong)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_a_step_is_broken_that_no_noise_breaks(seed):
-    """None of a random walk; the one that is bent by seven standard deviations; none where there is no odometry."""
-    rng, steps = np.random.default_rng(seed), 600
-    sd = np.array([0.008, 0.004, 0.007])
-    told = np.tile([0.15, 0.0, 0.02], (steps, 1))
-    bent = told + sd * rng.standard_normal(told.shape)
-
-    def poses():
-        out = [np.zeros(3)]
-        for step in bent:
-            out.append(composed(out[-1], step))
-        return np.array(out)
-
-    linked = np.tile(1 / sd**2, (steps, 1))
-    assert not len(broken_steps(poses(), told, linked))
-    bent[400] = told[400] + 7 * sd * [0, 0, 1]
-    assert broken_steps(poses(), told, linked).tolist() == [400]
-    linked[400] = 0
-    assert not len(broken_steps(poses(), told, linked))
 
 
 # The office
