@@ -386,8 +386,8 @@ def table(told: dict[str, Any]) -> Table:
         "better: odometry over ATE; tenth: runs whose ATE is at most a tenth of odometry's; best: ATE of the best "
         "alignment, and the tenth of that; CRB: what is possible; /CRB: median over the runs; NEES: over degrees of "
         "freedom, mean and median of the runs, 1 is right; closures made, wrong of these, withdrawn; walls: distance "
-        "of the map's from the true ones; missed: of the walls that were heard; false: of the map's length; p99: of the "
-        "slowest run; grows: last tenth of the steps over the second. "
+        "of the map's from the true ones; missed: of the walls that were heard; false: of the map's length; p99: "
+        "of the slowest run; grows: last tenth of the steps over the second. "
         f"jax {v['jax']} on {v['device']}, {v['commit'][:10]}",
     )
     for column in ["", *COLUMNS]:

@@ -41,8 +41,8 @@ def broken_steps(
         first = np.arange(len(slip) - count + 1)
         window = first[:, None] + np.arange(count)
         # Over two steps robots turn little: their slips are added as if they did not.
-        far = np.abs(slip[window].sum(axis=1)) > bound * np.sqrt(variance[window].sum(axis=1))
-        far = far.any(axis=-1) & known[window].all(axis=-1)
+        sigmas = np.abs(slip[window].sum(axis=1)) / np.sqrt(variance[window].sum(axis=1))
+        far = (sigmas.max(axis=-1) > bound) & known[window].all(axis=-1)
         broken[window[far]] = True
     return np.flatnonzero(broken)
 
