@@ -31,7 +31,7 @@ def broken_steps(
         odometry: each next pose in the frame of the one before, as measured.
         linked: inverse variances of it; 0 where there is none.
     """
-    known: np.ndarray = (linked > 0).all(axis=-1)
+    known = linked.min(axis=-1, initial=np.inf) > 0
     slip = relative(poses[:-1], poses[1:]) - odometry
     slip[:, 2] = wrap_angle(slip[:, 2])
     variance = np.divide(1.0, linked, out=np.ones_like(linked), where=linked > 0)

@@ -192,11 +192,10 @@ class _Job:
                 break
             self.say("again, less of what broke the odometry")
             again = self._settled(np.where(_placed(fit.poses)[:, None], poses, np.nan), parted)
-            left = self._broken(again)
-            if again.round.used * _GROWN < fit.round.used:
+            left = np.setdiff1d(self._broken(again), parted)
+            if len(left) >= len(broken) or again.round.used * _GROWN < fit.round.used:
                 break
-            fit, broken = again, np.setdiff1d(left, parted)
-            parted = np.union1d(parted, left)
+            fit, broken, parted = again, left, np.union1d(parted, left)
         return fit
 
     def _broken(self, fit: _Fit) -> Int[np.ndarray, " some"]:
