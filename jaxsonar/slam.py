@@ -27,6 +27,7 @@ from .maps import GlobalMap
 from .motion import placed
 from .passages import Passages
 from .placing import place_parts
+from .placing_ranges import place_ranges
 from .poses import composed, relative, rotation, wrap_angle
 from .ring import Ring
 from .slip import Slip
@@ -38,6 +39,9 @@ from .windows import check_window
 
 REACH = 0.85
 """Of the ring's maximum range; nearer than that walls are surely heard."""
+MOST_PLACED = 64
+"""Scans of a log without odometry that are placed by their ranges, in about a second each; longer logs are placed by walls
+and corners alone."""
 MOST_SMOOTHED = 2000
 """Scans; longer logs are smoothed only when asked for."""
 SPARSE = 4.0
@@ -233,8 +237,8 @@ def slam(
     """Poses of the scans of a log, and the map (paper, section 5, last paragraph).
 
     With odometry the scans are tracked one after the other, loops are closed, and in the end everything is smoothed.
-    Without it scans are placed by their walls and corners (``placing``); with few echoes a scan (``SPARSE``) only the
-    smoothing is done, on maps of windows.
+    Without it scans are placed by their ranges (``placing_ranges``), of long logs by walls and corners (``placing``);
+    with few echoes a scan (``SPARSE``) only the smoothing is done, on maps of windows.
 
     Args:
         ring: the sensors, calibrated.
@@ -277,7 +281,11 @@ def slam(
         start, covariance, ties, took, models, passages = _tracked(ring, log, sigma, slip, live, say)
     else:
         models = list(local_models(ring, log, sigma=sigma))
-        parts = place_parts(models, None, blur=BLUR, progress=lambda done, total: say("placing", done, total))
+        told = lambda done, total: say("placing", done, total)  # noqa: E731
+        if len(log) <= MOST_PLACED:
+            parts = place_ranges(ring, log, models, sigma=sigma, progress=told)
+        else:
+            parts = place_parts(models, None, blur=BLUR, progress=told)
         start, covariance = parts[0], np.full((len(log), 3, 3), np.nan)
     given = odometry if measured else None
     if len(log) <= MOST_SMOOTHED if smooth is None else smooth:
