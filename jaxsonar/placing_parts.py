@@ -213,7 +213,7 @@ def adjusted(views: Views, part: Part, *, steps: int, widest: float = GATE, held
         nats=part.nats,
         cov=cov[blocks[:, :, None], blocks[:, None]],
         pose_cov=pose_cov,
-        squares=np.bincount(target, weights=cost, minlength=len(part.owner)),
+        squares=np.bincount(target, weights=cost, minlength=len(part.owner)).astype(np.float64),
         stretch=_stretches(place[row], middle, base, target, len(part.owner)),
         evidence=float(space - cost.sum() / 2 - room.sum() + odds.sum()),
     )

@@ -40,8 +40,7 @@ from .windows import check_window
 REACH = 0.85
 """Of the ring's maximum range; nearer than that walls are surely heard."""
 MOST_PLACED = 64
-"""Scans of a log without odometry that are placed by their ranges, in about a second each; longer logs are placed by walls
-and corners alone."""
+"""Scans of a log without odometry that are placed by their ranges, a second each; longer logs by walls and corners."""
 MOST_SMOOTHED = 2000
 """Scans; longer logs are smoothed only when asked for."""
 SPARSE = 4.0
@@ -281,12 +280,7 @@ def slam(
         start, covariance, ties, took, models, passages = _tracked(ring, log, sigma, slip, live, say)
     else:
         models = list(local_models(ring, log, sigma=sigma))
-        told = lambda done, total: say("placing", done, total)  # noqa: E731
-        if len(log) <= MOST_PLACED:
-            parts = place_ranges(ring, log, models, sigma=sigma, progress=told)
-        else:
-            parts = place_parts(models, None, blur=BLUR, progress=told)
-        start, covariance = parts[0], np.full((len(log), 3, 3), np.nan)
+        start, covariance = _without_odometry(ring, log, models, sigma, say), np.full((len(log), 3, 3), np.nan)
     given = odometry if measured else None
     if len(log) <= MOST_SMOOTHED if smooth is None else smooth:
         choices = {"odometry": given, "sigma": sigma, "window": window, "speed": speed, "scale": scale, "slip": slip}
@@ -298,6 +292,19 @@ def slam(
     at = replace(log, pose=start)
     world = build_map(ring, at, window=window) if models is None else assemble(gather_evidence(ring, at, models))
     return Slam(start, covariance, stamps_of(log), world, log.pose, ties, took, None)
+
+
+def _without_odometry(
+    ring: Ring, log: Log, models: list[LocalModel], sigma: float | None, say: Callable[[str, int, int], None]
+) -> Float[np.ndarray, "scans 3"]:
+    """Poses of scans without odometry: those of the largest part that is sure."""
+
+    def told(done: int, total: int) -> None:
+        say("placing", done, total)
+
+    if len(log) <= MOST_PLACED:
+        return place_ranges(ring, log, models, sigma=sigma, progress=told)[0]
+    return place_parts(models, None, blur=BLUR, progress=told)[0]
 
 
 def _tracked(
