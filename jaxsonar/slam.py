@@ -27,6 +27,7 @@ from .maps import GlobalMap
 from .motion import placed
 from .passages import Passages
 from .placing import place_parts
+from .placing_ranges import place_ranges
 from .poses import composed, relative, rotation, wrap_angle
 from .ring import Ring
 from .slip import Slip
@@ -38,6 +39,8 @@ from .windows import check_window
 
 REACH = 0.85
 """Of the ring's maximum range; nearer than that walls are surely heard."""
+MOST_PLACED = 64
+"""Scans of a log without odometry that are placed by their ranges, a second each; longer logs by walls and corners."""
 MOST_SMOOTHED = 2000
 """Scans; longer logs are smoothed only when asked for."""
 SPARSE = 4.0
@@ -238,8 +241,8 @@ def slam(
     """Poses of the scans of a log, and the map (paper, section 5, last paragraph).
 
     With odometry the scans are tracked one after the other, loops are closed, and in the end everything is smoothed.
-    Without it scans are placed by their walls and corners (``placing``); with few echoes a scan (``SPARSE``) only the
-    smoothing is done, on maps of windows.
+    Without it scans are placed by their ranges (``placing_ranges``), of long logs by walls and corners (``placing``);
+    with few echoes a scan (``SPARSE``) only the smoothing is done, on maps of windows.
 
     Args:
         ring: the sensors, calibrated.
@@ -282,8 +285,7 @@ def slam(
         start, covariance, ties, took, models, passages = _tracked(ring, log, sigma, slip, live, say)
     else:
         models = list(local_models(ring, log, sigma=sigma))
-        parts = place_parts(models, None, blur=BLUR, progress=lambda done, total: say("placing", done, total))
-        start, covariance = parts[0], np.full((len(log), 3, 3), np.nan)
+        start, covariance = _without_odometry(ring, log, models, sigma, say), np.full((len(log), 3, 3), np.nan)
     given = odometry if measured else None
     if len(log) <= MOST_SMOOTHED if smooth is None else smooth:
         choices = {"odometry": given, "sigma": sigma, "window": window, "speed": speed, "scale": scale, "slip": slip}
@@ -295,6 +297,19 @@ def slam(
     at = replace(log, pose=start)
     world = build_map(ring, at, window=window) if models is None else assemble(gather_evidence(ring, at, models))
     return Slam(start, covariance, stamps_of(log), world, log.pose, ties, took, None)
+
+
+def _without_odometry(
+    ring: Ring, log: Log, models: list[LocalModel], sigma: float | None, say: Callable[[str, int, int], None]
+) -> Float[np.ndarray, "scans 3"]:
+    """Poses of scans without odometry: those of the largest part that is sure."""
+
+    def told(done: int, total: int) -> None:
+        say("placing", done, total)
+
+    if len(log) <= MOST_PLACED:
+        return place_ranges(ring, log, models, sigma=sigma, progress=told)[0]
+    return place_parts(models, None, blur=BLUR, progress=told)[0]
 
 
 def _tracked(
