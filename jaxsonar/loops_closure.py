@@ -193,9 +193,7 @@ def _judged(
     across = np.abs(place @ basis[:2]).max(axis=-1) if fit.free is not None else np.linalg.norm(place, axis=-1)
     out = across > NEAR
     unseen = density[out] + np.log(COPY) - (2 if fit.free is None else 1) * np.log(BESIDE)
-    if fit.free is not None:
-        # Corridors do not lie wall on wall: a parallel one is hardly as near as that.
-        unseen += np.log(-np.expm1(-np.square(across[out] / BESIDE)))
+    unseen += _rarer(place[out], _between_walls(best, around))
     doubts = Doubts(
         np.concatenate([poses[:, :2] - fit.pose[:2], place[out]]),
         np.concatenate([nats, unseen]),
@@ -212,6 +210,27 @@ def _both_sides(best: _Laid, around: tuple[Vicinity, Vicinity]) -> bool:
     walls = around[0].own.rows[:, None] == best.pairs.earlier
     theta = around[0].own.theta[walls.any(axis=1)]
     return bool((np.abs(wrap_angle(theta[:, None] - theta)) > np.pi / 2).any())
+
+
+def _between_walls(best: _Laid, around: tuple[Vicinity, Vicinity]) -> Float[np.ndarray, "2"] | None:
+    """Normal of the longest wall that is among the pairs, if there is one on the other side of the robot as well."""
+    own = around[0].own
+    walls = np.flatnonzero((own.rows[:, None] == best.pairs.earlier).any(axis=1))
+    if not len(walls):
+        return None
+    longest = walls[own.half[walls].argmax()]
+    opposite = np.abs(wrap_angle(own.theta[walls] - own.theta[longest])) > np.radians(150.0)
+    return unit(own.theta[longest]) if opposite.any() else None
+
+
+def _rarer(
+    place: Float[np.ndarray, "places 2"], normal: Float[np.ndarray, "2"] | None
+) -> Float[np.ndarray, " places"]:
+    """By how many nats places alike are rarer beside a corridor or room: they do not lie wall on wall."""
+    if normal is None:
+        return np.zeros(len(place))
+    aside = np.abs(place @ normal)
+    return np.where(aside > NEAR, np.log(-np.expm1(-np.square(np.maximum(aside, NEAR) / BESIDE))), 0.0)
 
 
 def _apart(pose: Float[np.ndarray, "3"], fit: Fit, basis: Float[np.ndarray, "3 rank"]) -> bool:

@@ -93,9 +93,10 @@ class Closures:
         if refused:
             return False
         before = len(self.accepted)
-        if self._verified(graph, submap, number, chi2):
-            # What it confirms may count as well.
-            for other in self._open:
+        self._verified(graph, submap, number, chi2)
+        # What it confirms, or is confirmed by, may count as well.
+        for other in self._open:
+            if other != number:
                 self._verified(graph, submap, other, _surprise(graph, self.proposals[other]))
         return len(self.accepted) > before
 
@@ -154,19 +155,26 @@ def confirmed(graph: Graph, proposal: Proposal, others: list[Proposal]) -> float
     closure, doubts = proposal.closure, proposal.closure.doubts
     turned_world = graph.poses[proposal.earlier, 2]
     world = _turned(doubts.offset, turned_world)
-    nats = doubts.nats.copy()
+    nats, mine = doubts.nats.copy(), closure.field.at(doubts.offset)
     places = [to_world(graph.poses[proposal.earlier], proposal.place)]
-    cost = 0.0
+    cost, sides = 0.0, 0
     for other in others:
-        if other is proposal or other.closure.free is not None or not _agree(graph, proposal, other):
+        along_walls = other.closure.free is not None
+        if other is proposal or (along_walls and closure.free is not None) or not _agree(graph, proposal, other):
             continue
-        nats -= other.closure.field.at(_turned(world, -graph.poses[other.earlier, 2]))
+        theirs = other.closure.field.at(_turned(world, -graph.poses[other.earlier, 2]))
+        if along_walls:
+            # The walls of one corridor are one piece of news: only what they know better than this closure counts.
+            nats -= np.maximum(theirs - mine, 0.0)
+            sides += 1
+            continue
+        nats -= theirs
         cost += max(float(other.closure.field.at(np.zeros((1, 2)))[0]), 0.0)
         place = to_world(graph.poses[other.earlier], other.place)
         if min(np.linalg.norm(place - one) for one in places) > SAME_PLACE:
             nats[doubts.unseen] += np.log(COPY)
             places.append(place)
-    if len(places) == 1:
+    if len(places) == 1 and not sides:
         return closure.odds
     return closure.weight - min(cost, 2.0) - log_sum(nats)
 
