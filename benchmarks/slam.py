@@ -433,7 +433,7 @@ def main() -> None:
     make_folder(options.output.parent)
     with atomic_write(options.output) as file:
         json.dump(told, file, indent=1, allow_nan=False)
-    Console(width=260).print(table(told))
+    Console(width=300).print(table(told))
     for why in sorted({row["why"] for row in told["scenarios"]} - {""}):
         say(why)
 

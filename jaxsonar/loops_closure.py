@@ -223,9 +223,7 @@ def _between_walls(best: _Laid, around: tuple[Vicinity, Vicinity]) -> Float[np.n
     return unit(own.theta[longest]) if opposite.any() else None
 
 
-def _rarer(
-    place: Float[np.ndarray, "places 2"], normal: Float[np.ndarray, "2"] | None
-) -> Float[np.ndarray, " places"]:
+def _rarer(place: Float[np.ndarray, "places 2"], normal: Float[np.ndarray, "2"] | None) -> Float[np.ndarray, " places"]:
     """By how many nats places alike are rarer beside a corridor or room: they do not lie wall on wall."""
     if normal is None:
         return np.zeros(len(place))

@@ -92,7 +92,10 @@ class Part:
         slope[:, 0, 1] += np.where(self.kind == kernels.PLANE, shift, 0.0)
         cov = slope @ self.cov @ slope.transpose(0, 2, 1)
         stretch = self.stretch + np.append(shift, 0.0)[self.owner, None]
-        return replace(self, poses=poses, places=places, cov=cov, stretch=stretch)
+        turn = np.eye(3)
+        turn[:2, :2] = rotation(float(frame[2]))
+        pose_cov = turn @ self.pose_cov @ turn.T
+        return replace(self, poses=poses, places=places, cov=cov, pose_cov=pose_cov, stretch=stretch)
 
     def without(self, scan_of: Int[np.ndarray, " targets"], scan: int | np.integer) -> "Part":
         """The same without a scan, not settled; ``scan_of``: scan of each target."""

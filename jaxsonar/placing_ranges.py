@@ -63,7 +63,7 @@ def place_ranges(
     *,
     sigma: float | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Float[np.ndarray, "scans 3"]]:
+) -> list[Part]:
     """Poses of scans without odometry, in parts that could not be laid on one another.
 
     Args:
@@ -74,8 +74,7 @@ def place_ranges(
         progress: called with (scans laid on others, scans).
 
     Returns:
-        The parts, the one with the most scans first. Of each (scans, 3) world_from_robot (x, y, theta), metres and
-        radians, its first scan at the origin; NaN where a scan is not of this part.
+        The parts, the one with the most scans first; each in the frame of its first scan, to which its covariances are.
     """
     noise = [model.sigma for model in models if model.sigma > 0]
     views = Views.of(ring, log, models, sigma or (float(np.median(noise)) if noise else 0.003))
@@ -97,7 +96,14 @@ def place_ranges(
         parts = [part for part in parts if part is not a and part is not b] + [way.part]
     parts = [confirmed(views, part) for part in parts]
     parts.sort(key=lambda part: (-len(part.rows), part.rows[0]))
-    return [part.moved(inverse(part.poses[part.rows[0]])).poses for part in parts]
+    return [_from_first(views, part) for part in parts]
+
+
+def _from_first(views: Views, part: Part) -> Part:
+    """The same in the frame of its first scan."""
+    first = int(part.rows[0])
+    part = adjusted(views, part, steps=3, held=first)
+    return part.moved(inverse(part.poses[first]))
 
 
 @dataclass(frozen=True, eq=False)

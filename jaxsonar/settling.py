@@ -66,6 +66,8 @@ class Data:
     """As in ``kernels.Problem``."""
     steps: int = 20
     """Of least squares in each round at most."""
+    of_wall: Bool[np.ndarray, "scans echoes"] | None = None
+    """Echoes that a wall of their own scan explains: they come from no point of the map; None: not asked."""
     together: int = 1
     """Echoes of one reflector that a scan must have for them to count. A pose that hardly anything holds in one
     direction goes where one or two echoes of something that is not in the map fit a reflector that is."""
@@ -352,6 +354,8 @@ def _associated(
             around.candidates.reflection.second,
         )
     )
+    if data.of_wall is not None:
+        used &= ~(data.of_wall & np.isin(kind, (kernels.CORNER, kernels.EDGE)))
     if data.together > 1:
         room = len(around.world)
         group = first + room * np.arange(len(first))[:, None]

@@ -250,8 +250,9 @@ def slam(
         sigma: noise of the ranges, metres; estimated if left out.
         window: metres of path gathered into one local model; 1.5 m for sparse rings if left out.
         slip: how wrong the odometry is.
-        smooth: whether all poses and reflectors are adjusted together in the end; of logs with ``MOST_SMOOTHED`` scans
-            or fewer if left out, since it takes about a minute for a thousand.
+        smooth: whether all poses and reflectors are adjusted together in the end; if left out, of logs with
+            ``MOST_SMOOTHED`` scans or fewer, since it takes about a minute for a thousand, and not of scans that were
+            placed by their ranges, but with ``speed``.
         speed: whether the smoothing estimates the speed of sound.
         scale: whether it estimates the scales of the odometry.
         live: local models one by one, as a robot makes them, so that ``step_ms`` is all that a step costs.
@@ -285,9 +286,13 @@ def slam(
         start, covariance, ties, took, models, passages = _tracked(ring, log, sigma, slip, live, say)
     else:
         models = list(local_models(ring, log, sigma=sigma))
-        start, covariance = _without_odometry(ring, log, models, sigma, say), np.full((len(log), 3, 3), np.nan)
+        start, covariance = _without_odometry(ring, log, models, sigma, say)
     given = odometry if measured else None
-    if len(log) <= MOST_SMOOTHED if smooth is None else smooth:
+    if smooth is None:
+        # What was placed by the ranges is adjusted to all of them already, more than are of the map's reflectors.
+        settled = not measured and bool(np.isfinite(covariance).any()) and not speed
+        smooth = len(log) <= MOST_SMOOTHED and not settled
+    if smooth:
         choices = {"odometry": given, "sigma": sigma, "window": window, "speed": speed, "scale": scale, "slip": slip}
         found = smoothing(
             ring, log, start, **choices, models=models, passages=passages, progress=lambda text: say(text, 0, 0)
@@ -301,15 +306,16 @@ def slam(
 
 def _without_odometry(
     ring: Ring, log: Log, models: list[LocalModel], sigma: float | None, say: Callable[[str, int, int], None]
-) -> Float[np.ndarray, "scans 3"]:
-    """Poses of scans without odometry: those of the largest part that is sure."""
+) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:
+    """Poses of scans without odometry, and their covariances: those of the largest part that is sure."""
 
     def told(done: int, total: int) -> None:
         say("placing", done, total)
 
     if len(log) <= MOST_PLACED:
-        return place_ranges(ring, log, models, sigma=sigma, progress=told)[0]
-    return place_parts(models, None, blur=BLUR, progress=told)[0]
+        part = place_ranges(ring, log, models, sigma=sigma, progress=told)[0]
+        return part.poses, part.pose_cov
+    return place_parts(models, None, blur=BLUR, progress=told)[0], np.full((len(log), 3, 3), np.nan)
 
 
 def _tracked(

@@ -17,6 +17,7 @@ from jaxsonar.hardware.errors import SonarError
 
 from .adjusting import known
 from .breaks import Breaks, broken_steps
+from .claims import of_own_walls
 from .local import LocalModel, check_sigma, local_models
 from .logs import Log
 from .maps import GlobalMap
@@ -211,6 +212,8 @@ class _Job:
         log = replace(self.log, pose=poses)
         data = _free(Data.of(self.ring, [log], [self.odometry], self.slip, silent=True), self.first)
         data = replace(data, together=_TOGETHER if self.window is None else 1, sparse=True)
+        if self.models is not None:
+            data = replace(data, of_wall=of_own_walls(self.ring, data, self.models))
         if data.scans > _MANY:
             data = replace(data, steps=_FEW_STEPS)
         found = self._alternated(data, log, Breaks(broken, self._rows))

@@ -97,7 +97,7 @@ def test_what_is_the_same_is_likelier_as_one(office, views):
 def test_the_office_is_placed_rightly(office):
     ring, poses, log, models = office
     said = []
-    parts = place_ranges(ring, log, models, progress=lambda *done: said.append(done))
+    parts = [part.poses for part in place_ranges(ring, log, models, progress=lambda *done: said.append(done))]
     assert np.isfinite(parts[0]).all()
     np.testing.assert_allclose(parts[0][0], 0.0, atol=1e-12)
     off = parts[0] - relative(np.broadcast_to(poses[0], poses.shape), poses)
@@ -112,12 +112,13 @@ def test_a_corridor_leaves_scans_open():
     walls = np.array([[[-9.0, -1.0], [9.0, -1.0]], [[9.0, 1.0], [-9.0, 1.0]]])
     poses = np.stack([np.linspace(-0.5, 0.5, 4), np.zeros(4), np.zeros(4)], axis=-1)
     ring = Ring.circular()
-    parts = place_ranges(ring, *heard(ring, Room(walls), poses))
+    parts = [part.poses for part in place_ranges(ring, *heard(ring, Room(walls), poses))]
     assert [int(np.isfinite(part[:, 0]).sum()) for part in parts] == [1] * 4
 
 
 def test_scans_without_echoes_stay_alone():
     ring, poses = Ring.circular(), np.zeros((3, 3))
-    parts = place_ranges(ring, *heard(ring, Room(np.array([[[50.0, 0.0], [50.0, 1.0]]])), poses))
+    nothing = Room(np.array([[[50.0, 0.0], [50.0, 1.0]]]))
+    parts = [part.poses for part in place_ranges(ring, *heard(ring, nothing, poses))]
     assert [int(np.isfinite(part[:, 0]).sum()) for part in parts] == [1] * 3
     assert composed(np.zeros(3), parts[0]).shape == (3, 3)

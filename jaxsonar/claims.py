@@ -1,0 +1,42 @@
+"""Which echoes a wall of their own scan explains.
+
+A map has what several scans saw. The echoes of a wall that only one saw find nothing in it but what happens to be near,
+often the edge next door, and pull the scan there; so what is of a wall by its own scan is of no point of the map.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool
+
+from .local import LocalModel
+from .poses import unit
+from .ring import Ring
+from .settling import GATE, Data
+
+_SIGMA = 0.003  # m; noise of a scan that does not tell
+
+
+def of_own_walls(ring: Ring, data: Data, models: Sequence[LocalModel]) -> Bool[np.ndarray, "scans echoes"]:
+    """Whether each echo is on a path on which its scan hears a wall, as far as that is.
+
+    Args:
+        ring: the sensors.
+        data: the scans of one log.
+        models: local models of all scans of this log.
+    """
+    out = np.zeros(data.path.shape, dtype=bool)
+    paths = ring.echo_paths
+    middle, half = np.asarray(paths.midpoint, dtype=np.float64), np.asarray(paths.half_baseline, dtype=np.float64)
+    tx, rx = ring.paths[data.path].T
+    ranges = np.asarray(ring.corrected(data.reported, tx.T, rx.T), dtype=np.float64)
+    for row, scan in enumerate(data.rows[0].tolist()):
+        model, own = models[scan], data.path[row]
+        gate = GATE * (model.sigma if model.sigma > 0 else _SIGMA)
+        for line in model.lines:
+            normal, along = unit(line.theta), unit(line.theta + np.pi / 2)
+            expected = np.hypot(line.rho - middle[own] @ normal, half[own] @ along)
+            heard = np.zeros(len(ring.paths), dtype=bool)
+            heard[ring.path_index[line.paths[:, 0], line.paths[:, 1]]] = True
+            out[row] |= heard[own] & (np.abs(ranges[row] - expected) < gate)  # False for NaN: no echo
+    return out
