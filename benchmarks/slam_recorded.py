@@ -82,7 +82,7 @@ def thicknesses(points: Float[np.ndarray, "points 2"]) -> list[tuple[float, int]
             near = points[np.abs(off) < within]
         out.append((float(np.sqrt(np.mean(off[np.abs(off) < NEAR] ** 2))), len(near)))
         points = points[np.abs(off) > _APART]
-    return out
+    return sorted(out, key=lambda one: -one[1])
 
 
 def main() -> None:

@@ -110,7 +110,10 @@ def test_without_odometry_scans_are_placed_by_what_they_see():
     found = slam(RING, replace(some, pose=np.full((16, 3), np.nan)), smooth=False)
     known = np.isfinite(found.poses[:, 0])
     assert known.sum() >= 8
-    assert np.isnan(found.covariance).all()
+    assert np.isnan(found.covariance[~known]).all()
+    first, *rest = np.flatnonzero(known)
+    np.testing.assert_allclose(found.covariance[first], 0, atol=1e-8)
+    assert (np.linalg.eigvalsh(found.covariance[rest]) > 0).all()
     own = errors(Trajectory(found.stamp[known], found.poses[known]), Trajectory(found.stamp, truth()[:16]))
     assert own.ate < 0.1
 
