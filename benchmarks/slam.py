@@ -19,11 +19,11 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
-from jaxsonar import GlobalMap, Room, SonarError
+from jaxsonar import GlobalMap, SonarError
 from jaxsonar.evaluation import evaluate
 from jaxsonar.files import atomic_write, make_folder
+from jaxsonar.maps import map_of
 from jaxsonar.poses import relative, wrap_angle
-from jaxsonar.rooms import lines_in
 from jaxsonar.slam import Tie
 from jaxsonar.trajectory import Trajectory, errors
 
@@ -70,14 +70,6 @@ def run_one_scan(scene: Scene, seed: int) -> Trajectory:
     sd = np.array([GUESS[0], GUESS[0], GUESS[1]])
     start = scene.poses[0] + sd * np.random.default_rng(seed).standard_normal(3)
     return localize(scene.ring, map_of(scene.room), scene.log(seed), start=start.tolist()).trajectory
-
-
-def map_of(room: Room) -> GlobalMap:
-    """The walls of a room, known to a micrometre."""
-    rho, theta = lines_in(room, np.zeros(3))
-    count = len(room.walls)
-    known = np.full(count, 1e-6)
-    return GlobalMap(np.array(room.walls), rho, theta, known, known, np.full(count, 1000), ((0, 1),) * count)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ Nothing heavy is imported here, so that help comes at once.
 
 import argparse
 import os
+import re
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -260,9 +261,20 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def _joined(arguments: Sequence[str]) -> list[str]:
+    """With negative numbers that follow an option written as one with it: argparse takes -0.1,0,90 for an option."""
+    out: list[str] = []
+    for one in arguments:
+        if out and out[-1] in ("--start", "--odometry") and re.match(r"-[\d.]", one):
+            out[-1] += f"={one}"
+        else:
+            out.append(one)
+    return out
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit code: 0 done, 2 the input or the call was wrong, 1 anything else, or a part undone."""
-    options = parser().parse_args(arguments)
+    options = parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
     if sys.stdout is None:  # closed by whoever called
         with open(os.devnull, "w") as sys.stdout:
             return main(arguments)

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import numpy as np
 
+    from .logs import Log
+    from .maps import GlobalMap
     from .slam import Slam
     from .slip import Slip
     from .trajectory import Trajectory, TrajectoryErrors
@@ -36,6 +38,8 @@ def slam(options: argparse.Namespace) -> None:
     )
     ring, log = load_ring(options.ring), load_log(options.log)
     truth = None if options.truth is None else load_trajectory(options.truth)
+    if truth is not None:
+        _check_truth(truth, log, str(options.truth), options.log)
     try:
         _, left_out = FlatEchoes.from_log(ring, log)
         with _stages() as progress:
@@ -98,14 +102,13 @@ def localize(options: argparse.Namespace) -> int:
     from .files import check_outputs, shown
     from .localizing import localize as run
     from .logs import load_log
-    from .mapfile import load_map
     from .ringfile import load_ring
     from .trajectory import save_trajectory
 
     check_outputs(
         {"--trajectory": options.trajectory, "--figure": options.figure}, [options.log, options.ring, options.map]
     )
-    ring, log, world = load_ring(options.ring), load_log(options.log), load_map(options.map)
+    ring, log, world = load_ring(options.ring), load_log(options.log), _known_map(options.map)
     try:
         with _stages() as progress:
             found = run(
@@ -138,7 +141,29 @@ def localize(options: argparse.Namespace) -> int:
 
         figures.save(figure, options.figure)
     _say(found.why)
+    if len(trajectory) < len(log):
+        _say(f"{len(log) - len(trajectory)} of {_count(len(log), 'scan')} could not be laid on the others: no pose")
     return 0
+
+
+def _known_map(path: str) -> "GlobalMap":
+    """A map, or a floor plan as one; what is neither is refused as a map."""
+    from jaxsonar.hardware.errors import SonarError
+
+    from .mapfile import load_map
+    from .maps import map_of
+    from .roomfile import load_room
+
+    try:
+        return load_map(path)
+    except SonarError as no_map:
+        try:
+            room = load_room(path)
+        except SonarError:
+            raise no_map from None
+        if not len(room.walls):
+            raise
+        return map_of(room)
 
 
 def add_commands(
@@ -203,7 +228,7 @@ def add_commands(
 
     where = command("localize", "Where the robot is in a known map.")
     where.add_argument("log", type=file, metavar="LOG", help="scan log of a short path, .csv or .parquet")
-    where.add_argument("--map", type=file, required=True, metavar="MAP", help="the known map, GeoJSON")
+    where.add_argument("--map", type=file, required=True, metavar="MAP", help="the known map, or a floor plan: GeoJSON")
     common(where)
     where.add_argument(
         "--start",
@@ -263,6 +288,22 @@ def _errors(
         }
     except SonarError as error:
         raise SonarError(f"--truth {shown(name)}: {error}") from None
+
+
+def _check_truth(truth: "Trajectory", log: "Log", name: str, source: str) -> None:
+    """Complain before the work about true poses that belong to no scan."""
+    import numpy as np
+
+    from jaxsonar.hardware.errors import SonarError
+
+    from .files import shown
+    from .trajectory import associated, stamps_of
+
+    if not np.array_equal(stamps_of(log), log.stamp):
+        raise SonarError(f"{shown(source)}: stamps are missing or do not rise; allowed with --truth are some that do")
+    if not len(associated(log.stamp, truth.stamp, tolerance=0.01)[0]):
+        one, other = (f"{stamp.min():g} to {stamp.max():g} s" for stamp in (truth.stamp, log.stamp))
+        raise SonarError(f"--truth {shown(name)}: stamps {one}, the log's are {other}; allowed are common ones")
 
 
 def _laid_on(estimate: "Trajectory", truth: "Trajectory") -> "np.ndarray":

@@ -164,7 +164,12 @@ def check_outputs(
     read = [path for path in inputs if path is not None and os.path.exists(path)]
     taken: dict[str, str] = {}
     for name, path in outputs.items():
-        if path is None or os.fspath(path) == "-":
+        if path is None:
+            continue
+        if os.fspath(path) == "-":
+            if "-" in taken:
+                raise SonarError(f"{name} -: {taken['-']} goes to standard output, too; allowed is one of them")
+            taken["-"] = name
             continue
         refuse_folder(path)
         place = f"{name} {shown(path)}"

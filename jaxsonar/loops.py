@@ -69,9 +69,9 @@ class SubmapGraph:
         """Of ``poses``."""
         return self.graph.covariance(np.arange(len(self.graph)))
 
-    def add(self, submap: Submap) -> None:
-        """Take a finished submap. Whatever was left to do for the one before is done first."""
-        self.settle()
+    def add(self, submap: Submap) -> tuple[Decision, ...]:
+        """Take a finished submap. Whatever was left to do for the one before is done first: its decisions."""
+        decisions = self.settle()
         newest = len(self.submaps)
         self.submaps.append(submap)
         self.surroundings.append(surroundings(submap))
@@ -80,6 +80,7 @@ class SubmapGraph:
         poses = np.concatenate([self.poses, composed(self.poses[-1], submap.exit)[None]])
         self.graph = Graph(poses, self.chain + self.closures.links, converged=self.graph.converged)
         self._todo = (SubmapGraph._join, SubmapGraph._choose) if newest else ()
+        return decisions
 
     @property
     def busy(self) -> bool:
@@ -121,7 +122,9 @@ class SubmapGraph:
         """See whether the newest submap lies on an earlier one; what counts makes the next ones' prior narrower."""
         newest = len(self.submaps) - 1
         expected, covariance = self.graph.relative(earlier, np.array([newest]))
-        known, around = self.submaps[earlier], (self._vicinity(earlier, newest - 1), self._vicinity(newest, newest))
+        middle = (earlier + newest) // 2  # what lies between the two is told of one of them
+        around = self._vicinity(earlier, 0, middle), self._vicinity(newest, middle + 1, newest)
+        known = self.submaps[earlier]
         found = closure(self.submaps[newest], known, expected[0], covariance[0], reach=self.reach, around=around)
         if found is None:
             return
@@ -131,11 +134,11 @@ class SubmapGraph:
             if sum(one.newest == newest for one in self.closures.accepted) >= TIED:
                 self._todo = ()
 
-    def _vicinity(self, number: int, last: int) -> Vicinity:
-        """Of a submap, with some of those before and after it up to the last one that is asked for."""
+    def _vicinity(self, number: int, first: int, last: int) -> Vicinity:
+        """Of a submap, with some of those before and after it, from a first to a last one."""
         own = self.graph.poses[number]
         steps = [sign * step for step in range(1, BESIDE + 1) for sign in (1, -1)]
-        others = [number + step for step in steps if 0 <= number + step <= last]
+        others = [number + step for step in steps if first <= number + step <= last]
         return Vicinity(
             self.surroundings[number],
             tuple((relative(own, self.graph.poses[k]), self.surroundings[k]) for k in others),

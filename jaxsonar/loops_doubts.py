@@ -31,7 +31,10 @@ class Doubts(NamedTuple):
 
 
 class Field(NamedTuple):
-    """Nats against lying elsewhere, on a grid of offsets from the closure's place."""
+    """Nats against lying elsewhere, on a grid of offsets from the closure's place.
+
+    0, too, where nothing was asked because the prior leaves no room there.
+    """
 
     first: Float[np.ndarray, "2"]
     pitch: float

@@ -60,7 +60,8 @@ class Data:
     linked: Float[np.ndarray, "scans 3"]
     """As in ``kernels.Problem``."""
     rows: tuple[Int[np.ndarray, " _"], ...]
-    """Of every log: its scans that are used, the first of them in row ``begin`` of the rectangle and so on."""
+    """Of every log: its scans that are used, the first of them in row ``begin`` of the rectangle and so on; those with
+    odometry first, in order, then those without."""
     begin: tuple[int, ...]
     reach: float = 1.0
     """As in ``kernels.Problem``."""
@@ -97,9 +98,11 @@ class Data:
         flats = [FlatEchoes.from_log(ring, log)[0] for log in logs]
         fresh = [renewed(flat) for flat in flats]  # a reading that was not renewed is the one before, not one more
         used, counts = [], []
-        for log, flat, new in zip(logs, flats, fresh, strict=True):
+        for log, flat, new, told in zip(logs, flats, fresh, odometry, strict=True):
             count = np.bincount(flat.scan[new], minlength=len(log))
             rows = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1) & (silent | (count > 0)))
+            # Odometry leads from each scan to the next one that has it: those without stand behind.
+            rows = rows[np.argsort(~np.isfinite(told[rows]).all(axis=1), kind="stable")]
             used.append(rows)
             counts.append(count[rows])
         begin = np.cumsum([0, *(len(rows) for rows in used)])
@@ -136,18 +139,17 @@ class Data:
         place[rows] = np.arange(first, first + len(rows))
         echo = np.flatnonzero(new & (place[flat.scan] >= 0))
         row = place[flat.scan[echo]]
-        column = np.arange(len(echo)) - np.searchsorted(row, row)
+        column = np.arange(len(echo)) - np.searchsorted(flat.scan[echo], flat.scan[echo])
         self.path[row, column] = flat.path[echo]
         self.reported[row, column] = flat.reported[echo]
         self.poses[here], self.world[here] = log.pose[rows], number
         self.anchored[first : first + 1] = 1 / _ANCHOR**2
-        if len(rows) < 2:
+        told = rows[np.isfinite(measured[rows]).all(axis=1)]
+        if len(told) < 2:
             return
-        step: np.ndarray = relative(measured[rows[:-1]], measured[rows[1:]])
-        known = np.all(np.isfinite(step), axis=1)
-        off = noise(measured, rows)
-        self.odometry[first : first + len(rows) - 1] = np.where(known[:, None], step, 0)
-        self.linked[first : first + len(rows) - 1] = np.where(known[:, None], 1 / off**2, 0)
+        here = slice(first, first + len(told) - 1)
+        self.odometry[here] = relative(measured[told[:-1]], measured[told[1:]])
+        self.linked[here] = 1 / noise(measured, told) ** 2
 
     @property
     def echoes(self) -> int:

@@ -33,7 +33,7 @@ from .ring import Ring
 from .slip import Slip
 from .smoothing import BLUR, Smoothed
 from .smoothing import smooth as smoothing
-from .tracking import LOST, Track, advance, begin, finished, update
+from .tracking import BRIDGED, LOST, Track, advance, aside, begin, finished, update
 from .trajectory import Trajectory, stamps_of
 from .windows import check_window
 
@@ -43,6 +43,8 @@ MOST_PLACED = 64
 """Scans of a log without odometry that are placed by their ranges, a second each; longer logs by walls and corners."""
 MOST_SMOOTHED = 2000
 """Scans; longer logs are smoothed only when asked for."""
+LEAST_EXPLAINED = 0.1
+"""Share of the echoes that poses and map explain, recordings of old narrow sonars included; with less it is no map."""
 SPARSE = 4.0
 """Echoes that a long wall sends back to a ring; with fewer, scans are gathered over windows."""
 WINDOW = 1.5
@@ -124,12 +126,16 @@ class Tracker:
             model = local_model(self.ring, scan, **choices)
         row, given = state.scans, {"sigma": self.sigma, "path_pose": path_pose}
         start = scan.pose if row == 0 and np.isfinite(scan.pose).all() else state.start
-        track = update(self.ring, advance(state.track, scan.pose, self.slip), scan, model, row=row, **given)
-        graph, decisions = state.graph, ()
-        lost = track.strange >= LOST
-        if track.ends or lost:
+        track, graph, decisions = state.track, state.graph, ()
+        gap = track.odometry is not None and track.bridged < BRIDGED and not np.isfinite(scan.pose).all()
+        if gap:
+            track = aside(self.ring, track, scan, model, self.slip, row=row, **given)
+        else:
+            track = update(self.ring, advance(track, scan.pose, self.slip), scan, model, row=row, **given)
+        lost = not gap and track.strange >= LOST
+        if (track.ends and not gap) or lost:
             graph = graph.copy()
-            graph.add(finished(track, lost=lost))
+            decisions = graph.add(finished(track, lost=lost))
             # The next submap begins with the same scan: of its first pose nothing else is known.
             track = update(self.ring, begin(track), scan, model, row=row, **given)
         elif graph.busy:
@@ -164,7 +170,7 @@ class Tracker:
     def _here(self, state: TrackerState) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
         number = len(state.graph.submaps)
         base_cov = state.graph.last_covariance
-        pose, cov = placed(state.graph.poses[number], base_cov, state.track.pose, state.track.covariance)
+        pose, cov = placed(state.graph.poses[number], base_cov, state.track.poses[-1], state.track.covs[-1])
         return _from_start(state.start, pose, cov)
 
 
@@ -259,7 +265,8 @@ def slam(
         progress: told what is being done, and (scans done, scans) of it; (0, 0) where that is not known.
 
     Raises:
-        SonarError: no scan, arguments out of range, a sparse ring without odometry, no wall found.
+        SonarError: no scan, arguments out of range, odometry in a few scans only, a sparse ring without odometry, no
+            wall found, hardly an echo explained.
     """
     check_sigma(sigma)
     check_window(window)
@@ -269,7 +276,15 @@ def slam(
         raise SonarError("slam: no scan in the log; allowed is a log with one or more")
     here = np.asarray(np.isfinite(log.pose).all(axis=1))
     odometry = np.where(here[:, None], log.pose, np.nan)
-    measured = bool(np.isfinite(odometry).any())
+    measured = bool(here.any())
+    if measured and here.sum() < max(2, len(log) / 2):
+        raise SonarError(
+            f"slam: odometry in {here.sum()} of {len(log)} scans; allowed are half of them or more, or none"
+        )
+    if scale and not measured:
+        raise SonarError("slam: scales of the odometry asked for, and no scan has any; allowed is a log with odometry")
+    if smooth is False and (scale or speed):
+        raise SonarError("slam: speed or scale came without smoothing, which estimates them; allowed is to leave it in")
     if window is None and float(np.asarray(ring.echo_paths.width).sum() / (2 * np.pi)) < SPARSE:
         window = WINDOW
     ties: tuple[Tie, ...] = ()
@@ -297,6 +312,11 @@ def slam(
         found = smoothing(
             ring, log, start, **choices, models=models, passages=passages, progress=lambda text: say(text, 0, 0)
         )
+        if found.used < LEAST_EXPLAINED:
+            raise SonarError(
+                f"slam: {found.used:.0%} of the echoes come from what was found; allowed are {LEAST_EXPLAINED:.0%} or "
+                "more: is it the right ring, are ranges and odometry in metres and radians?"
+            )
         return Slam(found.poses, found.pose_cov, stamps_of(log), found.world, log.pose, ties, took, found)
     say("building the map", 0, 0)
     at = replace(log, pose=start)

@@ -337,7 +337,7 @@ def _modes(ring: Ring, *, speed: bool, scale: bool) -> RingModes:
 def _free(data: Data, first: int) -> Data:
     """With all poses free but that of one scan, and reflectors that may go as far."""
     anchored = np.tile(1 / np.square(_LOOSE), (len(data.poses), 1))
-    anchored[int(np.searchsorted(data.rows[0], first))] = 1 / _ANCHOR**2
+    anchored[int(np.flatnonzero(data.rows[0] == first)[0])] = 1 / _ANCHOR**2
     return replace(data, anchored=anchored, reach=_LOOSE[0])
 
 

@@ -5,6 +5,7 @@ taken in by their ranges, and what is new becomes known. Nothing here depends on
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,8 @@ MOST = 48
 """Reflectors of a submap."""
 SEEN_TWICE = 2
 """Scans that see a reflector that is kept."""
+BRIDGED = 3
+"""Scans in a row without odometry over which that of the scan before leads to the next one."""
 LOST = 3
 """Scans in a row that know nothing of what they see, after which the robot is elsewhere than odometry says."""
 ELSEWHERE = (1.5, 1.0)
@@ -60,7 +63,9 @@ class Track:
     covs: tuple[Float[np.ndarray, "3 3"], ...] = ()
     """Their covariances."""
     odometry: Float[np.ndarray, "3"] | None = None
-    """Of the last scan that had it."""
+    """Of the last scan, where the pose is; None where it had none."""
+    bridged: int = 0
+    """Scans without odometry since then, which moved nothing."""
     squares: float = 0.0
     """Sum of squared residuals so far, square metres."""
     free: float = 0.0
@@ -111,15 +116,27 @@ def _nothing_known() -> Known:
 
 
 def advance(track: Track, odometry: Float[np.ndarray, "3"], slip: Slip) -> Track:
-    """The belief after the robot's motion; without odometry it is somewhere near."""
+    """The belief after the robot's motion from where the pose is; without odometry it is somewhere near."""
     here = np.isfinite(odometry).all()
     unknown = np.full(3, np.nan)
     step = relative(track.odometry, odometry) if here and track.odometry is not None else unknown
     first = track.odometry is None and not track.rows and not len(track.known)
     variance = np.zeros(3) if first else step_variance(slip, step)
+    if not here:
+        variance = variance * (1 + track.bridged)
     pose, covariance = moved(track.known.pose, track.known.covariance, np.nan_to_num(step), variance)
     known = replace(track.known, pose=pose, covariance=covariance)
-    return replace(track, known=known, odometry=odometry if here else track.odometry)
+    return replace(track, known=known, odometry=odometry if here else None, bridged=0)
+
+
+def aside(ring: Ring, track: Track, scan: Scan, model: LocalModel, slip: Slip, *, row: int, **given: Any) -> Track:
+    """Look at a scan that has no odometry, between others that do: its pose is told, nothing else hangs on it.
+
+    What the odometry of the next scan leads on from is the pose before; if this scan moved it, its motion would count
+    twice. Arguments as for ``advance`` and ``update``.
+    """
+    seen = update(ring, advance(track, np.full(3, np.nan), slip), scan, model, row=row, grow=False, **given)
+    return replace(track, rows=seen.rows, poses=seen.poses, covs=seen.covs, bridged=track.bridged + 1)
 
 
 def update(
