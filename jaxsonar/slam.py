@@ -308,6 +308,10 @@ def slam(
         settled = not measured and bool(np.isfinite(covariance).any()) and not speed
         smooth = len(log) <= MOST_SMOOTHED and not settled
     if smooth:
+        if measured:
+            # Nothing leads to scans without odometry: they are laid on the map of the others, or left out.
+            led = here | (np.arange(len(log)) == 0)  # all others are seen from the first one
+            start = np.where(led[:, None], start, np.nan)
         choices = {"odometry": given, "sigma": sigma, "window": window, "speed": speed, "scale": scale, "slip": slip}
         found = smoothing(
             ring, log, start, **choices, models=models, passages=passages, progress=lambda text: say(text, 0, 0)

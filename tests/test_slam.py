@@ -8,6 +8,7 @@ import pytest
 
 from jaxsonar import Ring, Room, SonarError, local_models, simulate
 from jaxsonar.incremental import Mapper
+from jaxsonar.logs import Scan
 from jaxsonar.mapping import build_map
 from jaxsonar.odometry import drifted
 from jaxsonar.poses import composed, relative, wrap_angle
@@ -116,6 +117,53 @@ def test_without_odometry_scans_are_placed_by_what_they_see():
     assert (np.linalg.eigvalsh(found.covariance[rest]) > 0).all()
     own = errors(Trajectory(found.stamp[known], found.poses[known]), Trajectory(found.stamp, truth()[:16]))
     assert own.ate < 0.1
+
+
+@pytest.mark.parametrize("missing", [[5], [4, 5, 11]])
+def test_scans_without_odometry_between_others_bend_nothing(missing):
+    """The odometry leads on over them; what they see places them, or they are left out."""
+    some = log()[:16]
+    pose = np.array(some.pose)
+    pose[missing] = np.nan
+    found = slam(RING, replace(some, pose=pose))
+    kept = np.setdiff1d(np.arange(16), missing)
+    assert np.isfinite(found.poses[kept]).all()
+    known = np.isfinite(found.poses[:, 0])
+    own = errors(
+        Trajectory(found.stamp[known], found.poses[known], found.covariance[known]),
+        Trajectory(found.stamp, truth()[:16]),
+        align="first",
+    )
+    assert own.ate < 0.08  # a motion that counts twice is 15 cm off at once, and with all that follows
+    assert own.nees < 4
+
+
+def test_a_step_over_a_scan_without_odometry_is_the_whole_step():
+    """With ranges that say nothing, the pose after it is where odometry says."""
+    tracker = Tracker(ring=RING, sigma=SIGMA)
+    state, pose = tracker.start(), np.full(3, np.nan)
+    none = np.zeros(0, dtype=np.int64)
+    for x in (0.0, 0.5, np.nan, 1.5):
+        scan = Scan(0, np.nan, np.array([x, 0.0 * x, 0.0 * x]), none, none, np.zeros(0), np.zeros(0))
+        state, step = tracker.step(state, scan)
+        pose = step.pose
+    np.testing.assert_allclose(pose, [1.5, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("pose", "choices", "said"),
+    [
+        ([0, 1], {}, "odometry in 2 of 16 scans"),
+        ([], {"scale": True}, "no scan has any"),
+        (range(16), {"scale": True, "smooth": False}, "without smoothing"),
+    ],
+)
+def test_what_odometry_can_not_do_is_refused_before_the_work(pose, choices, said):
+    some = log()[:16]
+    kept = np.full((16, 3), np.nan)
+    kept[list(pose)] = some.pose[list(pose)]
+    with pytest.raises(SonarError, match=said):
+        slam(RING, replace(some, pose=kept), **choices)
 
 
 def test_a_robot_that_was_carried_begins_anew():

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,8 +21,6 @@ COUNT = 14
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A log with odometry, the truth, a map made with the true poses; and what the command made of the log."""
-    from dataclasses import replace
-
     folder = tmp_path_factory.mktemp("slam")
     some = log()[:COUNT]
     save_log(some, folder / "log.csv")
@@ -76,6 +75,8 @@ BAD = {
     "slam log.csv --ring faw -o out.geojson --trajectory out.geojson": "out.geojson",
     "slam log.csv --ring faw -o out.geojson --sigma -1": "--sigma",
     "slam log.csv --ring faw -o out.geojson --odometry 3": "--odometry",
+    "slam log.csv --ring faw -o - --trajectory -": "standard output",
+    "slam log.csv --ring faw -o out.geojson --scale --no-smoothing": "without smoothing",
     "slam log.csv --ring faw -o out.geojson --truth other.tum": "--truth",
     "slam log.csv --ring faw -o out.geojson --figure run.xyz": "--figure",
     "slam log.csv --ring faw": "-o",
@@ -118,6 +119,29 @@ def test_localize_in_a_map(here, capsys):
         np.testing.assert_allclose(found.poses, truth()[:COUNT], atol=0.06)  # some scans see no wall across the way
         assert "the first one at" in capsys.readouterr().err
     assert (here / "where.svg").exists()
+
+
+def test_localize_in_a_floor_plan_with_a_negative_start(here, capsys):
+    from jaxsonar.roomfile import save_room
+
+    save_room(ROOM, here / "plan.geojson")
+    x, y, theta = truth()[0]
+    near = f"{x - 0.2:.2f},{y:.2f},{np.degrees(theta):.1f}"
+    arguments = ("localize", "log.csv", "--ring", "faw", "--map", "plan.geojson", "--trajectory")
+    assert call(*arguments, "p.tum", "--start", near) == 0
+    np.testing.assert_allclose(load_trajectory(here / "p.tum").poses, truth()[:COUNT], atol=0.06)
+    # Far below the origin: understood, and nothing there.
+    assert call(*arguments, "q.tum", "--start", "-9,-9,0") == 1
+    assert "no place" in capsys.readouterr().err
+    assert not (here / "q.tum").exists()
+
+
+def test_truth_needs_stamps_that_rise(here, capsys):
+    falling = load_log(here / "log.csv")
+    save_log(replace(falling, stamp=falling.stamp[::-1].copy()), here / "falling.csv")
+    assert call("slam", "falling.csv", "--ring", "faw", "-o", "out.geojson", "--truth", "truth.tum") == 2
+    assert "do not rise" in capsys.readouterr().err
+    assert not (here / "out.geojson").exists()
 
 
 def test_localize_says_where_it_is_not_sure(here, capsys):
