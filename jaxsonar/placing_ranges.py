@@ -103,7 +103,9 @@ def _from_first(views: Views, part: Part) -> Part:
     """The same in the frame of its first scan."""
     first = int(part.rows[0])
     part = adjusted(views, part, steps=3, held=first)
-    return part.moved(inverse(part.poses[first]))
+    part = part.moved(inverse(part.poses[first]))
+    part.poses[first] = 0.0  # to the last digit
+    return part
 
 
 @dataclass(frozen=True, eq=False)

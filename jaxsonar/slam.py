@@ -40,7 +40,8 @@ from .windows import check_window
 REACH = 0.85
 """Of the ring's maximum range; nearer than that walls are surely heard."""
 MOST_PLACED = 64
-"""Scans of a log without odometry that are placed by their ranges, a second each; longer logs by walls and corners."""
+"""Scans of a log without odometry that are placed by their ranges, some seconds each; of longer logs by walls and
+corners alone, which places fewer of them."""
 MOST_SMOOTHED = 2000
 """Scans; longer logs are smoothed only when asked for."""
 LEAST_EXPLAINED = 0.1
@@ -300,7 +301,7 @@ def slam(
     elif measured:
         start, covariance, ties, took, models, passages = _tracked(ring, log, sigma, slip, live, say)
     else:
-        models = list(local_models(ring, log, sigma=sigma))
+        models = _models(ring, log, sigma, say)
         start, covariance = _without_odometry(ring, log, models, sigma, say)
     given = odometry if measured else None
     if smooth is None:
@@ -342,6 +343,15 @@ def _without_odometry(
     return place_parts(models, None, blur=BLUR, progress=told)[0], np.full((len(log), 3, 3), np.nan)
 
 
+def _models(ring: Ring, log: Log, sigma: float | None, say: Callable[[str, int, int], None]) -> list[LocalModel]:
+    """Of all scans."""
+    models: list[LocalModel] = []
+    for model in local_models(ring, log, sigma=sigma):
+        models.append(model)
+        say("local models", len(models), len(log))
+    return models
+
+
 def _tracked(
     ring: Ring, log: Log, sigma: float | None, slip: Slip, live: bool, say: Callable[[str, int, int], None]
 ) -> tuple[
@@ -355,10 +365,7 @@ def _tracked(
     """Poses, covariances, closures, milliseconds of each step, the local models, and what is known to each other."""
     tracker = Tracker(ring=ring, sigma=sigma, slip=slip)
     state, took = tracker.start(), np.zeros(len(log))
-    models: list[LocalModel] = []
-    for model in () if live else local_models(ring, log, sigma=sigma):
-        models.append(model)
-        say("local models", len(models), len(log))
+    models = [] if live else _models(ring, log, sigma, say)
     for row in range(len(log)):
         begun = perf_counter()
         state, step = tracker.step(state, log[row], model=None if live else models[row])
