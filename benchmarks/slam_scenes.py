@@ -5,7 +5,7 @@ Its border is the walls. Corridors are 1.5 to 2.2 m wide, so that a ring of 2 m 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -56,6 +56,8 @@ class Scene:
     """Share of the echoes that are lost."""
     seed: int = 0
     """Of the noise."""
+    wheels: bool = True
+    """Whether there is odometry."""
 
     @cached_property
     def heard(self) -> Simulation:
@@ -74,7 +76,8 @@ class Scene:
 
     def log(self, seed: int = 0) -> Log:
         """What the robot has: echoes, and odometry of this seed."""
-        return self.heard.as_log(self.ring, self.odometry(seed))
+        told = self.odometry(seed)
+        return self.heard.as_log(self.ring, told if self.wheels else np.full_like(told, np.nan))
 
 
 # Scenes
@@ -98,6 +101,11 @@ def office(seed: int = 0, **errors: Any) -> Scene:
     """(b) The embedded office and its 17 poses."""
     place = load_office()
     return Scene("office", place.room, place.poses, ring=place.ring, seed=seed, **errors)
+
+
+def echoes_alone(seed: int = 0, **errors: Any) -> Scene:
+    """(b) The office again, at a noise of 5 mm, without any odometry."""
+    return replace(office(seed, **({"sigma": 0.005} | errors)), name=f"office, echoes alone {seed}", wheels=False)
 
 
 def loop(seed: int = 0, **errors: Any) -> Scene:
