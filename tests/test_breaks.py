@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from worlds import wall_and_corner
 
-from jaxsonar import GlobalMap
 from jaxsonar.breaks import RARE, Breaks, broken_steps
 from jaxsonar.poses import composed
 
@@ -61,21 +61,7 @@ ROWS = {10 * row: row for row in range(200)}  # the numbers of scans are not the
 @pytest.fixture
 def world():
     """A wall and a corner, seen on both sides of the break and long after."""
-    seen = tuple(10 * row for row in (3, 4, 6, 7, 150))
-    return GlobalMap(
-        segments=np.array([[[0.0, 1.0], [6.0, 1.0]]]),
-        rho=np.array([1.0]),
-        theta=np.array([np.pi / 2]),
-        sigma_rho=np.array([0.01]),
-        sigma_theta=np.array([0.01]),
-        echoes=np.array([40]),
-        scans=(seen,),
-        points=np.array([[0.5, 1.0]]),
-        point_kinds=("corner",),
-        point_cov=np.eye(2)[None] * 1e-6,
-        point_echoes=np.array([20]),
-        point_scans=(seen,),
-    )
+    return wall_and_corner(tuple(10 * row for row in (3, 4, 6, 7, 150)))
 
 
 def test_without_a_break_nothing_changes(world):

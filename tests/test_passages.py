@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds import wall_and_corner
 
-from jaxsonar import GlobalMap
 from jaxsonar.passages import NEAR, Passages
 from jaxsonar.surroundings import surroundings
 
@@ -15,21 +15,7 @@ SCANS = 4  # of each stretch
 @pytest.fixture
 def world():
     """A wall along x and a corner, seen on the first stretch and on the last."""
-    seen = (0, 1, 12, 13)
-    return GlobalMap(
-        segments=np.array([[[0.0, 1.0], [6.0, 1.0]]]),
-        rho=np.array([1.0]),
-        theta=np.array([np.pi / 2]),
-        sigma_rho=np.array([0.01]),
-        sigma_theta=np.array([0.01]),
-        echoes=np.array([40]),
-        scans=(seen,),
-        points=np.array([[0.5, 1.0]]),
-        point_kinds=("corner",),
-        point_cov=np.eye(2)[None] * 1e-6,
-        point_echoes=np.array([20]),
-        point_scans=(seen,),
-    )
+    return wall_and_corner((0, 1, 12, 13))
 
 
 def passages(last: tuple[float, float, float]) -> Passages:
