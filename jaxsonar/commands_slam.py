@@ -150,20 +150,21 @@ def _known_map(path: str) -> "GlobalMap":
     """A map, or a floor plan as one; what is neither is refused as a map."""
     from jaxsonar.hardware.errors import SonarError
 
+    from .files import shown
     from .mapfile import load_map
     from .maps import map_of
     from .roomfile import load_room
 
     try:
-        return load_map(path)
+        world = load_map(path)
     except SonarError as no_map:
         try:
-            room = load_room(path)
+            world = map_of(load_room(path))
         except SonarError:
             raise no_map from None
-        if not len(room.walls):
-            raise
-        return map_of(room)
+    if not len(world):
+        raise SonarError(f"{shown(path)}: no wall; allowed is a map with walls")
+    return world
 
 
 def add_commands(
@@ -340,9 +341,10 @@ def _as_json(found: "Slam", against: "dict[str, TrajectoryErrors | None] | None"
             "sigma": smoothed.sigma,
             "explained": smoothed.used,
             "speed_of_sound": float(smoothed.ring.speed_of_sound),
-            "speed_of_sound_sd": smoothed.speed_of_sound_sd,
-            "scale": smoothed.scale,
-            "scale_sd": smoothed.scale_sd,
+            # What was not estimated has no standard deviation: 0 would say that it is known exactly.
+            "speed_of_sound_sd": smoothed.speed_of_sound_sd or None,
+            "scale": smoothed.scale if any(smoothed.scale_sd) else None,
+            "scale_sd": smoothed.scale_sd if any(smoothed.scale_sd) else None,
         }
     if against is not None:
         said["errors"] = {name: None if one is None else _plain_numbers(asdict(one)) for name, one in against.items()}

@@ -85,7 +85,7 @@ BAD = {
     "localize log.csv --ring faw --map known.geojson --trajectory known.geojson": "known.geojson",
     "localize log.csv --ring faw --map known.geojson --trajectory out.tum --start 1,2": "X,Y,DEG",
     "localize log.csv --ring faw --map known.geojson --trajectory out.tum --start 1,2,nan": "X,Y,DEG",
-    "localize log.csv --ring faw --map empty.geojson --trajectory out.tum": "no wall",
+    "localize log.csv --ring faw --map empty.geojson --trajectory out.tum": "empty.geojson: no wall",
     "localize log.csv --ring faw --trajectory out.tum": "--map",
     "stream file:log.csv --ring faw --trajectory out.tum": "--slam",
 }
