@@ -56,6 +56,12 @@ class Result:
     """Why the whole shard was set aside; empty if it was not."""
 
 
+def one_thread() -> dict[str, str]:
+    """``ONE_THREAD``, with the flags of XLA that are set already before ours."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD['XLA_FLAGS']}".strip()
+    return ONE_THREAD | {"XLA_FLAGS": flags}
+
+
 def job_of(ring: "Ring", *, method: str, settings: "HoughSettings", sigma: float | None) -> str:
     """What is to be done with every shard, as JSON: plain text that any process can take, and equal for equal jobs."""
     from dataclasses import asdict

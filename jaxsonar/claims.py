@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool
 
+from .echoes import exact_paths
 from .local import LocalModel
-from .poses import unit
+from .placing_views import plane
 from .ring import Ring
 from .settling import GATE, Data
 
@@ -26,17 +27,15 @@ def of_own_walls(ring: Ring, data: Data, models: Sequence[LocalModel]) -> Bool[n
         models: local models of all scans of this log.
     """
     out = np.zeros(data.path.shape, dtype=bool)
-    paths = ring.echo_paths
-    middle, half = np.asarray(paths.midpoint, dtype=np.float64), np.asarray(paths.half_baseline, dtype=np.float64)
+    paths = exact_paths(ring)
+    middle, half = np.asarray(paths.midpoint), np.asarray(paths.half_baseline)
     tx, rx = ring.paths[data.path].T
     ranges = np.asarray(ring.corrected(data.reported, tx.T, rx.T), dtype=np.float64)
     for row, scan in enumerate(data.rows[0].tolist()):
         model, own = models[scan], data.path[row]
         gate = GATE * (model.sigma if model.sigma > 0 else _SIGMA)
         for line in model.lines:
-            normal, along = unit(line.theta), unit(line.theta + np.pi / 2)
-            expected = np.hypot(line.rho - middle[own] @ normal, half[own] @ along)
-            heard = np.zeros(len(ring.paths), dtype=bool)
-            heard[ring.path_index[line.paths[:, 0], line.paths[:, 1]]] = True
-            out[row] |= heard[own] & (np.abs(ranges[row] - expected) < gate)  # False for NaN: no echo
+            expected = plane(np.array([line.rho, line.theta]), middle[own], half[own]).reach
+            heard = np.isin(own, ring.path_index[line.paths[:, 0], line.paths[:, 1]])
+            out[row] |= heard & (np.abs(ranges[row] - expected) < gate)  # False for NaN: no echo
     return out

@@ -3,13 +3,14 @@
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
-from .logs import Log
+from .logs import Log, Scan
 from .ring import Ring
 
 SCANS_PER_STEP = (256, 64, 16)
@@ -267,3 +268,20 @@ def in_order(items: Iterable[tuple[int, Item]]) -> Iterator[Item]:
             yield early.pop(last)
             last += 1
     assert not early, f"scan {last} never came"
+
+
+def exact_paths(ring: Ring) -> kernels.EchoPaths:
+    """Geometry of the ring's paths as NumPy arrays in double precision; made once for every ring."""
+    cached = ring.__dict__.get("_exact_paths")
+    if cached is None:
+        cached = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), ring.echo_paths)
+        object.__setattr__(ring, "_exact_paths", cached)
+    return cached
+
+
+def echoes_of(ring: Ring, scan: Scan) -> tuple[Int[np.ndarray, " echoes"], Float[np.ndarray, " echoes"]]:
+    """Path (row of ``paths``) and corrected range, metres, of the echoes of a scan that are of a path and in reach."""
+    path = ring.path_index[scan.tx, scan.rx]
+    reach = np.asarray(ring.corrected(scan.range, scan.tx, scan.rx), dtype=np.float64)
+    heard = (path >= 0) & (reach > 0) & (reach < ring.max_range)
+    return path[heard], reach[heard]

@@ -14,7 +14,7 @@ from socket import socketpair
 from jaxsonar.hardware.errors import SonarError
 
 from .batch_shards import Shard
-from .batch_worker import KEPT_MEMORY, ONE_THREAD, Result
+from .batch_worker import KEPT_MEMORY, Result, one_thread
 from .files import shown
 
 STARTED_BY = "import sys; from jaxsonar.batch_worker import serve; serve(int(sys.argv[1]))"
@@ -92,9 +92,8 @@ class _Worker:
         self.shard: Shard | None = None
         self.ready = False
         ours, theirs = socketpair()
-        flags = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD['XLA_FLAGS']}".strip()
         path = os.pathsep.join(entry for entry in sys.path if entry)
-        environment = KEPT_MEMORY | os.environ | ONE_THREAD | {"XLA_FLAGS": flags, "PYTHONPATH": path}
+        environment = KEPT_MEMORY | os.environ | one_thread() | {"PYTHONPATH": path}
         if device is not None:
             environment["CUDA_VISIBLE_DEVICES"] = device
         if crowded:  # several share a GPU: none may take most of its memory at once

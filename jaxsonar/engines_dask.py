@@ -17,7 +17,7 @@ from typing import Any
 from jaxsonar.hardware.errors import SonarError
 
 from .batch_shards import Shard
-from .batch_worker import KEPT_MEMORY, ONE_THREAD, Result, do
+from .batch_worker import KEPT_MEMORY, ONE_THREAD, Result, do, one_thread
 from .engines import cores, gpus
 from .files import reason, shown
 
@@ -112,7 +112,6 @@ def _why(shard: Shard, failure: BaseException) -> str:
 
 def _local(distributed: Any, workers: int) -> Any:
     """A cluster on this machine that nobody else can reach."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD['XLA_FLAGS']}".strip()
     return distributed.LocalCluster(
         n_workers=workers,
         threads_per_worker=1,
@@ -121,7 +120,7 @@ def _local(distributed: Any, workers: int) -> Any:
         dashboard_address=None,
         memory_limit=0,
         silence_logs=50,
-        env=ONE_THREAD | {"XLA_FLAGS": flags},
+        env=one_thread(),
     )
 
 

@@ -1,5 +1,7 @@
 """What speaks for and against scans that lie together beside their targets: silence, walls in the way, loose echoes."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -73,11 +75,16 @@ def loose_explained(views: Views, part: Part) -> float:
     return float(np.minimum(np.bincount(both, weights=nats), MOST_LOOSE).sum())
 
 
-class _Look:
+class _Look(NamedTuple):
     """How paths hear reflectors: reflectors x (scans x paths, or echoes)."""
 
-    def __init__(self, faced: np.ndarray, off_axis: np.ndarray, foot: np.ndarray, range_: Range):
-        self.faced, self.off_axis, self.foot, self.range = faced, off_axis, foot, range_
+    faced: Bool[np.ndarray, "reflectors *batch"]
+    """Whether the sensors are before the wall; true for points."""
+    off_axis: Float[np.ndarray, "reflectors *batch"]
+    """Squared chord off the axis over that of the cone, the larger of both sensors."""
+    foot: Float[np.ndarray, "reflectors *batch"]
+    """Where along a wall, metres from the foot of the origin."""
+    range: Range
 
     @classmethod
     def of(cls, part: Part, pose: Float[np.ndarray, "... 3"], paths: Geometry) -> "_Look":

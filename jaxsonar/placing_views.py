@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from jaxsonar import kernels
 
+from .echoes import echoes_of, exact_paths
 from .local import LocalModel
 from .logs import Log
 from .poses import unit
@@ -175,15 +176,13 @@ class Views:
     @classmethod
     def of(cls, ring: Ring, log: Log, models: Sequence[LocalModel], sigma: float) -> "Views":
         """Scans and their local models; ``sigma``: noise of the ranges, metres."""
-        own = ring.echo_paths
-        paths = Geometry(
-            *(np.asarray(leaf, dtype=np.float64) for leaf in (own.midpoint, own.half_baseline, own.axes, own.cone))
-        )
+        own = exact_paths(ring)
+        paths = Geometry(*(np.asarray(leaf) for leaf in (own.midpoint, own.half_baseline, own.axes, own.cone)))
         ranges = np.full((len(models), len(ring.paths), _SLOTS), np.inf)
         echoes: list[tuple[np.ndarray, ...]] = []
         targets: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
         for row, model in enumerate(models):
-            path, reach = _echoes_of(ring, log, row)
+            path, reach = echoes_of(ring, log[row])
             order = np.lexsort((reach, path))
             path, reach = path[order], reach[order]
             slot = np.arange(len(path)) - np.searchsorted(path, path)
@@ -222,15 +221,6 @@ def _as_targets(rows: Sequence[tuple[int, np.ndarray, np.ndarray, np.ndarray]]) 
     scan = np.array([row[0] for row in rows], dtype=np.int64)
     plane_, point = (np.array([row[k] for row in rows], dtype=np.float64).reshape(-1, 2) for k in (1, 2))
     return Targets(scan, plane_, point, np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 3))
-
-
-def _echoes_of(ring: Ring, log: Log, row: int) -> tuple[Int[np.ndarray, " echoes"], Float[np.ndarray, " echoes"]]:
-    """Path and corrected range of the echoes of one scan."""
-    scan = log[row]
-    path = ring.path_index[scan.tx, scan.rx]
-    reach = np.asarray(ring.corrected(scan.range, scan.tx, scan.rx), dtype=np.float64)
-    heard = (path >= 0) & (reach > 0) & (reach < ring.max_range)
-    return path[heard].astype(np.int64), reach[heard]
 
 
 def _targets_of(model: LocalModel) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar import kernels
 
-from .echoes import power_of_two
+from .echoes import echoes_of, exact_paths, power_of_two
 from .local import LocalModel
 from .logs import Scan
 from .matching import Features, Known, features_of, match
@@ -167,7 +167,7 @@ def update(
     noise = track.sigma if sigma is None else sigma
     echoes = _Echoes.of(ring, scan, path_pose)
     seen = features_of(model)
-    full = float(np.asarray(_geometry(ring).width).sum() / (2 * np.pi))
+    full = float(np.asarray(exact_paths(ring).width).sum() / (2 * np.pi))
     with jax.enable_x64(True):
         # Where the robot is by what it knows again; then, with that, what is new and what else was heard.
         first = match(track.known, seen, full=full)
@@ -239,7 +239,7 @@ def _silent(ring: Ring, known: Known, scan: Scan, path_pose: Float[np.ndarray, "
     """
     room = power_of_two(len(known), least=_ROOM)
     direct = np.flatnonzero(ring.paths[:, 0] == ring.paths[:, 1])
-    paths = jax.tree.map(lambda leaf: leaf[direct], _geometry(ring))
+    paths = jax.tree.map(lambda leaf: leaf[direct], exact_paths(ring))
     if path_pose is not None:
         paths = _moved(paths, path_pose[direct])
     first = np.full(len(ring.paths), np.inf)
@@ -270,12 +270,9 @@ class _Echoes:
 
     @classmethod
     def of(cls, ring: Ring, scan: Scan, path_pose: Float[np.ndarray, "paths 3"] | None) -> "_Echoes":
-        row = ring.path_index[scan.tx, scan.rx]
-        reach = np.asarray(ring.corrected(scan.range, scan.tx, scan.rx), dtype=np.float64)
-        heard = (row >= 0) & (reach > 0) & (reach < ring.max_range)
-        row, reach = row[heard], reach[heard]
+        row, reach = echoes_of(ring, scan)
         room = power_of_two(len(row), least=_ECHOES)
-        paths = _geometry(ring)
+        paths = exact_paths(ring)
         padded = _pad(row, room)
         own = jax.tree.map(lambda leaf: leaf[padded], paths)
         if path_pose is not None:
@@ -334,15 +331,6 @@ class _Echoes:
             parameters=np.asarray(belief.scene.parameters)[:count],
             covariance=np.asarray(belief.covariance)[:size, :size],
         )
-
-
-def _geometry(ring: Ring) -> kernels.EchoPaths:
-    """Of the ring's paths, in double precision."""
-    cached = ring.__dict__.get("_tracking_paths")
-    if cached is None:
-        cached = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), ring.echo_paths)
-        object.__setattr__(ring, "_tracking_paths", cached)
-    return cached
 
 
 def _moved(paths: kernels.EchoPaths, pose: Float[np.ndarray, "echoes 3"]) -> kernels.EchoPaths:
