@@ -21,20 +21,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from jaxsonar.files import make_folder, read_bytes
+from benchmarks.metrics import BASELINE, RATIO, SIZES, Metric, Options, Results, failures, load_baseline, save_baseline
+from jaxsonar.fileio.atomic_files import make_folder, read_bytes
 from jaxsonar.hardware.errors import SonarError
-
-from .suite import (
-    BASELINE,
-    RATIO,
-    SIZES,
-    Metric,
-    Options,
-    Results,
-    failures,
-    load_baseline,
-    save_baseline,
-)
 
 WORKLOADS = {
     "throughput": ("throughput.measure", "scans a second of a batch, and of its peers, on one core and on two"),
@@ -107,7 +96,7 @@ def keep_compiled() -> None:
 
 def shown(results: Results) -> Table:
     """Ratios first, then times."""
-    from .page import conditions, said, wanted
+    from benchmarks.markdown_tables import conditions, said, wanted
 
     table = Table(caption=conditions(results).strip())
     for column in ("", "measured", "target", "met"):
@@ -120,7 +109,8 @@ def shown(results: Results) -> Table:
 
 def write_pages(pages: list[Path], results: Results) -> None:
     """Tables of each page, and the figures that it shows as ``speed_NAME.svg``."""
-    from . import page, suite_figures
+    from benchmarks import markdown_tables as page
+    from benchmarks import plots as suite_figures
 
     for path in pages:
         page.write(path, results)
@@ -189,7 +179,7 @@ def run(options: argparse.Namespace) -> int:
         save_baseline(results, options.baseline)
     PRINTED.print(shown(results))
     if not options.gate:
-        from . import suite_figures
+        from benchmarks import plots as suite_figures
 
         make_folder(options.output)
         suite_figures.write(results, options.output)

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxsonar.office import load_office
 
 import jaxsonar
 from jaxsonar import kernels
 from jaxsonar.calibration import speed_of_sound
-from jaxsonar.office import load_office
 
 office = load_office()
 truth = np.linspace(16, 24, len(office.poses))  # deg C

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from . import reflectors
-from .explanation import CORNER, PLANE
-from .paths import EchoPaths
+from . import measurement_model as reflectors
+from .array_geometry import EchoPaths
+from .ml_detection import CORNER, PLANE
 
 
 class Outlook(eqx.Module):

@@ -46,7 +46,7 @@ def _checked(of=None, *, typechecker):
 
 jaxtyping.jaxtyped = _checked
 
-from jaxsonar.compilecache import use_compilation_cache  # noqa: E402  what is imported from now on is checked
+from jaxsonar.fileio.compilation_cache import use_compilation_cache  # noqa: E402  what is imported from now on is checked
 
 use_compilation_cache()  # where the commands keep theirs, so that no process compiles what another one has
 
@@ -67,8 +67,8 @@ def faw_ring():
 @pytest.fixture(scope="session")
 def short_demo(tmp_path_factory):
     """A folder in which ``jaxsonar demo -o demo`` has run with two random rooms; its tables, and what it said."""
-    from jaxsonar import demo
-    from jaxsonar.cli import main
+    from jaxsonar.cli.app import main
+    from jaxsonar.demo import run_demo as demo
 
     folder, tables, said, run_demo = tmp_path_factory.mktemp("readme"), [], [], demo.run_demo
 

@@ -1,0 +1,216 @@
+"""Figures and tables of the accuracy benchmark, from its measures: one function, one figure."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from rich.table import Table
+
+from jaxsonar.reports import plot_style as figures
+
+KINDS = ("plane", "corner", "edge")
+"""Kinds of reflectors; poles are told like edges."""
+ANSWERS = (*KINDS, "undecided", "nothing")
+Series = dict[float, dict[str, dict[str, float]]]
+"""What was varied: its values, the methods, their measures."""
+MARKERS = ("o", "s", "^", "v", "D", "P")
+WIDE = 15.0
+"""NEES from which on all count as one."""
+
+
+def crb_figure(rows: dict[str, Series]) -> Figure:
+    """Root mean square errors over the bound against the noise, a row for each kind of scans."""
+    with figures.styled():
+        figure = Figure(figsize=(7.6, 2.9 * len(rows) + 0.7), layout="constrained")
+        grid = figure.subplots(len(rows), 2, sharex=True, sharey="col", squeeze=False)
+        for (title, series), row in zip(rows.items(), grid, strict=True):
+            for axes, (name, key) in zip(
+                row, {"distance ρ": "rho_mm", "direction θ": "theta_deg"}.items(), strict=True
+            ):
+                axes.axhline(1.0, color=figures.WALL, lw=1.0, ls="--")
+                _lines(axes, series, f"rmse_{key}_per_crb", across=1e3)
+                axes.set_yscale("log")
+                axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                axes.yaxis.set_minor_formatter(NullFormatter())
+                axes.set_title(f"{name}; {title}")
+            row[0].set_ylabel("RMSE / CRB")
+        for axes in grid[-1]:
+            axes.set_xlabel("range noise σ (mm)")
+        return _with_legend(figure, grid[0, 0], "CRB")
+
+
+def robustness_figure(columns: dict[str, Series]) -> Figure:
+    """Recall and false lines against what goes wrong, a column for each."""
+    with figures.styled():
+        figure = Figure(figsize=(7.6, 5.6), layout="constrained")
+        grid = figure.subplots(2, len(columns), sharex="col", sharey="row", squeeze=False)
+        for (name, series), (top, bottom) in zip(columns.items(), grid.T, strict=True):
+            _lines(top, series, "recall", across=100, up=100)
+            _lines(bottom, series, "false_per_scan", across=100)
+            bottom.set_xlabel(name)
+            bottom.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        grid[1, 0].set_ylim(bottom=-0.03 * grid[1, 0].get_ylim()[1])  # 0, and whole markers on it
+        grid[0, 0].set_ylabel("walls found (%)")
+        grid[1, 0].set_ylabel("false lines a scan")
+        return _with_legend(figure, grid[0, 0])
+
+
+def confusion_figure(tables: dict[str, Int[np.ndarray, "4 5"]]) -> Figure:
+    """Shares of each kind's reflectors by what was told of them, and how many reports are of nothing."""
+    across = 3
+    down = -(-len(tables) // across)
+    with figures.styled():
+        figure = Figure(figsize=(9.4, 2.7 * down + 0.4), layout="constrained")
+        grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
+        for axes in grid.ravel()[len(tables) :]:
+            axes.set_axis_off()
+        for (name, table), axes in zip(tables.items(), grid.ravel(), strict=False):
+            share = np.full(table.shape, np.nan)
+            share[:3] = table[:3] / np.maximum(table[:3].sum(axis=1, keepdims=True), 1)
+            axes.imshow(share, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+            for (row, column), count in np.ndenumerate(table):
+                if row < 3 or column < 4:
+                    percent = f"\n{100 * share[row, column]:.0f} %" if row < 3 else ""
+                    if not count:
+                        continue
+                    color = "white" if share[row, column] > 0.5 else figures.ROBOT
+                    axes.text(column, row, f"{count}{percent}", ha="center", va="center", fontsize=7, color=color)
+            axes.set_title(name)
+            axes.set_xticks(range(len(ANSWERS)), ANSWERS, rotation=30, ha="right", rotation_mode="anchor")
+            axes.set_yticks(range(4), [*KINDS[:2], "edge, pole", "nothing"])
+            axes.tick_params(length=0)
+            axes.spines[:].set_visible(False)
+        figure.supxlabel("told", fontsize=9)
+        figure.supylabel("true", fontsize=9)
+    return figure
+
+
+def nees_figure(values: dict[str, Float[np.ndarray, " walls"]]) -> Figure:
+    """Squared errors in units of the reported covariance, against the chi-squared density of two degrees of freedom."""
+    values = {name: some for name, some in values.items() if len(some)}
+    with figures.styled():
+        figure = Figure(figsize=(3.0 * max(len(values), 1) + 0.6, 3.0), layout="constrained")
+        if not values:
+            figure.text(0.5, 0.5, "no method reports a covariance", ha="center")
+            return figure
+        grid = figure.subplots(1, len(values), sharey=True, squeeze=False)[0]
+        x = np.linspace(0, WIDE, 200)
+        for axes, (name, some) in zip(grid, values.items(), strict=True):
+            inside = some[some < WIDE]
+            bins = np.linspace(0, WIDE, 31)
+            weight = np.full(len(inside), 1 / (len(some) * (bins[1] - bins[0])))
+            axes.hist(inside, bins, weights=weight, color=figures.PALETTE[4], label=f"{len(some)} walls")
+            axes.plot(x, np.exp(-x / 2) / 2, color=figures.ROBOT, lw=1.2, label="χ², 2 degrees of freedom")
+            beyond = f"{100 * np.mean(some >= WIDE):.2f} % beyond {WIDE:g} (χ²: {100 * np.exp(-WIDE / 2):.2f} %)"
+            axes.plot([], [], " ", label=f"mean {some.mean():.2f}, 2 is right\n{beyond}")
+            axes.set_title(name)
+            axes.set_xlabel("NEES of (ρ, θ)")
+            axes.legend(fontsize=7)
+        grid[0].set_ylabel("density")
+    return figure
+
+
+def tables(told: dict[str, Any]) -> Iterator[Table]:
+    """What is printed, from what the JSON file holds; the first condition is the base."""
+    v, s, base = told["versions"], told["settings"], told["conditions"][0]
+    table = Table(
+        title=f"Walls with {s['clear_echoes']} or more first-order echoes; "
+        f"{s['rooms']} random rooms, {s['poses']} poses in each, seed {s['seed']}",
+        caption=f"base: {_said(base)}; undec.: % of the walls that are seen but undecided; ± standard error; "
+        "/CRB: of root mean squares; 99 %: of |error| / CRB; NEES: mean, 2 is right. "
+        f"numpy {v['numpy']}, jax {v['jax']} on {v['device']}, OpenCV {v['cv2']}",
+    )
+    columns = ("", "walls", "recall (%)", "undec.", "false/scan", "RMSE (mm)", "(deg)", "median (mm)", "(deg)")
+    for column in (*columns, "ρ/CRB", "θ/CRB", "99 % ρ", "99 % θ", "NEES"):
+        table.add_column(column, justify="left" if not column else "right", no_wrap=True)
+    for condition in told["conditions"]:
+        table.add_section()
+        table.add_row(f"[bold]{condition['name']}[/]")
+        for name, got in condition["methods"].items():
+            table.add_row(
+                f"  {name}",
+                str(got["walls"]),
+                f"{100 * got['recall']:.1f} ± {100 * got['recall_se']:.1f}",
+                f"{100 * got['undecided']:.1f}",
+                f"{got['false_per_scan']:.2f} ± {got['false_per_scan_se']:.2f}",
+                *(f"{got[key]:.2f}" for key in ("rmse_rho_mm", "rmse_theta_deg", "median_rho_mm", "median_theta_deg")),
+                *(f"{got[f'rmse_{key}_per_crb']:.2f}" for key in ("rho_mm", "theta_deg")),
+                *(f"{got[f'p99_{key}_per_crb']:.1f}" for key in ("rho_mm", "theta_deg")),
+                "" if np.isnan(got["nees"]) else f"{got['nees']:.2f} ± {got['nees_se']:.2f}",
+            )
+    yield table
+    table = Table(
+        title=f"Kinds of reflectors with {s['clear_reflector']} or more echoes: % of those of a kind; {_said(base)}",
+        caption="nothing there: reports a scan at which there is no reflector; echoes of second order and false ones",
+    )
+    for column in ("", "is", "reflectors", *(f"told {answer}" for answer in ANSWERS)):
+        table.add_column(column, justify="left" if column in ("", "is") else "right")
+    for name, got in base["methods"].items():
+        table.add_section()
+        for row, (kind, cells) in enumerate(zip((*KINDS, "nothing there"), got["confusion"], strict=True)):
+            total = sum(cells) if row < 3 else got["scans"]
+            shares = [f"{100 * k / max(total, 1):.1f}" if row < 3 else f"{k / total:.2f}" for k in cells]
+            what = "edge or pole" if kind == "edge" else kind
+            table.add_row("" if row else name, what, str(total) if row < 3 else "", *shares[: 5 if row < 3 else 4])
+    yield table
+    table = Table(
+        title=f"One reflector at {s['ranges_m'][0]} to {s['ranges_m'][1]} m: a plane, a right-angled corner or an edge",
+        caption="right: of those that were decided",
+    )
+    for column in ("", "reflectors", "right (%)", "undecided (%)", "nothing (%)"):
+        table.add_column(column, justify="left" if not column else "right")
+    for condition in told["isolated"]:
+        table.add_section()
+        table.add_row(f"[bold]{condition['name']}[/]")
+        for name, got in condition["methods"].items():
+            shares = f"{100 * got['undecided']:.2f}", f"{100 * got['nothing']:.2f}"
+            right = f"{100 * got['right']:.2f} ± {100 * got['right_se']:.2f}"
+            table.add_row(f"  {name}", str(got["reflectors"]), right, *shares)
+    yield table
+    table = Table(
+        title="Worst deviation of three long walls from one scan, sigma 1 mm",
+        caption="of scans in which all three were found; the paper: "
+        f"{told['paper']['rho_mm']} mm, {told['paper']['theta_deg']} deg",
+    )
+    for column in ("", "scans", "all found (%)", "median (mm)", "90 % (mm)", "median (deg)", "90 % (deg)"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, got in told["three"][0]["methods"].items():
+        values = (got[f"{key}_p{share}"] for key in ("rho_mm", "theta_deg") for share in (50, 90))
+        table.add_row(name, str(got["scans"]), f"{100 * got['all_found']:.1f}", *(f"{x:.2f}" for x in values))
+    yield table
+
+
+def _lines(axes: Axes, series: Series, key: str, *, across: float = 1.0, up: float = 1.0) -> None:
+    """A measure of every method over what was varied, with its standard error."""
+    names = list(dict.fromkeys(name for row in series.values() for name in row))
+    values = across * np.array(list(series), dtype=float)
+    beside = 0.008 * np.ptp(values)  # so that bars that would hide one another stand side by side
+    for k, name in enumerate(names):
+        x = values + beside * (k - (len(names) - 1) / 2)
+        y, error = (
+            np.array([up * row[name][f"{key}{of}"] for row in series.values()], dtype=float) for of in ("", "_se")
+        )
+        style = {"color": figures.PALETTE[k % 6], "marker": MARKERS[k % 6], "ms": 4.5, "lw": 1.3, "label": name}
+        axes.errorbar(x, y, error, capsize=2, **style)
+    axes.grid(axis="y", color="#F0F0F0", lw=0.6)
+    axes.set_axisbelow(True)
+
+
+def _with_legend(figure: Figure, axes: Axes, *first: str) -> Figure:
+    handles, labels = axes.get_legend_handles_labels()
+    reference = [line for line in axes.lines if line.get_linestyle() == "--"][: len(first)]
+    figure.legend([*reference, *handles], [*first, *labels], loc="outside lower center", ncols=4, fontsize=8)
+    return figure
+
+
+def _said(c: dict[str, Any]) -> str:
+    """A condition in words."""
+    return (
+        f"{c['sigma'] * 1e3:g} mm, {100 * c['lost']:g} % lost, {100 * c['false']:g} % false, "
+        f"cones of {c['cone_deg']:g} deg, {c['sensors']} sensors"
+    )

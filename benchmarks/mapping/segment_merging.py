@@ -1,0 +1,206 @@
+"""Walls from segments: time, memory and growth of both ways of merging, on buildings of growing floor area.
+
+Run ``python -m benchmarks.mapping.segment_merging``. Every measurement is a process of its own. Ratios come from one run on one
+machine; compare only those across machines.
+"""
+
+import argparse
+import json
+import math
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial import KDTree
+
+from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.mapping.build_map import condense
+from jaxsonar.mapping.hough_merging import merge_as_paper, single_linkage
+from jaxsonar.mapping.segment_fusion import fuse
+from jaxsonar.mapping.wall_segments import SIGMA_OFFSET, SIGMA_THETA, Pieces
+
+ROOM = np.array([6.0, 4.0])
+"""Metres; of every room, wall to wall."""
+THICK = 0.6
+"""Metres between the rooms: more than the cut, so that rooms are clusters, which is the best case of single linkage."""
+EACH = 30
+"""Segments of a wall."""
+CLUTTER = 0.1
+"""Share of the segments that belong to no wall."""
+GAP, CUT = 0.5, 0.4
+NEAR, TURNED = 0.1, math.radians(5.0)
+"""Metres and radians up to which a found wall is a true one."""
+WAYS = ("condense + fuse", "merge_as_paper", "single_linkage", "scipy linkage(single)")
+PEER_UP_TO = 10_000
+"""Segments; the peer keeps half of their distances squared in memory, 0.4 GB for these."""
+
+
+def building(segments: int, *, thick: float = THICK, seed: int = 0) -> tuple[Pieces, np.ndarray]:
+    """Segments of local models in a square of rooms, and the walls (walls, 2, 2) of those; both faces are walls."""
+    rng = np.random.default_rng(seed)
+    strays = int(CLUTTER * segments)
+    rooms = max(1, round((segments - strays) / (4 * EACH)))
+    wide = math.ceil(math.sqrt(rooms))
+    corner = np.stack([np.arange(rooms) % wide, np.arange(rooms) // wide], axis=-1) * (ROOM + thick)
+    around = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * ROOM
+    walls = (corner[:, None, None] + np.stack([around, np.roll(around, -1, axis=0)], axis=1)).reshape(-1, 2, 2)
+    wall = rng.integers(0, len(walls), segments - strays)
+    along = (walls[wall, 1] - walls[wall, 0]) / np.linalg.norm(walls[wall, 1] - walls[wall, 0], axis=-1)[:, None]
+    normal = np.stack([along[:, 1], -along[:, 0]], axis=-1)
+    length = rng.uniform(0.3, 0.6, segments)
+    size = np.linalg.norm(walls[wall, 1] - walls[wall, 0], axis=-1)
+    own = length[: len(wall)]
+    place = own / 2 + rng.random(len(wall)) * (size - own)
+    centre = walls[wall, 0] + place[:, None] * along + rng.normal(0, SIGMA_OFFSET, len(wall))[:, None] * normal
+    theta = np.arctan2(normal[:, 1], normal[:, 0]) + rng.normal(0, SIGMA_THETA, len(wall))
+    centre = np.concatenate([centre, rng.uniform(0, 1, (strays, 2)) * (corner.max(axis=0) + ROOM)])
+    theta = np.concatenate([theta, rng.uniform(-np.pi, np.pi, strays)])
+    order = rng.permutation(segments)
+    row = np.arange(segments)
+    pieces = Pieces(
+        centre=centre[order],
+        theta=wrap_angle(theta[order]),
+        ends=0.5 * length[order, None] * np.array([-1.0, 1.0]),
+        info_offset=np.full(segments, SIGMA_OFFSET**-2),
+        info_theta=np.full(segments, SIGMA_THETA**-2),
+        misfit=np.zeros(segments),
+        count=np.ones(segments, np.int64),
+        echoes=np.full(segments, 6),
+        distance=rng.uniform(0.5, 4, segments),
+        latest=row / 10,
+        scans=(row, row // 4),
+    )
+    return pieces, walls
+
+
+def true_walls_found(pieces: Pieces, walls: np.ndarray) -> int:
+    """How many true walls have a found one on their line that covers most of them."""
+    long = pieces.take(pieces.length > 1.0)
+    if not len(long):
+        return 0
+    along = walls[:, 1] - walls[:, 0]
+    size = np.linalg.norm(along, axis=-1)
+    near = KDTree(long.centre).query_ball_point(walls.mean(axis=1), 0.3 * float(ROOM.max()))
+    found = 0
+    for k, rows in enumerate(near):
+        mine = np.asarray(rows, dtype=np.int64)
+        across = np.abs(((long.centre[mine] - walls[k, 0]) * [along[k, 1], -along[k, 0]]).sum(-1)) / size[k]
+        turn = np.abs(np.sin(long.theta[mine] - math.atan2(-along[k, 0], along[k, 1])))
+        covers = np.abs(long.length[mine] / size[k] - 1) < 0.3
+        found += bool(((across < NEAR) & (turn < math.sin(TURNED)) & covers).any())
+    return found
+
+
+def peak() -> float:
+    """Largest resident memory of this process so far, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def measure(way: str, segments: int, thick: float) -> dict[str, float | str]:
+    """One way on one building: seconds, MB above what the segments need, and what was found."""
+    small, _ = building(1000)
+    pieces, walls = building(segments, thick=thick)
+    midpoint = pieces.segments.mean(axis=1)
+    runs = {
+        "condense + fuse": lambda pieces: fuse(condense(pieces), gap=GAP)[0],
+        "merge_as_paper": lambda pieces: merge_as_paper(pieces, cut=CUT),
+        "single_linkage": lambda pieces: single_linkage(midpoint[: len(pieces)], CUT),
+        "scipy linkage(single)": lambda pieces: fcluster(linkage(midpoint[: len(pieces)], "single"), CUT, "distance"),
+    }
+    runs[way](small)  # imports, and the most common compilations
+    before, start = peak(), time.perf_counter()
+    try:
+        found = runs[way](pieces)
+    except (ValueError, MemoryError) as failure:
+        return {"failure": f"{type(failure).__name__}: {failure}"}
+    result: dict[str, float | str] = {"seconds": time.perf_counter() - start, "memory": peak() - before}
+    result["true"] = len(walls)
+    if isinstance(found, Pieces):
+        result |= {
+            "found": true_walls_found(found, walls),
+            "walls": len(found),
+            "confirmed": int((found.count > 4).sum()),
+        }
+    else:
+        result["walls"] = len(np.unique(found))
+    return result
+
+
+def in_a_process(way: str, segments: int, thick: float, limit: float) -> dict[str, float | str]:
+    """The same in a process of its own, so that its peak of memory is its own."""
+    call = [sys.executable, "-m", "benchmarks.mapping.segment_merging", "--one", way, str(segments), str(thick)]
+    try:
+        done = subprocess.run(call, capture_output=True, text=True, timeout=limit)
+    except subprocess.TimeoutExpired:
+        return {"failure": f"more than {limit:g} s"}
+    if done.returncode:
+        return {"failure": f"exit {done.returncode}: {done.stderr.strip().splitlines()[-1:]}"}
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def growth(one: tuple[int, float], other: tuple[int, float]) -> float:
+    """The exponent p of n^p between two measurements (n, value)."""
+    return math.log(other[1] / one[1]) / math.log(other[0] / one[0])
+
+
+def main() -> None:
+    """Measure and print."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--quick", action="store_true", help="1e3 and 1e4 segments instead of 1e4, 1e5 and 1e6")
+    options.add_argument("--thick", type=float, default=THICK, help="metres between rooms")
+    options.add_argument("--limit", type=float, default=600.0, help="seconds for each measurement")
+    options.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
+    options = options.parse_args()
+    if options.one:
+        way, segments, thick = options.one
+        print(json.dumps(measure(way, int(segments), float(thick))))
+        return
+    sizes = (1_000, 10_000) if options.quick else (10_000, 100_000, 1_000_000)
+    table = Table(
+        title=f"Segments of rooms of {ROOM[0]:g} m x {ROOM[1]:g} m, {options.thick:g} m apart; {EACH} a wall, "
+        f"{CLUTTER:.0%} clutter; gap {GAP} m, cut {CUT} m",
+        caption="memory: growth of the largest resident set (ru_maxrss); growth: p of n^p from the row above, in "
+        f"brackets that of n log n; of > 4: walls made of more than 4 segments. numpy {np.__version__}, "
+        f"jax {jax.__version__} on {jax.devices()[0].device_kind}, {os.cpu_count()} cores, "
+        f"Python {platform.python_version()}",
+    )
+    for column in ("", "segments", "s", "us/seg.", "growth", "MB", "walls true", "found", "made", "of > 4", "x fuse"):
+        table.add_column(column, justify="left" if not column else "right")
+    whole: dict[int, float] = {}
+    for way in WAYS:
+        last: tuple[int, float] | None = None
+        for size in sizes:
+            if way.startswith("scipy") and size > PEER_UP_TO:
+                continue
+            got = in_a_process(way, size, options.thick, options.limit)
+            if "failure" in got:
+                table.add_row(way, f"{size:,}", str(got["failure"]))
+                continue
+            seconds = float(got["seconds"])
+            if way == WAYS[0]:
+                whole[size] = seconds
+            nlogn = growth((last[0], last[0] * math.log(last[0])), (size, size * math.log(size))) if last else 0
+            table.add_row(
+                way,
+                f"{size:,}",
+                f"{seconds:.2f}",
+                f"{seconds / size * 1e6:.1f}",
+                f"{growth(last, (size, seconds)):.2f} ({nlogn:.2f})" if last else "",
+                f"{got['memory']:.0f}",
+                *(f"{got[name]:,}" if name in got else "" for name in ("true", "found", "walls", "confirmed")),
+                f"{seconds / whole[size]:.2f}" if size in whole else "",
+            )
+            last = (size, seconds)
+    Console(width=130).print(table)
+
+
+if __name__ == "__main__":
+    main()

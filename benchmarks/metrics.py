@@ -1,0 +1,232 @@
+"""What the suite measures, where, and whether it got worse: Metric, the JSON file, the baseline and its gate.
+
+A ratio holds a time of jaxsonar against one that was taken in the same run, so that it means something on another
+machine. Only ratios have a tolerance, and only they are in the baseline.
+"""
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from jaxsonar.fileio.atomic_files import atomic_write, reason
+from jaxsonar.hardware.errors import SonarError
+
+BASELINE = Path(__file__).with_name("baseline.json")
+RATIO = "x"
+"""The unit of ratios."""
+SIZES = ("gate", "quick", "full")
+"""How much is measured: what CI holds against the baseline, a minute, everything."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One figure."""
+
+    key: str
+    """Workload, what, and against what: ``throughput.hough:numpy``."""
+    value: float
+    """NaN: not measured here."""
+    unit: str
+    """``x`` for a ratio."""
+    direction: Literal["higher", "lower"] = "lower"
+    """Which is better."""
+    tolerance: float | None = None
+    """Factor by which it may be worse than the baseline; None: no part of the gate."""
+    target: float | None = None
+    """Wanted at least (higher) or at most (lower)."""
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the target is met; None without one, or without a value."""
+        if self.target is None or self.value != self.value:
+            return None
+        return self.value >= self.target if self.direction == "higher" else self.value <= self.target
+
+    def worse(self, than: float) -> float:
+        """Factor by which this is worse than another value; infinite if it was not measured."""
+        if not (self.value > 0 and than > 0):
+            return float("inf")
+        return than / self.value if self.direction == "higher" else self.value / than
+
+    def better(self, other: "Metric") -> "Metric":
+        """The better one of two measurements."""
+        return other if other.worse(self.value) < 1 or self.value != self.value else self
+
+
+@dataclass(frozen=True)
+class Options:
+    """What was asked for."""
+
+    size: str = "full"
+    """Which of SIZES."""
+    seed: int = 0
+    """Of rooms, poses and noise."""
+
+    def pick(self, *, gate: int, quick: int, full: int) -> int:
+        """A number by size."""
+        return {"gate": gate, "quick": quick, "full": full}[self.size]
+
+
+@dataclass(frozen=True)
+class Results:
+    """What one run measured, and where."""
+
+    environment: dict[str, Any]
+    options: dict[str, Any]
+    metrics: dict[str, Metric]
+    """By key."""
+
+    @classmethod
+    def of(cls, metrics: Iterable[Metric], options: Mapping[str, Any]) -> "Results":
+        """Metrics of this process, on this machine."""
+        return cls(environment(), dict(options), {metric.key: metric for metric in metrics})
+
+    def value(self, key: str) -> float:
+        """NaN for what was not measured."""
+        return self.metrics[key].value if key in self.metrics else float("nan")
+
+    def save(self, path: Path) -> None:
+        """As JSON; NaN as null."""
+        told: dict[str, Any] = {"environment": self.environment, "options": self.options}
+        told["metrics"] = [
+            asdict(metric) | {"value": None if metric.value != metric.value else metric.value}
+            for metric in self.metrics.values()
+        ]
+        with atomic_write(path) as file:
+            json.dump(told, file, indent=1, allow_nan=False)
+            file.write("\n")
+
+    @classmethod
+    def load(cls, path: Path) -> "Results":
+        """What ``save`` wrote.
+
+        Raises:
+            SonarError: this is something else.
+        """
+        told = _read(path, "metrics", "environment", "options")
+        names = {one.name for one in fields(Metric)}
+        metrics = []
+        for told_of in told["metrics"]:
+            row: dict[str, Any] = {key: told_of[key] for key in names}
+            row["value"] = float("nan") if row["value"] is None else row["value"]
+            metrics.append(Metric(**row))
+        return cls(told["environment"], told["options"], {one.key: one for one in metrics})
+
+
+def environment() -> dict[str, Any]:
+    """What the numbers hang on."""
+    import jax
+
+    names = ("jaxsonar", "jax", "jaxlib", "numpy", "scipy", "opencv-python-headless", "numba", "scikit-image")
+    return {
+        "device": jax.devices()[0].device_kind,
+        "platform": jax.devices()[0].platform,
+        "processor": _processor(),
+        "cores": available_cores(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        **{name: _version(name) for name in names},
+        "commit": _commit(),
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def available_cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """The commit, with ``+`` if files differ from it; None where there is no git, or no repository."""
+    root = Path(__file__).parent
+
+    def git(*call: str) -> str:
+        return subprocess.run(["git", *call], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def ratios(metrics: Iterable[Metric]) -> dict[str, Metric]:
+    """Those that the gate looks at."""
+    return {one.key: one for one in metrics if one.unit == RATIO and one.tolerance is not None}
+
+
+def save_baseline(results: Results, path: Path = BASELINE) -> None:
+    """Keep the ratios of a gate run."""
+    rows = {
+        key: {"value": round(one.value, 4), "direction": one.direction, "tolerance": one.tolerance}
+        for key, one in ratios(results.metrics.values()).items()
+    }
+    with atomic_write(path) as file:
+        json.dump({"environment": results.environment, "ratios": rows}, file, indent=1)
+        file.write("\n")
+
+
+def load_baseline(path: Path = BASELINE) -> dict[str, Any]:
+    """What ``save_baseline`` wrote.
+
+    Raises:
+        SonarError: this is something else.
+    """
+    return _read(path, "ratios")
+
+
+def _read(path: Path, *keys: str) -> dict[str, Any]:
+    """A JSON object that has these keys."""
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as failure:
+        raise SonarError(f"{path}: {reason(failure)}; needed is a file that this suite wrote") from None
+    if not isinstance(told, dict) or not set(keys) <= set(told):
+        raise SonarError(f"{path}: no {', '.join(keys)} in it; needed is a file that this suite wrote")
+    return told
+
+
+def failures(metrics: Mapping[str, Metric], baseline: Mapping[str, Any], only: Iterable[str] = ()) -> dict[str, str]:
+    """Ratios that are worse than the baseline by more than its tolerance, or missing: key, and what is wrong.
+
+    Args:
+        metrics: what was measured.
+        baseline: what is held against it.
+        only: workloads that were measured; all if left out.
+    """
+    only, wrong = set(only), {}
+    for key, was in baseline["ratios"].items():
+        if only and key.partition(".")[0] not in only:
+            continue
+        if key not in metrics:
+            wrong[key] = f"{key}: not measured; the baseline has {was['value']:g}"
+            continue
+        worse = metrics[key].worse(was["value"])
+        if worse > was["tolerance"]:
+            wrong[key] = (
+                f"{key}: {metrics[key].value:.3g} x, {worse:.2f} times worse than the baseline's {was['value']:.3g} x; "
+                f"allowed is {was['tolerance']:g} times"
+            )
+    return wrong

@@ -1,0 +1,450 @@
+"""How far from the truth poses are that nobody measured, how near to what is possible, and how long a step takes.
+
+Run ``python -m benchmarks.slam.accuracy [--quick] [-o FILE]``. Places are those of ``slam_scenes``: one scan in a known room,
+the office, twenty corridors in rings with rooms, two rooms that look alike, a bare corridor, and a run of 10,000 scans;
+the paper's ring, sigma 1 mm, odometry wrong by 2 % and 1 deg after one metre. Errors are those of the poses with the
+first one in its place (ATE), and are held against odometry and against the Cramer-Rao bound (``slam_bound``).
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.detection.accuracy import versions, without_nan
+from benchmarks.slam.cramer_rao import Bound, bound, pose_bound
+from benchmarks.slam.scenarios import (
+    DISTANCE,
+    SIGMA,
+    TURN,
+    Scene,
+    corridor,
+    echoes_alone,
+    long_run,
+    loop,
+    office,
+    one_scan,
+    twins,
+)
+from jaxsonar import GlobalMap, SonarError
+from jaxsonar.estimation.trajectory import Trajectory, errors
+from jaxsonar.evaluation.map_accuracy import evaluate
+from jaxsonar.fileio.atomic_files import atomic_write, make_folder
+from jaxsonar.geometry.se2 import relative, to_world, wrap_angle
+from jaxsonar.graph_slam.slam import Tie
+from jaxsonar.mapping.global_map import map_of
+
+WAYS: dict[str, dict[str, Any]] = {"smoothed": {"smooth": True}, "front end": {"smooth": False}}
+"""What ``run_slam`` is told, besides how wrong the odometry is, which the bound knows, too."""
+WRONG = 0.3, float(np.radians(10.0))
+"""Metres and radians by which a closure may be off the truth; corridors look alike at more than that."""
+GUESS = 0.1, float(np.radians(5.0))
+"""Standard deviation of what is known of the pose before the one scan in a known room, metres and radians."""
+_NO_WHEELS = 1e3  # m, rad; what odometry that is none is wrong by
+LOST = 1.0
+"""Metres; a run that is worse than this found itself in another place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What came of one run."""
+
+    trajectory: Trajectory
+    """Of the scans that could be placed, by their stamps."""
+    world: GlobalMap
+    closures: Sequence[Tie]
+    step_ms: Float[np.ndarray, " scans"]
+    """Of everything that a scan costs while the robot drives."""
+
+
+def run_slam(scene: Scene, seed: int, way: str) -> Run:
+    """The one call of the library's SLAM."""
+    from jaxsonar.estimation.odometry_noise import Slip
+    from jaxsonar.graph_slam.slam import slam
+
+    slip = Slip(place=DISTANCE, heading=TURN, turn=DISTANCE)
+    choices = WAYS[way] if scene.wheels else {}  # placed by the ranges, there is no front end
+    got = slam(scene.ring, scene.log(seed), slip=slip, live=True, **choices)
+    return Run(got.trajectory, got.world, got.closures, np.asarray(got.step_ms))
+
+
+def run_one_scan(scene: Scene, seed: int) -> Trajectory:
+    """The pose of one scan in a room whose walls are known, from a guess beside the truth; none where it is unsure."""
+    from jaxsonar.localization.localize import localize
+
+    sd = np.array([GUESS[0], GUESS[0], GUESS[1]])
+    start = scene.poses[0] + sd * np.random.default_rng(seed).standard_normal(3)
+    return localize(scene.ring, map_of(scene.room), scene.log(seed), start=start.tolist()).trajectory
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One run against the truth: metres, radians, milliseconds."""
+
+    scenario: str
+    way: str
+    failed: str = ""
+    """Why there is no result."""
+    scans: int = 0
+    metres: float = np.nan
+    odometry: float = np.nan
+    """Absolute trajectory errors (RMS, first poses in one place)."""
+    odometry_heading: float = np.nan
+    odometry_aligned: float = np.nan
+    placed: float = np.nan
+    """Share of the scans that got a pose."""
+    ate: float = np.nan
+    ate_heading: float = np.nan
+    aligned: float = np.nan
+    """The same of the best alignment, as evo has it."""
+    relative: float = np.nan
+    """Per metre of way."""
+    bound: float = np.nan
+    """Of the ATE, by Cramer and Rao."""
+    bound_heading: float = np.nan
+    nees: float = np.nan
+    made: int = 0
+    wrong: int = 0
+    withdrawn: int = 0
+    missed: float = np.nan
+    """Share of the walls that were heard that the map does not have."""
+    false: float = np.nan
+    """Share of the map's length that is no wall."""
+    walls: float = np.nan
+    """Distance of the map's walls from the true ones (RMS of those within 0.15 m, 10 deg)."""
+    walls_bound: float = np.nan
+    p50: float = np.nan
+    p99: float = np.nan
+    first: float = np.nan
+    """Milliseconds of the first step, compilation and all."""
+    growth: float = np.nan
+    """Median time of the last tenth of the steps over that of the second tenth."""
+    seconds: float = np.nan
+
+
+def outcome(scene: Scene, way: str, least: Bound, *, seed: int = 0) -> Outcome:
+    """Run once, and hold it against the truth.
+
+    Args:
+        scene: the place.
+        way: one of ``WAYS``.
+        least: what is possible there.
+        seed: of the odometry.
+    """
+    truth = Trajectory(scene.heard.stamps, scene.poses)
+    told = Trajectory(truth.stamp, scene.odometry(seed))
+    wheels = errors(told, truth, align="first")
+    base = Outcome(
+        scene.name.rstrip("0123456789 "),
+        way,
+        scans=len(truth),
+        metres=scene.way,
+        odometry=wheels.ate if scene.wheels else np.nan,
+        odometry_heading=wheels.ate_heading if scene.wheels else np.nan,
+        odometry_aligned=errors(told, truth).ate if scene.wheels else np.nan,
+        bound=least.ate,
+        bound_heading=least.ate_heading,
+        walls_bound=_rms(np.sqrt(least.distance)),
+    )
+    begin = time.perf_counter()
+    try:
+        got = run_slam(scene, seed, way)
+    except (ImportError, SonarError) as error:
+        return replace(base, failed=str(error))
+    seconds = time.perf_counter() - begin
+    if not len(got.trajectory):
+        return replace(base, failed="no scan was placed")
+    own, best = errors(got.trajectory, truth, align="first"), errors(got.trajectory, truth)
+    counted = [one for one in got.closures if one.state == "counted"]
+    return replace(
+        base,
+        placed=own.poses / len(truth),
+        ate=own.ate,
+        ate_heading=own.ate_heading,
+        aligned=best.ate,
+        relative=own.relative,
+        nees=own.nees,
+        made=len(counted),
+        wrong=sum(wrong(scene.poses, one) for one in counted),
+        withdrawn=sum(one.state == "withdrawn" for one in got.closures),
+        seconds=seconds,
+        **_map_measures(scene, got.world, np.zeros(3) if scene.wheels else best.truth_from_estimate),
+        **_times(got.step_ms),
+    )
+
+
+def wrong(poses: Float[np.ndarray, "scans 3"], tie: Tie) -> bool:
+    """Whether a closure says something else than the truth does, in what it determines."""
+    off = tie.pose - relative(poses[tie.first], poses[tie.second])
+    off[2] = wrap_angle(float(off[2]))
+    off = tie.determined @ (tie.determined.T @ off)
+    return bool(np.hypot(off[0], off[1]) > WRONG[0] or abs(off[2]) > WRONG[1])
+
+
+def _map_measures(scene: Scene, world: GlobalMap, frame: Float[np.ndarray, "3"]) -> dict[str, float]:
+    """Of a map, after it was moved by ``frame``."""
+    found = evaluate(to_world(frame, world.segments), scene.room.walls)
+    heard = np.unique(scene.heard.reflector[scene.heard.kind == 0])
+    covered = found.reference_covered[heard] >= found.reference_length[heard] / 2
+    return {
+        "missed": float(1 - covered.mean()) if len(heard) else np.nan,
+        "false": 1 - found.precision_length,
+        "walls": _rms(found.distance),
+    }
+
+
+def _times(step_ms: Float[np.ndarray, " scans"]) -> dict[str, float]:
+    """Percentiles of the steps but the first one, which compiles."""
+    if len(step_ms) < 2:
+        return {}
+    steps, tenth = step_ms[1:], max(len(step_ms) // 10, 1)
+    growth = float(np.median(step_ms[-tenth:]) / np.median(step_ms[tenth : 2 * tenth])) if tenth > 9 else np.nan
+    p50, p99 = np.percentile(steps, [50, 99]).tolist()
+    return {"p50": p50, "p99": p99, "first": float(step_ms[0]), "growth": growth}
+
+
+def one_scans(count: int, *, progress: Callable[[str], None] = lambda what: None) -> list[Outcome]:
+    """One scan in each of so many known rooms; the guess that it begins with counts as odometry."""
+    found = []
+    for seed in range(count):
+        scene = one_scan(seed)
+        least = pose_bound(scene)[0]
+        base = Outcome(
+            "one scan, known room",
+            "localized",
+            scans=1,
+            metres=0.0,
+            odometry=GUESS[0] * np.sqrt(2),
+            odometry_heading=GUESS[1],
+            bound=float(np.sqrt(least[0, 0] + least[1, 1])),
+            bound_heading=float(np.sqrt(least[2, 2])),
+        )
+        begin = time.perf_counter()
+        try:
+            got = run_one_scan(scene, seed)
+        except (ImportError, SonarError) as error:
+            found.append(replace(base, failed=str(error)))
+            continue
+        seconds = time.perf_counter() - begin
+        if not len(got):
+            found.append(replace(base, failed="no scan was placed"))
+            continue
+        own = errors(got, Trajectory(scene.heard.stamps, scene.poses), align="none")
+        found.append(
+            replace(base, placed=1.0, ate=own.ate, ate_heading=own.ate_heading, nees=own.nees, seconds=seconds)
+        )
+        progress(_told(found[-1]))
+    return found
+
+
+def measures(some: Sequence[Outcome]) -> dict[str, Any]:
+    """Over the runs of one scenario and way; errors are root mean squares, counts sums."""
+    good = [one for one in some if not one.failed]
+    mean = lambda name: _mean([getattr(one, name) for one in good])  # noqa: E731
+    squared = lambda name, of: _rms([getattr(one, name) for one in of])  # noqa: E731
+    against = [one.ate / one.bound for one in good]
+    return {
+        "scenario": some[0].scenario,
+        "way": some[0].way,
+        "runs": len(some),
+        "failed": len(some) - len(good),
+        "scans": sum(one.scans for one in some),
+        "metres": _mean([one.metres for one in some]),
+        "odometry_mm": 1e3 * squared("odometry", some),
+        "odometry_deg": float(np.degrees(squared("odometry_heading", some))),
+        "placed": mean("placed"),
+        "ate_mm": 1e3 * squared("ate", good),
+        "ate_deg": float(np.degrees(squared("ate_heading", good))),
+        "worst_mm": 1e3 * max((one.ate for one in good), default=np.nan),
+        "lost": sum(bool(one.ate > LOST) for one in good),
+        "tenth": sum(bool(one.ate <= one.odometry / 10) for one in good),
+        "aligned_mm": 1e3 * squared("aligned", good),
+        "tenth_aligned": sum(bool(one.aligned <= one.odometry_aligned / 10) for one in good),
+        "ratio": squared("odometry", good) / squared("ate", good) if good else np.nan,
+        "bound_mm": 1e3 * squared("bound", some),
+        "bound_deg": float(np.degrees(squared("bound_heading", some))),
+        "per_bound": _median(against),
+        "nees": mean("nees"),
+        "nees_median": _median([one.nees for one in good]),
+        "made": sum(one.made for one in good),
+        "wrong": sum(one.wrong for one in good),
+        "withdrawn": sum(one.withdrawn for one in good),
+        "walls_mm": 1e3 * squared("walls", good),
+        "walls_bound_mm": 1e3 * squared("walls_bound", some),
+        "missed": mean("missed"),
+        "false": mean("false"),
+        "p50": _median([one.p50 for one in good]),
+        "p99": max((one.p99 for one in good), default=np.nan),
+        "growth": mean("growth"),
+        "seconds": sum(one.seconds for one in good),
+        "why": next((one.failed for one in some if one.failed), ""),
+        "each": [asdict(one) for one in some],
+    }
+
+
+def _rms(values: Sequence[float] | np.ndarray) -> float:
+    known = np.asarray(values, dtype=float)
+    known = known[np.isfinite(known)]
+    return float(np.sqrt(np.mean(np.square(known)))) if len(known) else np.nan
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.mean(known)) if known else np.nan
+
+
+def _median(values: Sequence[float]) -> float:
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.median(known)) if known else np.nan
+
+
+def run(
+    makers: Mapping[str, Sequence[Callable[[], Scene]]],
+    ways: Sequence[str],
+    *,
+    ones: int,
+    progress: Callable[[str], None] = lambda what: None,
+) -> list[dict[str, Any]]:
+    """Everything.
+
+    Args:
+        makers: scenarios, and what makes each of their scenes.
+        ways: some of ``WAYS``.
+        ones: how many rooms for one scan each.
+        progress: told what was done.
+    """
+    table = [measures(one_scans(ones, progress=progress))] if ones else []
+    for some in makers.values():
+        outcomes: dict[str, list[Outcome]] = {way: [] for way in ways}
+        for make in some:
+            scene = make()
+            least = bound(scene) if scene.wheels else bound(scene, distance=_NO_WHEELS, turn=_NO_WHEELS)
+            for way in ways:
+                outcomes[way].append(outcome(scene, way, least))
+                progress(_told(outcomes[way][-1]))
+        table += [measures(outcomes[way]) for way in ways if some]
+    return table
+
+
+def _told(one: Outcome) -> str:
+    head = f"{one.scenario}, {one.way}, {one.scans} scans, {one.metres:.1f} m"
+    if one.failed:
+        return f"{head}: {one.failed}"
+    return (
+        f"{head}: {1e3 * one.ate:.1f} mm {np.degrees(one.ate_heading):.2f} deg, odometry {1e3 * one.odometry:.0f} mm, "
+        f"best aligned {1e3 * one.aligned:.1f} mm, odometry {1e3 * one.odometry_aligned:.0f} mm, "
+        f"bound {1e3 * one.bound:.1f} mm, NEES {one.nees:.2f}, closures {one.made}, wrong {one.wrong}, "
+        f"withdrawn {one.withdrawn}, walls {1e3 * one.walls:.1f} mm, {one.p50:.1f}/{one.p99:.1f} ms, "
+        f"{one.seconds:.1f} s"
+    )
+
+
+COLUMNS = {
+    "runs": ("runs", 0),
+    "failed": ("failed", 0),
+    "m": ("metres", 0),
+    "odo. mm": ("odometry_mm", 0),
+    "deg": ("odometry_deg", 2),
+    "placed %": ("placed", 0),
+    "ATE mm": ("ate_mm", 1),
+    "deg ": ("ate_deg", 2),
+    "worst": ("worst_mm", 0),
+    "lost": ("lost", 0),
+    "better": ("ratio", 1),
+    "tenth": ("tenth", 0),
+    "best mm": ("aligned_mm", 1),
+    "tenth ": ("tenth_aligned", 0),
+    "CRB mm": ("bound_mm", 1),
+    "deg  ": ("bound_deg", 2),
+    "/CRB": ("per_bound", 2),
+    "NEES": ("nees", 2),
+    "med.": ("nees_median", 2),
+    "made": ("made", 0),
+    "wrong": ("wrong", 0),
+    "withdr.": ("withdrawn", 0),
+    "walls mm": ("walls_mm", 1),
+    "CRB": ("walls_bound_mm", 1),
+    "missed %": ("missed", 0),
+    "false %": ("false", 0),
+    "p50 ms": ("p50", 1),
+    "p99": ("p99", 1),
+    "grows": ("growth", 2),
+    "s": ("seconds", 0),
+}
+"""Heading, name in ``measures``, digits."""
+
+
+def table(told: dict[str, Any]) -> Table:
+    """What is printed, from what the JSON file holds."""
+    v, s = told["versions"], told["settings"]
+    shown = Table(
+        title=f"SLAM, paper's ring, sigma {1e3 * s['sigma']:g} mm, odometry {100 * s['distance']:g} % and "
+        f"{np.degrees(s['turn']):g} deg after 1 m",
+        caption="ATE: RMS over scans and runs, first poses in one place; worst, lost: of the runs, lost beyond 1 m; "
+        "better: odometry over ATE; tenth: runs whose ATE is at most a tenth of odometry's; best: ATE of the best "
+        "alignment, and the tenth of that; CRB: what is possible; /CRB: median over the runs; NEES: over degrees of "
+        "freedom, mean and median of the runs, 1 is right; closures made, wrong of these, withdrawn; walls: distance "
+        "of the map's from the true ones; missed: of the walls that were heard; false: of the map's length; p99: "
+        "of the slowest run; grows: last tenth of the steps over the second. Echoes alone: sigma 5 mm, no odometry, "
+        "walls after the best alignment. "
+        f"jax {v['jax']} on {v['device']}, {v['commit'][:10]}",
+    )
+    for column in ["", *COLUMNS]:
+        shown.add_column(column.rstrip(), justify="right" if column else "left", no_wrap=True)
+    for row in told["scenarios"]:
+        cells = []
+        for heading, (name, digits) in COLUMNS.items():
+            value = row[name]
+            scale = 100 if heading.endswith("%") else 1
+            cells.append("" if value is None else f"{scale * value:.{digits}f}")
+        shown.add_row(f"{row['scenario']}, {row['way']}", *cells)
+    return shown
+
+
+def main() -> None:
+    """Measure, print."""
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--quick", action="store_true", help="few seeds, and a long run of 1000 scans")
+    options.add_argument("--seeds", type=int, help="rings of corridors, and rooms; 20, with --quick 3")
+    options.add_argument("--scans", type=int, help="of the long run; 10000, with --quick 1000; 0 = none")
+    options.add_argument("--only", metavar="TEXT", help="scenarios whose name holds this")
+    options.add_argument("--way", choices=tuple(WAYS), help="one of the two; default: both, the long run smoothed")
+    options.add_argument("-o", "--output", type=Path, default=Path("benchmark-results/slam.json"))
+    options = options.parse_args()
+    seeds = options.seeds or (3 if options.quick else 20)
+    scans = (1000 if options.quick else 10_000) if options.scans is None else options.scans
+    wanted = lambda name: options.only is None or options.only in name  # noqa: E731
+    makers: dict[str, list[Callable[[], Scene]]] = {
+        "office": [office],
+        "echoes alone": [lambda k=k: echoes_alone(k) for k in range(max(seeds // 3, 1))],
+        "loop": [lambda k=k: loop(k) for k in range(seeds)],
+        "twin rooms": [lambda k=k: twins(k) for k in range(max(seeds // 4, 1))],
+        "corridor": [lambda k=k: corridor(k) for k in range(max(seeds // 4, 1))],
+    }
+    makers = {name: some for name, some in makers.items() if wanted(name)}
+    ways = [options.way] if options.way else list(WAYS)
+    stderr = Console(stderr=True)
+    say = lambda what: stderr.print(what, highlight=False, soft_wrap=True)  # noqa: E731
+    found = run(makers, ways, ones=seeds if wanted("one scan, known room") else 0, progress=say)
+    if scans and wanted("long run"):
+        found += run({"long run": [lambda: long_run(scans=scans)]}, [options.way or "smoothed"], ones=0, progress=say)
+    settings = {"seeds": seeds, "scans": scans, "sigma": SIGMA, "distance": DISTANCE, "turn": TURN}
+    told = without_nan({"versions": versions(), "settings": settings, "scenarios": found})
+    make_folder(options.output.parent)
+    with atomic_write(options.output) as file:
+        json.dump(told, file, indent=1, allow_nan=False)
+    Console(width=300).print(table(told))
+    for why in sorted({row["why"] for row in told["scenarios"]} - {""}):
+        say(why)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,158 @@
+"""A ring of 24 sensors on a TCP link, many times as fast as sound allows: rate, drops, latency, and memory.
+
+    python -m benchmarks.speed.streaming            ten minutes at 50 times real time, lines by method hough
+    python -m benchmarks.speed.streaming --quick    the same for 20 s
+    python -m benchmarks.speed.streaming --speed 1 --method ml --map    what a robot sees
+
+The device is a process of its own (``--device``). A device that is played back too fast is waited for, not dropped
+from; so the row "times real time" says what rate was reached, and "latest" by how much the device fell behind.
+"""
+
+import argparse
+import itertools
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxsonar import simulate
+from jaxsonar.hardware.device_emulator import emulate
+from jaxsonar.hardware.messages import Group, Message
+from jaxsonar.hardware.transport_servers import listen
+from jaxsonar.live.stream import Status, stream
+from jaxsonar.simulation.device_messages import log_messages
+from jaxsonar.simulation.office import load_office
+
+SCAN = 8 * 2 * 2.0 / 343.2
+"""Seconds that 8 firing groups take for 2 m."""
+SETTLED = 0.2
+"""Share of the time after which memory should no longer grow."""
+
+
+def endless(scans: float) -> Iterator[Message]:
+    """The office again and again, as one device that never starts anew."""
+    office = load_office()
+    stamps = SCAN * np.arange(len(office.poses))
+    heard = simulate(office.ring, office.room, office.poses, sigma=0.002, seed=0, stamps=stamps)
+    sent = list(log_messages(heard.as_log(office.ring, office.poses), office.ring))
+    turn = round(1e6 * SCAN * len(stamps))
+    for k in itertools.count():
+        for message in sent:
+            if isinstance(message, Group) and message.scan + k * len(stamps) >= scans:
+                return
+            shifted = {"sequence": message.sequence + k * len(sent), "time_us": message.time_us + k * turn}
+            if isinstance(message, Group):
+                shifted["scan"] = message.scan + k * len(stamps)
+            yield replace(message, **shifted)
+
+
+def device(speed: float, seconds: float) -> None:
+    """Be the device, as ``jaxsonar emulate`` is."""
+    with listen("tcp://127.0.0.1:0") as sink:
+        print(f"listening on {sink.url}", flush=True)
+        done = emulate(endless(seconds * speed / SCAN), sink, speed=speed)
+        print(f"latest {done.latest:.3f}", flush=True)
+
+
+def memory() -> float:
+    """What this process holds now, MB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+
+
+def run(
+    *, speed: float, seconds: float, method: str, mapping: bool, record: str | None
+) -> list[tuple[str, float, str]]:
+    """One stream; rows of name, value and unit."""
+    call = [
+        sys.executable,
+        "-m",
+        "benchmarks.speed.streaming",
+        "--device",
+        "--speed",
+        str(speed),
+        "--seconds",
+        str(seconds),
+    ]
+    process = subprocess.Popen(call, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    url = process.stdout.readline().removeprefix("listening on ").strip()
+    samples: list[tuple[float, float, int]] = []
+    longest = 0
+
+    def sample(status: Status) -> None:
+        nonlocal longest
+        now = time.monotonic()
+        longest = max(longest, status.waiting)
+        if status.warm and (not samples or now - samples[-1][0] >= 1.0):
+            samples.append((now, memory(), status.scans))
+            if len(samples) % 10 == 0:
+                print(f"{status.line()}, {samples[-1][1]:.0f} MB", file=sys.stderr, flush=True)
+
+    office = load_office()
+    with tempfile.TemporaryDirectory() as folder:
+        status = stream(
+            url,
+            office.ring,
+            method=method,
+            map_path=Path(folder) / "map.geojson" if mapping else None,
+            record=None if record is None else Path(folder) / f"record{record}",
+            on_status=sample,
+            stop=threading.Event(),
+        )
+    said = re.search(r"latest ([\d.]+)", process.communicate(timeout=60)[0])
+    times, held, scans = (np.array(column) for column in zip(*samples, strict=True))
+    settled = times > times[0] + SETTLED * (times[-1] - times[0])
+    slope = np.polyfit((times[settled] - times[0]) / 60, held[settled], 1)[0] if settled.sum() > 2 else np.nan
+    rate = (scans[-1] - scans[0]) / (times[-1] - times[0])
+    counts = status.counts
+    return [
+        ("scans", status.scans, ""),
+        ("scans a second", rate, "1/s"),
+        ("times real time", rate * SCAN, ""),
+        ("latest of the device", float(said[1]) if said else np.nan, "s"),
+        ("dropped", counts["dropped"], "scans"),
+        ("damaged, lost, missing", counts["rejected"] + counts["lost"] + counts["missing"], ""),
+        ("longest queue", longest, "scans"),
+        ("latency, median", 1e3 * status.p50, "ms"),
+        ("latency, 99th percentile", 1e3 * status.p99, "ms"),
+        ("memory once settled", float(held[settled][0]), "MB"),
+        ("memory at the end", float(held[-1]), "MB"),
+        ("growth once settled", float(slope), "MB/min"),
+    ]
+
+
+def main() -> None:
+    """Run it and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="20 s")
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--speed", type=float, default=50.0)
+    parser.add_argument("--method", choices=("ml", "hough"), default="hough")
+    parser.add_argument("--map", action="store_true", help="build the map, too")
+    parser.add_argument("--record", choices=(".csv", ".parquet", ".mcap"), help="record, too")
+    parser.add_argument("--device", action="store_true", help="be the device")
+    options = parser.parse_args()
+    seconds = 20.0 if options.quick else options.seconds
+    if options.device:
+        device(options.speed, seconds)
+        return
+    record = options.record
+    rows = run(speed=options.speed, seconds=seconds, method=options.method, mapping=options.map, record=record)
+    what = f"{options.method}{', map' if options.map else ''}{f', {record}' if record else ''}"
+    print(f"{seconds:g} s at {options.speed:g} times real time, {what}")
+    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {platform.machine()}")
+    for name, value, unit in rows:
+        print(f"{name:26} {value:12.4g} {unit}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""A calibrated ring as a file: the ring as ``load_ring`` takes it, and how well its parameters are known."""
+
+import os
+from typing import Any
+
+import numpy as np
+import tomli_w
+from jaxtyping import Float
+
+from jaxsonar.calibration.calibrate import Calibration
+from jaxsonar.fileio.atomic_files import open_output
+from jaxsonar.sensors.ring_toml import ring_toml
+
+_DIGITS = 8  # behind the point: 10 nm
+
+
+def save_calibration(calibration: Calibration, path: str | os.PathLike[str]) -> None:
+    """Write the ring with its table ``[calibration]``; ``-`` is standard output.
+
+    Args:
+        calibration: what was found.
+        path: the file, replaced only once all is written.
+
+    Raises:
+        SonarError: the place cannot be written.
+    """
+    text = ring_toml(calibration.ring, each=True) + "\n" + tomli_w.dumps({"calibration": as_table(calibration)})
+    with open_output(path) as file:
+        file.write(text)
+
+
+def as_table(calibration: Calibration) -> dict[str, Any]:
+    """The table ``[calibration]``: plain numbers; metres, metres per second, degrees where the name says so."""
+    table: dict[str, Any] = {
+        "estimated": list(calibration.free),
+        "scans": calibration.scans,
+        "echoes": calibration.echoes,
+        "echoes_explained": len(calibration.residuals),
+        "sigma": _short(calibration.sigma),
+        "residual_rms_before": _short(calibration.rms_before),
+        "residual_rms_after": _short(calibration.rms),
+    }
+    if "offset" in calibration.free:
+        table["range_offset_sd"] = _list(calibration.range_offset_sd)  # relative to their mean, see README
+        if "mean_offset" not in calibration.held:
+            table["mean_offset_sd"] = _short(calibration.mean_offset_sd)
+    if "speed" in calibration.free:
+        table["speed_of_sound_sd"] = _short(calibration.speed_of_sound_sd)
+    if "radius" in calibration.free:
+        table["radius"], table["radius_sd"] = (_short(value) for value in calibration.radius)
+    if "position" in calibration.free:
+        table["x_sd"], table["y_sd"] = (_list(column) for column in calibration.position_sd.T)
+    if "offset" in calibration.free and {"position", "radius"} & set(calibration.free):
+        correction, sd = calibration.effective_correction
+        table["effective_correction"], table["effective_correction_sd"] = _list(correction), _list(sd)
+    if "heading" in calibration.free:
+        table["heading_sd_deg"] = _list(np.degrees(calibration.heading_sd))
+    table["held"] = dict(calibration.held)
+    table["correlations"] = [
+        {"between": [a, b], "value": round(value, 3)} for a, b, value in calibration.correlations()
+    ]
+    return table
+
+
+def _short(value: float) -> float:
+    return round(float(value), _DIGITS)
+
+
+def _list(values: Float[np.ndarray, " sensors"]) -> list[float]:
+    return [_short(value) for value in values]

@@ -1,0 +1,180 @@
+"""A map as the scene that echoes are compared with: every wall, corner and edge, and what may be heard of them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxsonar import kernels
+from jaxsonar.detection.extract import LocalModel, local_models
+from jaxsonar.geometry.se2 import unit
+from jaxsonar.mapping.build_map import assemble, build_map, gather_evidence
+from jaxsonar.mapping.global_map import GlobalMap
+from jaxsonar.mapping.point_landmarks import cluster, condense
+from jaxsonar.scans.echo_batches import power_of_two
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.ring import Ring
+
+_MEETS = 0.3  # m; walls that end this near to where their lines cross make a corner
+_SQUARE = float(np.radians(15.0))  # off a right angle; from there on a corner does not reflect back
+_OF_CORNER = 0.08  # m; a corner of the map this near to where two walls meet is theirs
+_TWICE = 2  # scans that see a point
+_ROOM = 16
+
+
+def seen_world(ring: Ring, log: Log, *, window: float | None, models: Sequence[LocalModel] | None = None) -> GlobalMap:
+    """The map of a log, with every corner and edge that two scans saw, however little they agree where.
+
+    A map keeps only points that stand still; before ring and poses are adjusted they do not.
+
+    Args:
+        ring: the sensors.
+        log: scans with poses.
+        window: metres of path for a local model, where single scans are sparse.
+        models: the local models of the log, where they are known already; without a window they need no poses.
+    """
+    if window is not None:
+        return build_map(ring, log, window=window)
+    evidence = gather_evidence(ring, log, local_models(ring, log) if models is None else models)
+    world = assemble(evidence)
+    found, _ = cluster(condense(evidence.points))
+    apart = np.linalg.norm(found.place[:, None] - world.points[None], axis=-1).min(axis=1, initial=np.inf)
+    more = found.take((found.times >= _TWICE) & (apart > _OF_CORNER))
+    return replace(
+        world,
+        points=np.concatenate([world.points, more.place]),
+        point_kinds=(*world.point_kinds, *more.kinds),
+        point_cov=np.concatenate([world.point_cov, more.honest_cov]),
+        point_echoes=np.concatenate([world.point_echoes, more.echoes]),
+        point_scans=(*world.point_scans, *more.scan_lists()),
+    )
+
+
+class Surroundings(NamedTuple):
+    """Reflectors of one or more worlds, and the reflections that may be heard of them; NumPy arrays, padded."""
+
+    scene: kernels.Scene
+    world: Int[np.ndarray, " reflectors"]
+    """Which map each reflector is from; -1 for padding."""
+    candidates: kernels.Candidates
+    heard_by: Bool[np.ndarray, "scans reflectors"] | None = None
+    """Which scans may hear each reflector; None: all."""
+
+    def near(
+        self, poses: Float[np.ndarray, "scans 3"], world: Int[np.ndarray, " scans"], reach: float
+    ) -> Int[np.ndarray, "scans near"]:
+        """Rows of the candidates that scans may hear, -1 for none: those of their world of which a part is in reach.
+
+        Args:
+            poses: of the scans, where they are now.
+            world: of each scan.
+            reach: how far off an echo may come from, metres.
+        """
+        scene, reflection = self.scene, self.candidates.reflection
+        wall = np.asarray(scene.kind) == kernels.PLANE
+        parameters, anchor, ends = (np.asarray(leaf) for leaf in (scene.parameters, scene.anchor, scene.ends))
+        offset = poses[:, None, :2] - anchor
+        theta = np.where(wall, parameters[:, 1], 0.0)
+        along = (offset * unit(theta + np.pi / 2)).sum(axis=-1)
+        beyond = np.maximum(np.maximum(ends[:, 0] - along, along - ends[:, 1]), 0.0)
+        across = (offset * unit(theta)).sum(axis=-1) - parameters[:, 0]
+        distance = np.where(wall, np.hypot(across, beyond), np.linalg.norm(offset - parameters, axis=-1))
+        either = np.minimum(distance[:, np.asarray(reflection.first)], distance[:, np.asarray(reflection.second)])
+        heard = (either < reach) & (np.asarray(self.candidates.world) == world[:, None]) & (world >= 0)[:, None]
+        heard &= np.asarray(reflection.kind) >= 0
+        if self.heard_by is not None:
+            heard &= self.heard_by[:, np.asarray(reflection.first)]
+        room = min(power_of_two(int(heard.sum(axis=1).max(initial=1)), least=_ROOM), heard.shape[1])
+        order = np.argsort(~heard, axis=1, kind="stable")[:, :room]
+        return np.where(np.take_along_axis(heard, order, axis=1), order, -1).astype(np.int32)
+
+
+def surroundings(worlds: Sequence[GlobalMap], *, tied: bool) -> Surroundings:
+    """The reflectors of maps.
+
+    Args:
+        worlds: one map for every world that scans were taken in.
+        tied: corners are where two walls meet, so that wall to wall reflections say how far off the walls are; a corner
+            is a place of its own otherwise.
+    """
+    none = np.zeros((0, 2))
+    kind, parameters, anchor, ends, world = [np.zeros(0, int)], [none], [none], [none], [np.zeros(0, int)]
+    meetings: list[tuple[int, int, int]] = []  # first wall, second wall, world
+    for number, map_ in enumerate(worlds):
+        meet, own = _meetings(map_)
+        first = sum(len(part) for part in kind)
+        middle = map_.segments.mean(axis=1)
+        half = np.linalg.norm(map_.segments[:, 1] - map_.segments[:, 0], axis=1) / 2
+        normal = unit(map_.theta)
+        kept = ~own if tied else np.ones(len(own), bool)
+        points = map_.points[kept]
+        of_points = np.array([name == "corner" for name in map_.point_kinds], dtype=bool)[kept]
+        kind += [np.full(len(middle), kernels.PLANE), np.where(of_points, kernels.CORNER, kernels.EDGE)]
+        distance = map_.rho - (normal * middle).sum(axis=-1)
+        parameters += [np.stack([distance, map_.theta], axis=-1), np.zeros_like(points)]
+        anchor += [middle, points]
+        ends += [np.stack([-half, half], axis=-1), np.zeros_like(points)]
+        world.append(np.full(len(middle) + len(points), number))
+        if tied:
+            meetings += [(first + a, first + b, number) for a, b in meet]
+    scene = kernels.Scene(*(np.concatenate(part) for part in (kind, parameters, anchor, ends)))
+    return _padded(scene, np.concatenate(world), meetings)
+
+
+def _meetings(map_: GlobalMap) -> tuple[list[tuple[int, int]], Bool[np.ndarray, " points"]]:
+    """Pairs of walls that end where they meet at about a right angle, and which corners of the map are these."""
+    count = len(map_)
+    a, b = np.triu_indices(count, k=1)
+    turn = np.abs(np.sin(map_.theta[a] - map_.theta[b]))
+    square = turn > np.cos(_SQUARE)
+    a, b = a[square], b[square]
+    normal = unit(map_.theta)
+    both = np.stack([normal[a], normal[b]], axis=1)
+    cross = np.linalg.solve(both, np.stack([map_.rho[a], map_.rho[b]], axis=-1)[..., None])[..., 0]
+    near = np.ones(len(a), dtype=bool)
+    for wall in (a, b):
+        near &= np.linalg.norm(map_.segments[wall] - cross[:, None], axis=-1).min(axis=1) < _MEETS
+    cross = cross[near]
+    apart = np.linalg.norm(map_.points[:, None] - cross[None], axis=-1).min(axis=1, initial=np.inf)
+    corner = np.array([name == "corner" for name in map_.point_kinds], dtype=bool)
+    return list(zip(a[near].tolist(), b[near].tolist(), strict=True)), corner & (apart < _OF_CORNER)
+
+
+def _padded(
+    scene: kernels.Scene, world: Int[np.ndarray, " reflectors"], meetings: Sequence[tuple[int, int, int]]
+) -> Surroundings:
+    """With room for a power of two of reflectors, and of candidates, so that few shapes are compiled."""
+    count = len(world)
+    room = power_of_two(count, least=_ROOM)
+    more = room - count
+
+    def pad(array: np.ndarray, filler: float | int = 0) -> np.ndarray:
+        return np.pad(array, [(0, more)] + [(0, 0)] * (array.ndim - 1), constant_values=filler)
+
+    scene = kernels.Scene(
+        kind=pad(np.asarray(scene.kind, np.int32), -1),
+        parameters=pad(np.asarray(scene.parameters, np.float64)),
+        anchor=pad(np.asarray(scene.anchor, np.float64)),
+        ends=pad(np.asarray(scene.ends, np.float64)),
+    )
+    first, second, of_world = np.array(meetings, dtype=np.int32).reshape(-1, 3).T
+    pairs = len(first)
+    size = power_of_two(count + 2 * pairs, least=_ROOM)
+    rest = size - count - 2 * pairs
+    alone = np.arange(count, dtype=np.int32)
+    candidates = kernels.Candidates(
+        reflection=kernels.Reflection(
+            kind=np.concatenate(
+                [scene.kind[:count], np.full(2 * pairs, kernels.SECOND, np.int32), np.full(rest, -1, np.int32)]
+            ),
+            first=np.concatenate([alone, first, second, np.zeros(rest, np.int32)]),
+            second=np.concatenate([alone, second, first, np.zeros(rest, np.int32)]),
+        ),
+        world=np.concatenate([world, of_world, of_world, np.full(rest, -1)]).astype(np.int32),
+        group=np.concatenate(
+            [alone, count + np.tile(np.arange(pairs), 2), np.full(rest, -1)], dtype=np.int32, casting="unsafe"
+        ),
+    )
+    return Surroundings(scene, pad(world.astype(np.int32), -1), candidates)

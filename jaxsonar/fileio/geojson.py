@@ -1,0 +1,108 @@
+"""What all GeoJSON files of this project share: a FeatureCollection in metres, features named when they are wrong."""
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsonar.fileio.atomic_files import open_output, read_bytes, reason, shown
+from jaxsonar.hardware.errors import SonarError
+
+T = TypeVar("T")
+
+
+def read_features(path: str | os.PathLike[str], read: Callable[[dict[str, Any], str, Any], T], *, what: str) -> list[T]:
+    """Read a FeatureCollection, feature by feature.
+
+    Args:
+        path: the file.
+        read: makes something of a feature's properties, the name of its geometry and the geometry's coordinates; its
+            errors get the file and the feature's number in front.
+        what: what the file should hold, for the message ("a room").
+
+    Raises:
+        SonarError: the file cannot be read or is none, or ``read`` refused a feature.
+    """
+    content = read_bytes(path, what=f"{what}, GeoJSON")
+    place = shown(path)
+    try:
+        document = json.loads(content)
+    except (ValueError, RecursionError) as failure:
+        raise SonarError(f"{place}: no JSON: {reason(failure)}; allowed is a GeoJSON FeatureCollection") from None
+    features = document.get("features") if isinstance(document, dict) else None
+    if not (isinstance(document, dict) and document.get("type") == "FeatureCollection" and isinstance(features, list)):
+        raise SonarError(f"{place}: no FeatureCollection came; allowed is a GeoJSON FeatureCollection with features")
+    found = []
+    for index, entry in enumerate(features):
+        try:
+            found.append(read(*_opened(entry)))
+        except SonarError as error:
+            raise SonarError(f"{place}: feature {index}: {error}") from None
+    return found
+
+
+def write_features(features: Sequence[dict[str, Any]], path: str | os.PathLike[str]) -> None:
+    """Write a FeatureCollection, a feature a line, whole or not at all; ``-`` is standard output.
+
+    Raises:
+        SonarError: the file cannot be written.
+    """
+    body = ",\n".join(json.dumps(entry, ensure_ascii=False, allow_nan=False) for entry in features)
+    with open_output(path) as file:
+        file.write(f'{{"type": "FeatureCollection", "features": [\n{body}\n]}}\n')
+
+
+def feature(form: str, coordinates: Any, /, **properties: Any) -> dict[str, Any]:
+    """One feature: a geometry's name and coordinates, and what is known about it."""
+    return {"type": "Feature", "properties": properties, "geometry": {"type": form, "coordinates": coordinates}}
+
+
+def lines_of(form: str, coordinates: Any) -> Iterator[tuple[Any, bool]]:
+    """Every list of positions in a geometry of lines or polygons, and whether it is a ring.
+
+    Raises:
+        SonarError: another geometry, or coordinates that are not nested as they should be.
+    """
+    depth = {"LineString": 0, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}.get(form)
+    if depth is None:
+        raise SonarError(f"geometry {form!r:.60}; allowed are LineString, Polygon, their Multi forms and Point")
+    lists = [coordinates]
+    for _ in range(depth):
+        if not all(isinstance(entry, list) for entry in lists):
+            raise SonarError(f"coordinates of a {form:.60} are no lists of lines; allowed is what RFC 7946 gives")
+        lists = [line for entry in lists for line in entry]
+    for line in lists:
+        yield line, form.endswith("Polygon")
+
+
+def positions(line: Any) -> Float[np.ndarray, "positions 2"]:
+    """The positions of one line, metres; a third coordinate is left out.
+
+    Raises:
+        SonarError: something else than pairs of finite numbers.
+    """
+    if not isinstance(line, list):
+        raise SonarError(f"{line!r:.40} instead of a list of positions; allowed are lists of [x, y]")
+    for position in line:
+        pair = position[:2] if isinstance(position, list) else []
+        if len(pair) < 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
+            raise SonarError(f"position {position!r:.60}; allowed is [x, y] in metres")
+        if not all(abs(v) < 1e12 for v in pair):  # NaN fails too, and integers too large for a float
+            raise SonarError(f"position {position!r:.60}; allowed are finite numbers, metres")
+    return np.array([position[:2] for position in line], dtype=np.float64).reshape(-1, 2)
+
+
+def _opened(entry: Any) -> tuple[dict[str, Any], str, Any]:
+    """Properties, name of the geometry and coordinates of one feature."""
+    if not isinstance(entry, dict) or entry.get("type") != "Feature":
+        raise SonarError("no Feature came; allowed are Feature objects")
+    properties, geometry = entry.get("properties"), entry.get("geometry")
+    properties = {} if properties is None else properties
+    if not isinstance(properties, dict):
+        raise SonarError("properties are no object; allowed is an object or null")
+    if not isinstance(geometry, dict) or "coordinates" not in geometry:
+        raise SonarError("no geometry with coordinates came; allowed are LineString, Polygon, their Multi forms, Point")
+    return properties, str(geometry.get("type")), geometry["coordinates"]

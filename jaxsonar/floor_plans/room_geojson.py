@@ -1,0 +1,78 @@
+"""Rooms as GeoJSON, world frame, metres: lines and polygons are walls, points of kind pole are poles."""
+
+import os
+from typing import Any
+
+import numpy as np
+
+from jaxsonar.fileio.atomic_files import shown
+from jaxsonar.fileio.geojson import feature, lines_of, positions, read_features, write_features
+from jaxsonar.floor_plans.room import TOUCH, Room
+from jaxsonar.hardware.errors import SonarError
+
+
+def load_room(path: str | os.PathLike[str]) -> Room:
+    """Read a room from a GeoJSON FeatureCollection in world metres.
+
+    LineString and MultiLineString pieces and the rings of Polygon and MultiPolygon are walls, each with its feature's
+    property ``name``; a Point with property ``kind`` "pole" is a pole. Points of kind "corner" and "edge", which maps
+    contain, are skipped: walls imply them.
+
+    Raises:
+        SonarError: the file cannot be read, or a feature is none of these; one line names file, feature and cause.
+    """
+    place = shown(path)
+    walls, names, poles = [], [], []
+    for name, pieces, points in read_features(path, _feature, what="a room"):
+        walls += pieces
+        names += [name] * len(pieces)
+        poles += points
+    if not walls and not poles:
+        raise SonarError(f"{place}: neither wall nor pole came; allowed is at least one LineString, Polygon or pole")
+    try:
+        return Room(np.array(walls).reshape(-1, 2, 2), tuple(names), np.array(poles).reshape(-1, 2))
+    except SonarError as error:
+        raise SonarError(f"{place}: {error}") from None
+
+
+def save_room(room: Room, path: str | os.PathLike[str]) -> None:
+    """Write a room as GeoJSON in world metres: a LineString a wall, a Point of kind "pole" a pole; ``-`` is stdout.
+
+    The file appears complete or not at all. Coordinates are written in full: what is loaded again is the same room.
+
+    Raises:
+        SonarError: the file cannot be written.
+    """
+    walls = zip(room.walls.tolist(), room.wall_names, strict=True)
+    features = [feature("LineString", wall, kind="wall", **({"name": name} if name else {})) for wall, name in walls]
+    features += [feature("Point", pole, kind="pole") for pole in room.poles.tolist()]
+    write_features(features, path)
+
+
+def _feature(properties: dict[str, Any], form: str, coordinates: Any) -> tuple[str, list[np.ndarray], list[np.ndarray]]:
+    """Name, walls and poles of one GeoJSON feature."""
+    name = properties.get("name")
+    if not isinstance(name, str | None):
+        raise SonarError(f"name {name!r:.60}; allowed is text")
+    if form == "Point":
+        kind = properties.get("kind")
+        if kind not in ("pole", "corner", "edge"):
+            raise SonarError(f'Point of kind {kind!r:.60}; allowed is "pole" ("corner" and "edge" are skipped)')
+        return name or "", [], [positions([coordinates])[0]] if kind == "pole" else []
+    pieces: list[np.ndarray] = []
+    for line, is_ring in lines_of(form, coordinates):
+        points = positions(line)
+        if is_ring:
+            if len(points) < 4 or (points[0] != points[-1]).any():
+                raise SonarError(
+                    f"a ring of {len(points)} positions is open; allowed are 4 or more, the last = the first"
+                )
+            points = points[np.append(True, (points[1:] != points[:-1]).any(axis=1))]
+        if len(points) < 2:
+            raise SonarError(f"a line of {len(points)} positions; allowed are 2 or more")
+        length = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        if (length <= TOUCH).any():
+            x, y = points[int(length.argmin())]
+            raise SonarError(f"a wall of no length at ({x:g}, {y:g}); allowed is more than {TOUCH * 1e3:g} mm")
+        pieces += list(np.stack([points[:-1], points[1:]], axis=1))
+    return name or "", pieces, []

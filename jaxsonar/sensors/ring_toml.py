@@ -1,0 +1,256 @@
+"""Rings as TOML files: degrees where a person types them, every key checked; rings of known devices are shipped."""
+
+import math
+import os
+import re
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, get_type_hints
+
+import msgspec
+import numpy as np
+import tomli_w
+from msgspec import Meta
+
+from jaxsonar.fileio.atomic_files import atomic_write, read_toml, shown
+from jaxsonar.hardware.errors import SonarError
+from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
+
+DATA = Path(__file__).parents[1] / "data"
+
+_Length = Annotated[float, Meta(description="a finite number (m)")]
+_Heading = Annotated[float, Meta(description="a finite number (degrees counter-clockwise from x)")]
+_Beam = Annotated[float, Meta(gt=0, le=180, description="a number above 0 and up to 180 (degrees)")]
+_Neighbors = Annotated[int, Meta(ge=0, description="a whole number, 0 or more and less than there are sensors")]
+_MaxRange = Annotated[float, Meta(gt=0, description="a finite number above 0 (m)")]
+
+
+class _RingTable(msgspec.Struct, forbid_unknown_fields=True):
+    count: Annotated[int, Meta(ge=1, le=10_000, description="a whole number from 1 to 10000")]
+    radius: Annotated[float, Meta(ge=0, description="a finite number, 0 or more (m)")]
+    first_heading_deg: _Heading
+    beam_deg: _Beam
+    neighbors: _Neighbors
+    max_range: _MaxRange
+
+
+class _ArrayTable(msgspec.Struct, forbid_unknown_fields=True):
+    neighbors: _Neighbors
+    max_range: _MaxRange
+
+
+class _SensorTable(msgspec.Struct, forbid_unknown_fields=True):
+    x: _Length
+    y: _Length
+    heading_deg: _Heading
+    beam_deg: _Beam
+    range_offset: _Length = 0.0
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    name: Annotated[str, Meta(description="a text")]
+    speed_of_sound: Annotated[float, Meta(gt=0, description="a finite number above 0 (m/s)")] = REFERENCE_SPEED_OF_SOUND
+    ring: Annotated[_RingTable | None, Meta(description="one table [ring]")] = None
+    array: Annotated[_ArrayTable | None, Meta(description="one table [array]")] = None
+    sensor: Annotated[list[_SensorTable] | None, Meta(description="tables [[sensor]], one a sensor")] = None
+    # What a calibration says about itself; a ring needs none of it.
+    calibration: Annotated[dict[str, Any] | None, Meta(description="one table [calibration]")] = None
+
+
+_TABLES = {"": _File, "ring": _RingTable, "array": _ArrayTable, "sensor": _SensorTable}
+
+
+def shipped_rings() -> tuple[str, ...]:
+    """Names of the rings that come with the package, as ``load_ring`` takes them."""
+    return tuple(sorted(file.stem.removeprefix("ring-") for file in DATA.glob("ring-*.toml")))
+
+
+def load_ring(path: str | os.PathLike[str]) -> Ring:
+    """A ring from a TOML file, or one of the shipped rings by its name.
+
+    The file has a ``name``, optionally ``speed_of_sound`` (m/s), and either ``[ring]`` (count, radius,
+    first_heading_deg, beam_deg, neighbors, max_range: sensors evenly around a circle) or ``[array]`` (neighbors,
+    max_range) with one ``[[sensor]]`` each (x, y, heading_deg, beam_deg and optionally range_offset). A table
+    ``[calibration]``, which calibrated rings carry, is left unread. Lengths in metres.
+
+    Args:
+        path: the file; or, where no such file exists, a name from ``shipped_rings()``: ``load_ring("faw")``.
+
+    Raises:
+        SonarError: no such ring, or a file that holds none; one line with file, key and what is allowed.
+    """
+    file = Path(path)
+    if not os.path.isfile(path) and os.fspath(path) in shipped_rings():
+        file = DATA / f"ring-{os.fspath(path)}.toml"
+    elif not os.path.exists(path):
+        allowed = f"allowed is a ring file or one of the shipped rings {', '.join(shipped_rings())}"
+        raise SonarError(f"{shown(path)}: no such ring; {allowed}")
+    given = _read(file)
+    if (given.ring is None) == (given.array is None):
+        came = "neither [ring] nor [array]" if given.ring is None else "both [ring] and [array]"
+        raise SonarError(f"{shown(file)}: {came} came; allowed is [ring], or [array] with one [[sensor]] each")
+    if given.ring is not None and given.sensor is not None:
+        raise SonarError(f"{shown(file)}: [[sensor]] came beside [ring]; allowed is [[sensor]] with [array] only")
+    if given.array is not None and not given.sensor:
+        raise SonarError(f"{shown(file)}: sensor is missing; allowed with [array] is one [[sensor]] each, at least one")
+
+    table, key, count = (
+        (given.ring, "ring", given.ring.count) if given.ring else (given.array, "array", len(given.sensor or ()))
+    )
+    assert table is not None
+    if table.neighbors >= count:
+        came = f"{key}.neighbors: {table.neighbors} came"
+        raise SonarError(f"{shown(file)}: {came}; allowed is 0 to {count - 1} with {count} sensors")
+    try:
+        return _ring(given)
+    except SonarError as error:
+        raise SonarError(f"{shown(file)}: {error}") from None
+
+
+def _ring(given: _File) -> Ring:
+    if given.ring is not None:
+        return Ring.circular(
+            count=given.ring.count,
+            radius=given.ring.radius,
+            beam=math.radians(given.ring.beam_deg),
+            neighbors=given.ring.neighbors,
+            max_range=given.ring.max_range,
+            first_heading=math.radians(given.ring.first_heading_deg),
+            speed_of_sound=given.speed_of_sound,
+            name=given.name,
+        )
+    assert given.array is not None
+    sensors = given.sensor or []
+    return Ring(
+        np.array([(sensor.x, sensor.y) for sensor in sensors]),
+        np.radians([sensor.heading_deg for sensor in sensors]),
+        beam=np.radians([sensor.beam_deg for sensor in sensors]),
+        neighbors=given.array.neighbors,
+        max_range=given.array.max_range,
+        range_offset=np.array([sensor.range_offset for sensor in sensors]),
+        speed_of_sound=given.speed_of_sound,
+        name=given.name,
+    )
+
+
+def save_ring(ring: Ring, path: str | os.PathLike[str]) -> None:
+    """Write a ring as TOML, so that ``load_ring`` gives the same one to 1e-12 (m, rad, m/s).
+
+    As ``[ring]`` where the sensors are evenly around a circle, alike and without offsets; as ``[array]`` with a
+    ``[[sensor]]`` each otherwise.
+
+    Args:
+        ring: the ring.
+        path: the file, replaced only once all is written.
+
+    Raises:
+        SonarError: the place cannot be written.
+    """
+    with atomic_write(path) as file:
+        file.write(ring_toml(ring))
+
+
+def ring_toml(ring: Ring, *, each: bool = False) -> str:
+    """A ring as the text of its file.
+
+    Args:
+        ring: the ring.
+        each: as ``[array]`` with a ``[[sensor]]`` each, even where ``[ring]`` would do.
+    """
+    speed = float(np.asarray(ring.speed_of_sound, dtype=np.float64))
+    head: dict[str, Any] = {"name": ring.name, "speed_of_sound": speed}
+    if (circle := _circle(ring)) and not each:
+        return tomli_w.dumps({**head, "ring": circle})
+    text = tomli_w.dumps({**head, "array": {"neighbors": ring.neighbors, "max_range": ring.max_range}})
+    # One by one, since the library would put short tables into an inline array.
+    return text + "".join(f"\n[[sensor]]\n{tomli_w.dumps(sensor)}" for sensor in _sensors(ring))
+
+
+def _circle(ring: Ring) -> dict[str, Any] | None:
+    """The table [ring], or None where it would not give this ring back."""
+    position, heading = np.asarray(ring.position, np.float64), np.asarray(ring.heading, np.float64)
+    beam, offset = np.asarray(ring.beam, np.float64), np.asarray(ring.range_offset, np.float64)
+    radius, first_heading = _short(np.hypot(*position[0])), float(heading[0])
+    again = Ring.circular(count=ring.count, radius=radius, first_heading=first_heading, neighbors=ring.neighbors)
+    if offset.any() or (beam != beam[0]).any():
+        return None
+    if np.abs(again.position - position).max() > 1e-12 or np.abs(again.heading - heading).max() > 1e-12:
+        return None
+    return {
+        "count": ring.count,
+        "radius": radius,
+        "first_heading_deg": _degrees(first_heading),
+        "beam_deg": min(_degrees(beam[0]), 180.0),
+        "neighbors": ring.neighbors,
+        "max_range": ring.max_range,
+    }
+
+
+def _sensors(ring: Ring) -> list[dict[str, Any]]:
+    """The tables [[sensor]]."""
+    columns = (ring.position, ring.heading, ring.beam, ring.range_offset)
+    sensors = []
+    for (x, y), heading, beam, offset in zip(*(np.asarray(column, np.float64) for column in columns), strict=True):
+        sensor = {
+            "x": _short(x),
+            "y": _short(y),
+            "heading_deg": _degrees(heading),
+            "beam_deg": min(_degrees(beam), 180.0),
+        }
+        sensors.append({**sensor, "range_offset": _short(offset)} if offset else sensor)
+    return sensors
+
+
+def _short(value: float) -> float:
+    """0.14 for 0.14000000000000004: what is dropped is far below the 1e-12 that a file promises."""
+    return round(float(value), 14) + 0.0
+
+
+def _degrees(angle: float) -> float:
+    return round(math.degrees(angle), 12) + 0.0
+
+
+def _read(file: Path) -> _File:
+    data = read_toml(file, what="a ring")
+    _refuse_not_finite(file, {key: value for key, value in data.items() if key != "calibration"}, "")
+    try:
+        return msgspec.convert(data, type=_File)
+    except (msgspec.ValidationError, OverflowError) as failure:
+        _refuse(file, data, str(failure))
+
+
+def _refuse_not_finite(file: Path, value: Any, key: str) -> None:
+    """TOML knows nan and inf, and no bound stops both."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise SonarError(f"{shown(file)}: {shown(key)}: {value} came; allowed is {_allowed(key) or 'a finite number'}")
+    if isinstance(value, dict):
+        for name, item in value.items():
+            _refuse_not_finite(file, item, f"{key}.{name}" if key else name)
+    if isinstance(value, list):
+        for k, item in enumerate(value):
+            _refuse_not_finite(file, item, f"{key}[{k}]")
+
+
+def _refuse(file: Path, data: dict[str, Any], message: str) -> NoReturn:
+    """One line in our words for what msgspec found; it names a key or the table that a key is in."""
+    what, _, place = message.partition(" - at `$")
+    place = place.rstrip("`").removeprefix(".")
+    if field := re.fullmatch(r"Object (missing required|contains unknown) field `(.*)`", what, re.DOTALL):
+        key = f"{place}.{field[2]}" if place else field[2]
+        if field[1] == "missing required":
+            raise SonarError(f"{shown(file)}: {key} is missing; needed is {_allowed(key)}")
+        table = re.sub(r"\[\d+\]", "", place)
+        keys = ", ".join(_TABLES[table].__struct_fields__)
+        where = {"": "outside of tables", "sensor": "in [[sensor]]"}.get(table, f"in [{table}]")
+        raise SonarError(f"{shown(file)}: unknown key {shown(key)}; allowed {where} are {keys}")
+    value: Any = data
+    for name, index in re.findall(r"(\w+)|\[(\d+)\]", place):
+        value = value[name] if name else value[int(index)]
+    came = shown(repr(value), 80) if place else shown(what)
+    raise SonarError(f"{shown(file)}: {shown(place)}: {came} came; allowed is {_allowed(place) or what}")
+
+
+def _allowed(key: str) -> str:
+    """What may stand under a key such as ``sensor[3].beam_deg``; empty where the key is none of ours."""
+    table, _, name = re.sub(r"\[\d+\]", "", key).rpartition(".")
+    hint = get_type_hints(_TABLES[table], include_extras=True).get(name) if table in _TABLES else None
+    return next((meta.description or "" for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, Meta)), "")

@@ -1,0 +1,138 @@
+"""Random rooms, and poses in rooms: what simulations are run on so that no result hangs on one room."""
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsonar.floor_plans.room import Room, crossings, point_to_walls
+from jaxsonar.hardware.errors import SonarError
+
+
+def random_room(
+    rng: np.random.Generator,
+    *,
+    recess: float = 0.4,
+    box: float = 0.3,
+    segment: float = 0.4,
+    pole: float = 0.3,
+) -> Room:
+    """A closed room 3 to 6 m across with 4 to 7 walls, at any angle, in which a ring of 2 m range finds walls.
+
+    Half of the rooms are rectangles, turned at random; the others are polygons without parallel walls.
+
+    Args:
+        rng: source of randomness; the same state gives the same room.
+        recess: probability that one wall has a recess (a door, 0.6 to 1 m wide).
+        box: probability that a box (0.3 to 0.6 m) stands in the room.
+        segment: probability that a free-standing segment (0.3 to 0.8 m) stands in the room.
+        pole: probability that a pole stands in the room.
+    """
+    while True:
+        outline = _rectangle(rng.uniform(3.0, 5.0, 2)) if rng.random() < 0.5 else _polygon(rng)
+        if rng.random() < recess:
+            outline = _with_recess(rng, outline)
+        turn = rng.uniform(-np.pi, np.pi)
+        outline = _placed(outline, rng.uniform(-1.0, 1.0, 2), turn)
+        shell = _loop(outline)
+        names = tuple(f"wall {k}" for k in range(len(shell)))
+        parts, poles = [shell], np.zeros((0, 2))
+        low, high = outline.min(0), outline.max(0)
+        if rng.random() < box:
+            parts.append(_loop(_placed(_rectangle(rng.uniform(0.3, 0.6, 2)), rng.uniform(low, high), turn)))
+            names += ("box",) * 4
+        if rng.random() < segment:
+            half = rng.uniform(0.15, 0.4)
+            ends = np.array([[-half, 0.0], [half, 0.0]])
+            parts.append(_placed(ends, rng.uniform(low, high), rng.uniform(-np.pi, np.pi))[None])
+            names += ("segment",)
+        if rng.random() < pole:
+            poles = rng.uniform(low, high, (1, 2))
+        room = Room(np.concatenate(parts), names, poles)
+        if _sound(room, len(shell), rng):
+            return room
+
+
+def random_pose(rng: np.random.Generator, room: Room, *, clearance: float = 0.45) -> Float[np.ndarray, " 3"]:
+    """A pose (x, y, theta) inside a closed room, metres and radians, world_from_robot.
+
+    Inside means that walls are met in all directions; this works whatever stands in the room.
+
+    Args:
+        rng: source of randomness.
+        room: the walls around.
+        clearance: least distance of the robot's centre from any wall or pole, metres.
+
+    Raises:
+        SonarError: no such place was found: the room is open or too small.
+    """
+    if not (np.isfinite(clearance) and clearance >= 0):
+        raise SonarError(f"random_pose: clearance {clearance:g} m; allowed is 0 or more")
+    for _ in range(100 if len(room.walls) else 0):
+        points = rng.uniform(room.walls.min((0, 1)), room.walls.max((0, 1)), (64, 2))
+        inside = np.flatnonzero(_free(room, points, clearance))
+        if len(inside):
+            return np.append(points[inside[0]], rng.uniform(-np.pi, np.pi))
+    raise SonarError(f"random_pose: no place {clearance:g} m clear of all walls; allowed is a closed room with space")
+
+
+def _free(room: Room, points: np.ndarray, clearance: float) -> np.ndarray:
+    """Which points lie inside, with walls in every one of 64 directions, and clear of everything."""
+    inside = (point_to_walls(points, room.walls) >= clearance).all(axis=1)
+    inside &= (np.linalg.norm(points[:, None] - room.poles, axis=-1) >= clearance).all(axis=1)
+    kept = np.flatnonzero(inside)
+    angle = 2 * np.pi * np.arange(64) / 64
+    towards = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    rays = np.stack(np.broadcast_arrays(points[kept, None], points[kept, None] + towards), axis=-2).reshape(-1, 2, 2)
+    distance, share = crossings(rays, room.walls)
+    hits = ((distance > 0) & (share >= 0) & (share <= 1)).any(axis=1)
+    inside[kept] = hits.reshape(-1, 64).all(axis=1)
+    return inside
+
+
+def _sound(room: Room, shell: int, rng: np.random.Generator) -> bool:
+    """Whether a random room is of use: nothing crosses, obstacles stand inside, and a robot finds a place."""
+    share_a, share_b = crossings(room.walls, room.walls)
+    inner = (share_a > 1e-6) & (share_a < 1 - 1e-6) & (share_b > 1e-6) & (share_b < 1 - 1e-6)
+    if inner.any() or (np.ptp(room.walls[:shell], axis=(0, 1)) > 7.0).any():
+        return False
+    outer = Room(room.walls[:shell])
+    obstacles = np.concatenate([room.walls[shell:].reshape(-1, 2), room.poles])
+    if len(obstacles) and not _free(outer, obstacles, 0.1).all():
+        return False
+    points = rng.uniform(room.walls.min((0, 1)), room.walls.max((0, 1)), (256, 2))
+    return int(np.count_nonzero(_free(room, points, 0.5))) >= 16
+
+
+def _rectangle(size: np.ndarray) -> np.ndarray:
+    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * size / 2
+
+
+def _polygon(rng: np.random.Generator) -> np.ndarray:
+    """A polygon around the origin with 4 to 7 corners, counter-clockwise; star-shaped, hence simple."""
+    count = int(rng.integers(4, 8))
+    angle = 2 * np.pi * (np.arange(count) + rng.uniform(-0.25, 0.25, count)) / count
+    radius = rng.uniform(1.8, 2.9, count)
+    return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _with_recess(rng: np.random.Generator, outline: np.ndarray) -> np.ndarray:
+    """The outline with a rectangular niche behind the middle of one wall, where the wall is long enough."""
+    k = int(rng.integers(len(outline)))
+    start, end = outline[k], outline[(k + 1) % len(outline)]
+    length = np.linalg.norm(end - start)
+    width, depth = rng.uniform(0.6, 1.0), rng.uniform(0.1, 0.4)
+    if length < width + 0.6:
+        return outline
+    tangent = (end - start) / length
+    outward = np.array([tangent[1], -tangent[0]])
+    left, right = (start + end - width * tangent) / 2, (start + end + width * tangent) / 2
+    niche = [left, left + depth * outward, right + depth * outward, right]
+    return np.concatenate([outline[: k + 1], niche, outline[k + 1 :]])
+
+
+def _loop(outline: np.ndarray) -> np.ndarray:
+    return np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
+
+
+def _placed(points: np.ndarray, at: np.ndarray, turn: float) -> np.ndarray:
+    cos, sin = np.cos(turn), np.sin(turn)
+    return at + points @ np.array([[cos, sin], [-sin, cos]])

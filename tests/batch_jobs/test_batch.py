@@ -1,0 +1,484 @@
+"""Batches: the numbers of local models, the same bytes however the work was done, and nothing lost by a kill."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import jaxsonar
+from jaxsonar import Log, SonarError, batch, load_log, load_ring, local_models, save_log
+from jaxsonar.batch_jobs import process_pool as engines
+from jaxsonar.batch_jobs import worker as batch_worker
+from jaxsonar.batch_jobs.inputs import Input, find_inputs
+from jaxsonar.batch_jobs.manifest import opened
+from jaxsonar.batch_jobs.parquet_tables import TABLES, parquet
+from jaxsonar.batch_jobs.scan_tables import tables
+from jaxsonar.batch_jobs.shards import shards_of
+from jaxsonar.batch_jobs.worker import do, job_of
+from jaxsonar.detection.hough_detector import settings_for
+from jaxsonar.scans.log_chunks import csv_parts, csv_reader, parquet_parts, parquet_reader
+from jaxsonar.simulation.poses_csv import load_path
+
+pa = pytest.importorskip("pyarrow")
+pq = pytest.importorskip("pyarrow.parquet")
+dataset = pytest.importorskip("pyarrow.dataset")
+
+RING = load_ring("faw")
+HOUGH: dict[str, Any] = {"method": "hough", "workers": 1, "shard_scans": 8}
+
+
+def with_(**others: Any) -> dict[str, Any]:
+    return HOUGH | others
+
+
+HEADER = "scan,stamp,x,y,theta,tx,rx,range\n"
+
+
+def office(scans, *, first=0):
+    """Scans of the office, as often as it takes; one of them heard nothing, some have no pose."""
+    data = Path(jaxsonar.__file__).with_name("data")
+    poses, stamps = load_path(data / "office-path.csv")
+    room = jaxsonar.load_room(data / "office.geojson")
+    seen = jaxsonar.simulate(RING, room, poses, sigma=0.003, seed=first, stamps=stamps).as_log(RING, poses)
+    rows = [seen[k % len(seen)] for k in range(scans)]
+    rows = [replace(scan, scan=first + k, stamp=0.5 * k) for k, scan in enumerate(rows)]
+    rows[3] = replace(
+        rows[3], **{name: rows[3].tx[:0] for name in ("tx", "rx")}, range=np.zeros(0), amplitude=np.zeros(0)
+    )
+    rows[4] = replace(rows[4], pose=np.full(3, np.nan), stamp=np.nan)
+    return Log.from_scans(rows)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """A folder with two logs."""
+    folder = tmp_path_factory.mktemp("logs")
+    save_log(office(36), folder / "a.csv")
+    save_log(office(20, first=100), folder / "b.parquet")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(logs, tmp_path_factory):
+    """What a batch of them gives, by one worker without an interruption."""
+    folder = tmp_path_factory.mktemp("done")
+    batch([logs], RING, folder, **HOUGH)
+    return folder
+
+
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def table(folder, name):
+    return pq.read_table(folder / name).to_pylist()
+
+
+def manifest(folder):
+    return [json.loads(line) for line in (folder / "manifest.jsonl").read_text().splitlines()]
+
+
+def found(log, *, method, rows=None):
+    rows = np.arange(len(log)) if rows is None else rows
+    settings = settings_for(RING, None)
+    return tables(RING, log, rows, source="log", method=method, settings=settings, sigma=None)
+
+
+def as_rows(name, columns):
+    return pq.read_table(pa.BufferReader(parquet(name, columns))).to_pylist()
+
+
+# What it gives
+
+
+@pytest.mark.parametrize("method", ["ml", "hough"])
+def test_the_numbers_are_those_of_local_models(method):
+    log = office(17)
+    columns = found(log, method=method)
+    scans, lines, points = (as_rows(name, columns[name]) for name in TABLES)
+    models = list(local_models(RING, log, method=method))
+    assert [row["scan"] for row in scans] == [model.scan for model in models]
+    assert [row["empty"] or "" for row in scans] == [model.empty for model in models]
+    wanted = [(model, line) for model in models for line in model.lines]
+    assert len(lines) == len(wanted) > 30
+    for row, (model, line) in zip(lines, wanted, strict=True):
+        assert (row["scan"], row["rho"], row["theta"], row["echoes"]) == (model.scan, line.rho, line.theta, line.echoes)
+        assert [[row["x1"], row["y1"]], [row["x2"], row["y2"]]] == line.segment.tolist()
+        assert row["votes" if method == "hough" else "evidence"] == line.votes
+        assert row["evidence" if method == "hough" else "votes"] is None
+        cov = [[row["cov_rho"], row["cov_rho_theta"]], [row["cov_rho_theta"], row["cov_theta"]]]
+        assert line.cov is None or cov == line.cov.tolist()
+    if method == "hough":
+        assert points == []
+        return
+    np.testing.assert_array_equal([row["sigma"] for row in scans], [model.sigma for model in models])
+    decided = [row for row in points if row["kind"] != "undecided"]
+    for row, (model, point) in zip(decided, [(m, p) for m in models for p in m.points], strict=True):
+        assert (row["scan"], row["kind"], row["x"], row["y"]) == (model.scan, point.kind, point.x, point.y)
+        assert [[row["cov_x"], row["cov_xy"]], [row["cov_xy"], row["cov_y"]]] == point.cov.tolist()
+        assert row[f"p_{point.kind}"] == point.probability
+    others = [row for row in points if row["kind"] == "undecided"]
+    for row, (model, one) in zip(others, [(m, u) for m in models for u in m.undecided], strict=True):
+        assert (row["scan"], row["rho"], row["theta"]) == (model.scan, one.rho, one.theta)
+        assert (row["x"], row["y"]) == pytest.approx((one.x, one.y), rel=1e-6)
+        assert {kind: row[f"p_{kind}"] for kind in one.probability} == one.probability
+    assert [row["undecided"] for row in scans] == [len(model.undecided) for model in models]
+
+
+def test_each_table_opens_as_one_data_set_with_units(done):
+    for name, columns in TABLES.items():
+        seen = dataset.dataset(done / name)
+        assert seen.schema.names == list(columns)
+        for field in seen.schema:
+            assert field.metadata[b"unit"].decode() == columns[field.name].unit
+            assert field.metadata[b"about"]
+    scans, lines = table(done, "scans"), table(done, "lines")
+    assert [row["source"] for row in scans] == ["a.csv"] * 36 + ["b.parquet"] * 20
+    assert [row["row"] for row in scans] == [*range(36), *range(20)]
+    assert sum(row["lines"] for row in scans) == len(lines) > 50
+    assert (scans[3]["echoes"], scans[3]["empty"]) == (0, "no echo within the maximum range")
+    assert scans[4]["stamp"] is scans[4]["pose_x"] is None
+    assert (done / "lines" / "a.csv-000004.parquet").exists()
+
+
+# The same, however it was done
+
+
+@pytest.mark.parametrize(("method", "sizes"), [("hough", (1, 5, 16)), ("ml", (5,))])
+def test_shards_of_any_size_give_the_same_rows(method, sizes):
+    """A scan's result is its own, to the bit."""
+    log = office(17)
+    whole = found(log, method=method)
+    for size in sizes:
+        cuts = [np.arange(k, min(k + size, 17)) for k in range(0, 17, size)]
+        parts = [found(log[int(cut[0]) : int(cut[-1]) + 1], method=method, rows=cut) for cut in cuts]
+        for name in TABLES:
+            assert [row for part in parts for row in as_rows(name, part[name])] == as_rows(name, whole[name])
+
+
+def test_two_workers_write_the_same_bytes(logs, done, tmp_path):
+    told = []
+    report = batch([logs], RING, tmp_path, **with_(workers=2), on_planned=told.append, on_done=told.append)
+    assert contents(tmp_path) == contents(done)
+    assert (told[0], told[-1], sorted(told[1:])) == (56, 56, told[1:])
+    assert (report.scans, report.shards, report.before, report.set_aside) == (56, 8, 0, ())
+
+
+def test_a_dask_cluster_writes_the_same_bytes(logs, done, tmp_path):
+    pytest.importorskip("distributed")
+    names = (*batch_worker.KEPT_MEMORY, *batch_worker.ONE_THREAD)
+    before = [os.environ.get(name) for name in names]
+    batch([logs], RING, tmp_path, engine="dask", **HOUGH)
+    assert contents(tmp_path) == contents(done)
+    assert [os.environ.get(name) for name in names] == before
+
+
+def test_a_folder_in_which_nothing_was_done_is_begun_anew(logs, done, tmp_path):
+    pytest.importorskip("distributed")
+    with pytest.raises(SonarError, match=r"nonsense.*allowed is an address"):
+        batch([logs], RING, tmp_path, engine="dask", scheduler="nonsense://x", method="ml")
+    batch([logs], RING, tmp_path, **HOUGH)
+    assert contents(tmp_path) == contents(done)
+    with pytest.raises(SonarError, match="before"):
+        batch([logs], RING, tmp_path, method="ml")
+
+
+def test_killed_and_taken_up_again_it_is_as_if_nothing_had_been(logs, done, tmp_path):
+    code = f"""
+from jaxsonar import batch, load_ring
+def wait(done):
+    if done >= 16:
+        print("now", flush=True)
+        import time; time.sleep(60)
+batch([{str(logs)!r}], load_ring("faw"), {str(tmp_path)!r}, on_done=wait, **{HOUGH})
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "now\n"
+        with pytest.raises(SonarError, match="another batch is at work there; allowed is one at a time"):
+            batch([logs], RING, tmp_path, **HOUGH)
+        process.send_signal(signal.SIGKILL)
+    # What a process leaves that is killed while it writes.
+    (tmp_path / "lines" / ".0123456789abcdef.tmp").write_bytes(b"half")
+    (tmp_path / "lines" / "a.csv-000001.parquet").write_bytes(b"damaged")
+    with open(tmp_path / "manifest.jsonl", "ab") as file:
+        file.write(b'{"shard": "a.csv-0000')
+    report = batch([logs], RING, tmp_path, **HOUGH)
+    assert report.before == 1
+    assert contents(tmp_path) == contents(done)
+
+
+def test_what_is_done_stays_done(done, logs, monkeypatch):
+    before = contents(done)
+    monkeypatch.setattr(engines, "run_local", None)
+    assert batch([logs], RING, done, **HOUGH).before == 8
+    assert contents(done) == before
+
+
+def test_a_log_can_be_added(logs, done, tmp_path):
+    shutil.copytree(done, tmp_path / "out")
+    for line in (tmp_path / "out").rglob("b.parquet*"):
+        line.unlink()
+    lines = [line for line in manifest(done) if "b.parquet" not in json.dumps(line)]
+    (tmp_path / "out" / "manifest.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert batch([logs / "a.csv", logs / "b.parquet"], RING, tmp_path / "out", **HOUGH).before == 5
+    assert contents(tmp_path / "out") == contents(done)
+
+
+@pytest.mark.parametrize("always", [False, True])
+def test_a_shard_whose_process_dies_is_tried_once_more(logs, done, tmp_path, monkeypatch, always):
+    """The first process, or every one, dies in the third shard of b."""
+    code = f"""
+import os, sys
+from jaxsonar import batch_worker
+work, flag = batch_worker.do, {str(tmp_path / "died")!r}
+def do(job, shard):
+    if shard.key == "b.parquet-000002" and ({always} or not os.path.exists(flag)):
+        open(flag, "w").close()
+        os.kill(os.getpid(), 9)
+    return work(job, shard)
+batch_worker.do = do
+batch_worker.serve(int(sys.argv[1]))
+"""
+    monkeypatch.setattr(engines, "STARTED_BY", code)
+    report = batch([logs / "b.parquet"], RING, tmp_path / "out", **HOUGH)
+    assert (tmp_path / "died").exists()
+    if not always:
+        expected = {name: data for name, data in contents(done).items() if "b.parquet" in name}
+        assert contents(tmp_path / "out").items() >= expected.items()
+        return
+    assert (report.shards, report.aside) == (2, "1 shard")
+    assert report.set_aside == (f"b.parquet: {engines.LOST}",)
+    assert manifest(tmp_path / "out")[-1]["state"] == "set aside"
+    monkeypatch.undo()
+    assert not batch([logs / "b.parquet"], RING, tmp_path / "out", **HOUGH).set_aside, "it is tried again in a new run"
+
+
+# What is wrong is set aside
+
+
+def shard(path, *, scans=100, part=0):
+    (log,) = find_inputs([path])
+    return shards_of(log, copies=Path(path).parent / "copies", sensors=RING.count, scans=scans)[part]
+
+
+JOB = job_of(RING, method="hough", settings=settings_for(RING, None), sigma=None)
+
+BAD_ROWS = {
+    "5,0.0,0,0,0,24,3,1.0\n": "scan 5: echo of sensors tx 24, rx 3; allowed are 0 to 23, the sensors of 'FAW ring'",
+    "5,0.0,0,0,0,3,3,-1.0\n": "row 6, column range: '-1.0' came; allowed is a finite number of metres above 0",
+    "5,0.0,0,0,0,3,3,nan\n": "row 6, column range: 'nan' came; allowed is a finite number of metres above 0",
+    "5,0.0,0,0,0,3,3\n": "row 6: 7 columns came; allowed are 8, scan,stamp,x,y,theta,tx,rx,range",
+    "5,0.0,0,,0,3,3,1.0\n": "row 6, column y: nothing came; allowed is finite x, y (m) and theta (rad), all three",
+    "5,0.0,0,0,0,3,3,1.0\n5,0.1,0,0,0,4,4,1.0\n": "row 7, column stamp: '0.1' came; allowed is the same in every row",
+    "2,0.0,0,0,0,3,3,1.0\n": "scan 2 came again; allowed is each scan number once",
+}
+
+
+@pytest.mark.parametrize(("bad", "why"), BAD_ROWS.items())
+@pytest.mark.parametrize("scans", [100, 3])
+def test_a_bad_row_sets_its_scan_aside_and_nothing_else(tmp_path, bad, why, scans):
+    good = [f"{k},0.0,0,0,0,{k},{k},1.0\n" for k in range(8) if k != 5]
+    path = tmp_path / "log.csv"
+    path.write_text(HEADER + "".join(good[:4]) + bad + "".join(good[4:]))
+    came = [do(JOB, one) for one in shards_of(*find_inputs([path]), copies=tmp_path, sensors=24, scans=scans)]
+    assert [one.failure for one in came] == [""] * len(came)
+    assert sum(one.bad for one in came) == 1
+    ((reason,),) = [one.reasons for one in came if one.bad]
+    assert reason.startswith("log.csv: ")
+    assert why in reason
+    rows = [row for one in came for row in pq.read_table(pa.BufferReader(one.tables["scans"])).to_pylist()]
+    assert [row["scan"] for row in rows] == [0, 1, 2, 3, 4, 6, 7][: len(rows)]
+    assert [row["row"] for row in rows] == [0, 1, 2, 3, 5, 6, 7] if "2,0.0" in bad else len(rows) == 7
+
+
+def test_rows_without_a_number_spoil_the_scans_beside_them(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(HEADER + "0,,,,,1,1,1.0\n1,,,,,1,1,1.0\nrubbish\n2,,,,,1,1,1.0\n3,,,,,1,1,1.0\n4,,,,,1,1")
+    came = do(JOB, shard(path))
+    assert came.bad == 2
+    assert came.reasons[0].startswith("log.csv: row 4: 1 columns came")
+    assert came.reasons[1].startswith("log.csv: row 7: 7 columns came")
+    assert pq.read_table(pa.BufferReader(came.tables["scans"]))["scan"].to_pylist() == [0, 3]
+
+
+def test_bad_scans_of_parquet_are_set_aside(tmp_path):
+    log = office(12)
+    save_log(log, tmp_path / "log.parquet")
+    rows = pq.read_table(tmp_path / "log.parquet").to_pylist()
+    rows[2]["echoes"][5]["range"] = -1.0
+    rows[6]["scan"] = 1
+    rows[9]["x"] = None
+    rows[11]["echoes"][0]["tx"] = 99
+    schema = pq.read_schema(tmp_path / "log.parquet")
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema), tmp_path / "log.parquet", row_group_size=5)
+    came = [
+        do(JOB, one)
+        for one in shards_of(*find_inputs([tmp_path / "log.parquet"]), copies=tmp_path, sensors=24, scans=4)
+    ]
+    assert [one.bad for one in came] == [1, 1, 2]
+    assert came[0].reasons[0].startswith("log.parquet: row 3, column echoes[5].range: -1.0 came")
+    assert came[1].reasons == ["log.parquet: scan 1 came again; allowed is each scan number once"]
+    assert came[2].reasons[0].startswith("log.parquet: row 10, column x, y, theta: [nan")
+    assert "tx 99" in came[2].reasons[1]
+    good = [k for k in range(12) if k not in (2, 6, 9, 11)]
+    lines = [row for one in came for row in pq.read_table(pa.BufferReader(one.tables["lines"])).to_pylist()]
+    alone = as_rows(
+        "lines", found(Log.from_scans([log[k] for k in good]), method="hough", rows=np.array(good))["lines"]
+    )
+    assert [row | {"source": ""} for row in lines] == [row | {"source": ""} for row in alone]
+
+
+def test_logs_that_cannot_be_read_are_set_aside_and_the_others_done(logs, done, tmp_path):
+    folder = tmp_path / "logs"
+    shutil.copytree(logs, folder)
+    whole = (folder / "b.parquet").read_bytes()
+    (folder / "cut.parquet").write_bytes(whole[: len(whole) // 2])
+    (folder / "damaged.parquet").write_bytes(whole[:3000] + bytes(2000) + whole[5000:])
+    (folder / "path.csv").write_text("x,y,theta\n1,2,3\n")
+    (folder / "noise.csv").write_bytes(bytes(range(256)) * 9000)
+    (folder / "notes.txt").write_text("no log")
+    out = tmp_path / "out"
+    report = batch([folder], RING, out, **HOUGH)
+    aside = {line["input"]: line["reason"] for line in manifest(out) if "input" in line and "reason" in line}
+    assert aside.keys() == {"cut.parquet", "path.csv", "noise.csv"}
+    assert all(reason.startswith(f"{source}: ") for source, reason in aside.items())
+    assert report.bad_logs == 3
+    assert report.bad_shards + report.bad_scans > 0, "pages that cannot be read"
+    expected = {name: data for name, data in contents(done).items() if name.endswith(".parquet")}
+    assert contents(out).items() >= expected.items()
+
+
+def test_a_log_that_changes_meanwhile_is_set_aside(tmp_path):
+    save_log(office(8), tmp_path / "log.csv")
+    one = shard(tmp_path / "log.csv")
+    with open(tmp_path / "log.csv", "a") as file:
+        file.write("99,,,,,,,\n")
+    assert do(JOB, one).failure.startswith("log.csv: changed since it was looked at")
+    (tmp_path / "log.csv").unlink()
+    assert do(JOB, one).failure.startswith("log.csv: No such file or directory")
+
+
+# Going on with something else
+
+
+def test_another_job_is_refused(logs, done):
+    before = contents(done)
+    other = replace(RING, neighbors=2)
+    with pytest.raises(SonarError, match="another ring came; allowed is to go on as it was begun, or another folder"):
+        batch([logs], other, done, **HOUGH)
+    with pytest.raises(SonarError, match='method "ml", before "hough", came'):
+        batch([logs], RING, done, **with_(method="ml"))
+    with pytest.raises(SonarError, match=r"b.parquet, which did not come"):
+        batch([logs / "a.csv"], RING, done, **HOUGH)
+    assert contents(done) == before
+
+
+def test_another_log_of_the_same_name_is_refused(logs, done, tmp_path):
+    save_log(office(36, first=1000), tmp_path / "a.csv")
+    with pytest.raises(SonarError, match=r"a.csv: changed since .* was begun; allowed is the log as it was"):
+        batch([tmp_path / "a.csv", logs / "b.parquet"], RING, done, **HOUGH)
+    with pytest.raises(SonarError, match="two logs of one name came"):
+        batch([tmp_path / "a.csv", logs], RING, tmp_path / "out", **HOUGH)
+
+
+def test_a_folder_with_other_things_is_refused(logs, tmp_path):
+    (tmp_path / "lines").mkdir()
+    (tmp_path / "lines" / "mine.parquet").write_bytes(b"")
+    with pytest.raises(SonarError, match=r"tables without a manifest.jsonl lie there"):
+        batch([logs], RING, tmp_path, **HOUGH)
+    (tmp_path / "manifest.jsonl").write_text("hello\n")
+    with pytest.raises(SonarError, match="this is no manifest of a batch"), opened(tmp_path, {"batch": 1}):
+        pass
+
+
+# Logs in parts
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@pytest.mark.parametrize("scans", [1, 7, 50])
+def test_parts_make_the_log(tmp_path, suffix, scans):
+    log, path = office(40), tmp_path / f"log.{suffix}"
+    save_log(log, path)
+    plan, reader = (csv_parts, csv_reader) if suffix == "csv" else (parquet_parts, parquet_reader)
+    parts = plan(path, name="log", scans=scans)
+    assert [part.first for part in parts] == list(range(0, 40, scans))
+    read = [reader(path, part, name="log")(0, part.scans) for part in parts]
+    assert Log.from_scans([scan for one in read for scan in one]) == log == load_log(path)
+
+
+def test_csv_and_parquet_give_the_same_rows(tmp_path):
+    log = office(10)
+    save_log(log, tmp_path / "log.csv")
+    save_log(log, tmp_path / "log.parquet")
+    text = (tmp_path / "log.csv").read_bytes()
+    (tmp_path / "log.windows.csv").write_bytes(b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n").removesuffix(b"\r\n"))
+    came = [do(JOB, shard(tmp_path / name)) for name in ("log.csv", "log.parquet", "log.windows.csv")]
+    for name in TABLES:
+        rows = [pq.read_table(pa.BufferReader(one.tables[name])).drop_columns("source").to_pylist() for one in came]
+        assert rows[0] == rows[1] == rows[2]
+
+
+def test_scans_may_come_in_any_order(tmp_path):
+    log = office(9)
+    mixed = Log.from_scans([log[k] for k in (5, 2, 8, 0, 1, 7, 3, 6, 4)])
+    save_log(mixed, tmp_path / "log.csv")
+    assert not any(part.repeated for part in csv_parts(tmp_path / "log.csv", name="log", scans=4))
+    rows = pq.read_table(pa.BufferReader(do(JOB, shard(tmp_path / "log.csv")).tables["scans"]))
+    assert rows["scan"].to_pylist() == mixed.scan.tolist()
+
+
+def test_a_log_without_scans_has_no_shards(tmp_path):
+    for name in ("log.csv", "log.parquet"):
+        save_log(Log.from_scans([]), tmp_path / name)
+    assert [shards_of(one, copies=tmp_path, sensors=24) for one in find_inputs([tmp_path])] == [[], []]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_planning_holds_no_log(tmp_path, suffix, monkeypatch):
+    """Four times the scans, the same memory."""
+    monkeypatch.setattr("jaxsonar.logs_parts.BLOCK", 1 << 16)
+    monkeypatch.setattr("jaxsonar.logs_parts.AT_ONCE", 1 << 10)
+    path, peaks = tmp_path / f"log.{suffix}", []
+    for scans in (10_000, 40_000):
+        echo = np.arange(scans * 4)
+        sensor, index = echo % 24, echo // 4
+        none = np.full((scans, 3), np.nan)
+        log = Log.from_echoes(index, sensor, sensor, 1 + 0.001 * (echo % 7), stamp=none[:, 0], pose=none)
+        save_log(log, path)
+        del log
+        plan = csv_parts if suffix == "csv" else parquet_parts
+        before = pa.total_allocated_bytes()
+        tracemalloc.start()
+        assert sum(part.scans for part in plan(path, name="log", scans=2048)) == scans
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert pa.total_allocated_bytes() - before < 1e6
+    assert peaks[1] < 1.3 * peaks[0] + 1e5
+
+
+def test_huge_row_groups_are_made_small_first(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxsonar.batch_shards.LARGEST_GROUP", 8)
+    save_log(office(20), tmp_path / "log.parquet")
+    parts = shards_of(*find_inputs([tmp_path / "log.parquet"]), copies=tmp_path / "copies", sensors=24, scans=4)
+    assert parts[0].path == str(tmp_path / "copies" / "log.parquet.parquet")
+    assert pq.ParquetFile(parts[0].path).metadata.num_row_groups == 5
+    assert load_log(parts[0].path) == load_log(tmp_path / "log.parquet")
+
+
+def test_names_are_safe_and_different():
+    keys = [
+        Input(name, "", "csv").key for name in ("a.csv", "a b.csv", "a_b.csv", "_a.csv", "ä.csv", ".a.csv", "x" * 300)
+    ]
+    assert len(set(keys)) == len(keys)
+    assert keys[0] == "a.csv"
+    assert all(key[0].isalnum() and key.isascii() and len(key) < 120 for key in keys)

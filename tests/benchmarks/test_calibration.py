@@ -1,0 +1,147 @@
+"""The calibration benchmark: its bound against laws of its own, and measures on errors of known size."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.calibration import accuracy as calibration
+from benchmarks.calibration.accuracy import (
+    CONDITIONS,
+    Outcome,
+    bound,
+    measures,
+    path_in,
+    reports,
+    scene,
+    slipped,
+    trial,
+)
+from jaxsonar import random_room, simulate
+from jaxsonar.floor_plans.room import point_to_walls
+from jaxsonar.geometry.se2 import relative, wrap_angle
+
+KNOWN, ALONE, ODOMETRY = CONDITIONS[:3]
+
+
+@pytest.fixture(scope="module")
+def office():
+    """A trial in the office."""
+    return trial(KNOWN, 0, "office")
+
+
+def sds(covariance):
+    return np.sqrt(np.diag(covariance))
+
+
+@pytest.mark.parametrize("place", ["office", "random rooms"])
+def test_formulas_are_those_of_the_simulator(place):
+    one = trial(KNOWN, 0, place)
+    exact = simulate(one.true, one.room, one.poses)
+    first, own, places = scene(one.room, exact)
+    pairs = one.true.paths[exact.path[first]]
+    scale = np.full(len(first), 343.2 / float(one.true.speed_of_sound))
+    ends = np.asarray(one.true.position)[pairs]
+    got = reports(exact.kind[first], places[own], one.poses[exact.scan[first]], ends, scale)
+    got += np.asarray(one.true.range_offset)[pairs].mean(axis=1)
+    np.testing.assert_allclose(got, exact.range[first], rtol=0, atol=1e-12)
+
+
+def test_the_bound_grows_with_the_noise_and_with_what_is_unknown(office):
+    known = bound(office, mean_free=False)
+    np.testing.assert_allclose(known[:24].sum(axis=0), np.zeros(25), atol=1e-12)
+    # Priors hardly matter where scans tell this much.
+    np.testing.assert_allclose(sds(bound(office, mean_free=False, sigma=2e-4)), sds(known) / 5, rtol=0.02)
+    odometry = bound(office, mean_free=False, poses_free=True, odometry=0.02)
+    alone = bound(office, mean_free=False, poses_free=True)
+    exact = bound(office, mean_free=False, poses_free=True, odometry=1e-9)
+    for less, more in [(known, bound(office, mean_free=True)), (known, exact), (exact, odometry), (odometry, alone)]:
+        assert np.linalg.eigvalsh(more - less).min() > -1e-9 * np.linalg.eigvalsh(more).max()
+
+
+def test_the_bound_does_not_hang_on_the_frame(office):
+    """The room and all poses moved together."""
+    turn, shift = 0.7, np.array([1.0, -2.0])
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    room = replace(office.room, walls=office.room.walls @ matrix.T + shift, poles=office.room.poles @ matrix.T + shift)
+    poses = np.column_stack([office.poses[:, :2] @ matrix.T + shift, office.poses[:, 2] + turn])
+    moved = office._replace(room=room, poses=poses, heard=simulate(office.true, room, poses))
+    still = office._replace(heard=simulate(office.true, office.room, office.poses))
+    for settings in ({}, {"poses_free": True, "odometry": 0.02}):
+        a, b = (sds(bound(one, mean_free=True, **settings)) for one in (still, moved))
+        np.testing.assert_allclose(a, b, rtol=0.01)
+
+
+def test_paths_keep_clear_and_steps_are_as_said(rng):
+    room = random_room(rng)
+    poses = path_in(room, rng, 40)
+    assert (point_to_walls(poses[:, :2], room.walls) >= calibration.CLEARANCE).all()
+    way = np.hypot(*relative(poses[:-1], poses[1:])[:, :2].T)
+    assert (way >= calibration.STEP[0]).all()
+    assert (way <= calibration.STEP[1]).all()
+    np.testing.assert_allclose(slipped(poses, 0.0, rng)[:, :2], poses[:, :2], atol=1e-12)
+    off = relative(*(p[1:] for p in (poses, slipped(poses, 0.02, rng))))
+    assert 0 < np.hypot(off[:, 0], off[:, 1]).max() < 1
+
+
+def test_rings_and_logs_are_as_the_condition_says():
+    known, hard, alone, odometry = (trial(one, 1, "office") for one in (KNOWN, CONDITIONS[3], ALONE, ODOMETRY))
+    np.testing.assert_allclose(
+        np.abs(np.log(float(known.true.speed_of_sound / known.nominal.speed_of_sound))), 0.01, 0.02
+    )
+    np.testing.assert_allclose(np.std(known.true.range_offset), 0.005, rtol=0.4)
+    assert (np.sort(np.abs(hard.true.range_offset))[-2:] > 0.01).all()
+    np.testing.assert_array_equal(known.log.pose, known.poses)
+    assert np.isnan(alone.log.pose).all()
+    assert 0 < np.abs(wrap_angle(odometry.log.pose - odometry.poses)).max() < 0.5
+    np.testing.assert_array_equal(known.heard.range, odometry.heard.range)
+
+
+def held_against(one, error, covariance):
+    """A calibration that is off by so much, offsets then log speed, and says this of it."""
+    count = one.true.count
+    said = np.zeros((3 * count + 1, 3 * count + 1))
+    said[: count + 1, : count + 1] = covariance
+    speed = float(one.true.speed_of_sound) * float(np.exp(error[count]))
+    ring = replace(one.true, range_offset=one.true.range_offset + error[:count], speed_of_sound=speed)
+    return calibration.compared(ring, said, one, KNOWN, mean_free=False)
+
+
+def test_errors_at_the_bound_have_ratio_1_and_nees_1(office, rng):
+    least = bound(office, mean_free=False)
+    errors = rng.multivariate_normal(np.zeros(25), least, size=60, method="svd")
+    some = [held_against(office, error, least) for error in errors]
+    got = measures(some)
+    assert got["per_bound"] == pytest.approx(1, abs=0.1)
+    assert got["whitened"] == pytest.approx(1, abs=0.08)
+    assert got["nees"] == pytest.approx(1, abs=0.16)
+    assert got["within"] == pytest.approx(0.683, abs=0.05)
+    assert got["speed_per_bound"] == pytest.approx(got["speed_per_sd"]) == pytest.approx(1, abs=0.3)
+    assert got["converged"] == 1
+    far = held_against(office, 5 * errors[-1], least)
+    assert not far.converged
+    assert far.nees == pytest.approx(25 * some[-1].nees)
+    assert measures([some[0], Outcome(1, failed="no walls")])["failed"] == 1
+
+
+def test_growth_is_the_exponent():
+    rows = [{"scans": n, "processor": 3.0 * n**1.5} for n in (25, 100, 1000)]
+    assert calibration.growth(rows) == pytest.approx([1.5, 1.5])
+
+
+def test_what_is_written_can_be_read(tmp_path, monkeypatch):
+    def nothing(condition, seed, place):
+        return Outcome(seed, failed="no") if seed else Outcome(seed, rms=0.001, rms_bound=0.001, whitened=1.0)
+
+    monkeypatch.setattr(calibration, "outcome", nothing)
+    times = dict.fromkeys(("echoes", "placed", "first", "again", "processor"), 1.0)
+    monkeypatch.setattr(calibration, "timed", lambda scans, *_: times | {"scans": scans})
+    said = []
+    found = calibration.run(CONDITIONS[:2], {"office": 2}, [25, 100], progress=said.append)
+    told = calibration.write(found, tmp_path, {"seeds": 2})
+    read = json.loads((tmp_path / "calibration.json").read_text(), parse_constant=pytest.fail)
+    assert [row["failed"] for row in read["conditions"]] == [1, 1]
+    assert read["versions"]["jax"]
+    assert len(said) == 8
+    assert [table.row_count for table in calibration.tables(told)] == [2, 4]

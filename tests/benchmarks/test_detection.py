@@ -1,0 +1,235 @@
+"""The accuracy benchmark: peers on echoes without noise, measures on errors of known size, and all of its files."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks.detection import accuracy
+from benchmarks.detection.accuracy import ANSWERS, BASE, KINDS, Condition, Reported, Score, Truth, score
+from benchmarks.detection.baselines import PairConsensus, PointHough, arcs_of_scans, distinct
+from jaxsonar import Ring
+from jaxsonar.geometry.se2 import wrap_angle
+
+EXACT = Condition("", sigma=0.0, lost=0.0, false=0.0)
+
+
+@pytest.fixture(scope="module")
+def walls():
+    """Scans of one wall each."""
+    return accuracy.single_reflectors(EXACT, "plane", 40, seed=1)
+
+
+def worst(walls, peer):
+    """Largest error of the first line of each scan, and how many lines they have."""
+    found = [peer(arcs, 1e-9) for arcs in arcs_of_scans(walls.ring, walls.log)]
+    error = np.array([lines[0] - true.place[0] for lines, true in zip(found, walls.truth, strict=True)])
+    return np.abs(error[:, 0]).max(), np.abs(wrap_angle(error[:, 1])).max(), {len(lines) for lines in found}
+
+
+def test_consensus_finds_a_single_wall_exactly(walls):
+    rho, theta, count = worst(walls, PairConsensus())
+    assert rho < 1e-9
+    assert theta < 1e-7
+    assert count == {1}
+
+
+def test_points_find_a_single_wall_up_to_their_cells(walls):
+    peer = PointHough(pitch=np.radians(0.25), rho_cell=0.002, threshold=4.0)
+    rho, theta, _ = worst(walls, peer)
+    assert rho < 2 * peer.rho_cell
+    assert theta < 4 * peer.theta_cell
+
+
+def test_tangents_touch_both_arcs(walls):
+    arcs = next(arcs_of_scans(walls.ring, walls.log))
+    rho, theta = PairConsensus(hypotheses=50).tangents(arcs)
+    off = np.abs(arcs.ranges(rho, theta) - arcs.reach)
+    assert (np.sort(off, axis=1)[:, :2] < 1e-9).all()
+
+
+def test_points_of_arcs_are_as_far_as_the_echo_says(walls):
+    arcs = next(arcs_of_scans(walls.ring, walls.log))
+    count = len(PointHough().points(arcs))
+    each = [len(PointHough().points(arcs.take(np.array([k])))) for k in range(len(arcs.reach))]
+    assert sum(each) == count
+    for k in range(len(arcs.reach)):
+        one = arcs.take(np.array([k]))
+        points = PointHough().points(one)
+        foci = one.middle - one.half, one.middle + one.half
+        way = np.sum([np.linalg.norm(points - focus, axis=-1) for focus in foci], axis=0)
+        np.testing.assert_allclose(way, np.full(len(way), 2 * one.reach[0]), rtol=1e-12)
+
+
+def test_distinct_lines_are_apart_across_the_seam():
+    lines = np.array([[1.0, np.pi - 0.01], [1.02, -np.pi + 0.01], [1.0, 0.0], [1.3, 0.0]])
+    np.testing.assert_array_equal(distinct(lines), lines[[0, 2, 3]])
+
+
+def gaussian(rng, *, count, scale=1.0):
+    """A score of walls whose errors are normal with the bound's own covariance, times a factor."""
+    factor = rng.normal(size=(count, 2, 2)) * [[1e-3], [1e-2]]
+    cov = factor @ np.swapaxes(factor, 1, 2)
+    error = scale * np.einsum("kij,kj->ki", factor, rng.normal(size=(count, 2)))
+    bound = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    walls = np.ones(count, dtype=int)
+    counts = np.stack([walls, walls, 0 * walls, 0 * walls], axis=-1)
+    confusion = np.zeros((4, 5), dtype=int)
+    return Score(np.arange(count) // 5, counts, np.arange(count), error, bound, cov, confusion)
+
+
+@pytest.mark.parametrize("scale", [1.0, 3.0])
+def test_errors_at_the_bound_have_ratio_1_and_nees_2(rng, scale):
+    got = gaussian(rng, count=20_000, scale=scale).measures()
+    for key in ("rho_mm", "theta_deg"):
+        assert got[f"rmse_{key}_per_crb"] == pytest.approx(scale, abs=4 * got[f"rmse_{key}_per_crb_se"])
+        assert got[f"rmse_{key}"] / got[f"crb_{key}"] == pytest.approx(got[f"rmse_{key}_per_crb"])
+        assert got[f"p99_{key}_per_crb"] == pytest.approx(2.576 * scale, rel=0.05)
+    assert got["nees"] == pytest.approx(2 * scale**2, abs=4 * got["nees_se"])
+    assert got["nees_median"] == pytest.approx(2 * np.log(2) * scale**2, rel=0.05)
+    assert got["nees_se"] / scale**2 == pytest.approx(2 / np.sqrt(20_000), rel=0.2)
+
+
+def test_standard_errors_are_those_of_groups(rng):
+    group = np.repeat(np.arange(50), 20)
+    values = []
+    for _ in range(300):
+        top = np.repeat(rng.random(50) < 0.4, 20).astype(float)  # all rows of a group alike
+        values.append(accuracy.ratio(top, np.ones(1000), group))
+    value, error = np.array(values).T
+    assert error.mean() == pytest.approx(value.std(), rel=0.15)
+    assert error.mean() == pytest.approx(np.sqrt(0.4 * 0.6 / 50), rel=0.05)
+
+
+def truth(place, kind, heard):
+    return Truth(0, np.array(place), np.array(kind), np.array(heard), np.full((len(place), 2), 0.01))
+
+
+def test_walls_are_counted_once_and_kinds_by_place():
+    true = truth(
+        [[1.0, 0.0], [1.2, 1.5], [0.9, -3.1], [1.5, -1.5], [1.4, 2.5], [1.0, -0.8]],
+        [0, 0, 0, 1, 2, 0],
+        [9, 8, 3, 6, 4, 9],
+    )
+    said = Reported(
+        # The first wall, the same again, the wall across the seam that few echoes show, and a line at the corner.
+        lines=np.array([[1.01, 0.02], [1.05, 0.1], [0.9, 3.13], [1.52, -1.45]]),
+        cov=np.stack([np.eye(2), *[np.full((2, 2), np.nan)] * 3]),
+        others=np.array([[1.4, 2.5], [1.01, -0.8], [1.7, 0.7]]),
+        answers=np.array([ANSWERS.index(answer) for answer in ("edge", "undecided", "corner")]),
+    )
+    got = score([true], [said])
+    # Three clear walls: one found, one undecided, one not there at all; false are the second line and the corner's.
+    assert got.counts.tolist() == [[3, 1, 1, 2]]
+    np.testing.assert_allclose(got.error, [[0.01, 0.02]])
+    np.testing.assert_allclose(got.nees, [0.01**2 + 0.02**2])
+    table = {
+        (kind, answer): int(got.confusion[row, column])
+        for row, kind in enumerate((*KINDS, "none"))
+        for column, answer in enumerate(ANSWERS)
+        if got.confusion[row, column]
+    }
+    assert table == {
+        ("plane", "plane"): 1,
+        ("plane", "undecided"): 1,
+        ("plane", "nothing"): 1,
+        ("corner", "plane"): 1,
+        ("edge", "edge"): 1,
+        ("none", "plane"): 1,
+        ("none", "corner"): 1,
+    }
+    assert accuracy.answers(got.confusion) == pytest.approx(
+        {"reflectors": 5, "right": 2 / 3, "right_se": np.sqrt(2 / 27), "undecided": 0.2, "nothing": 0.2}
+    )
+
+
+def test_what_finds_everything_has_full_marks():
+    scans = accuracy.random_scans(BASE, 3, 3, seed=2)
+    perfect = []
+    for true in scans.truth:
+        plane = true.kind == 0
+        lines = true.place[plane]
+        nothing = np.zeros((len(lines), 2, 2)) + np.eye(2)
+        perfect.append(Reported(lines, nothing, true.place[~plane], true.kind[~plane]))
+    got = score(scans.truth, perfect)
+    assert got.measures()["recall"] == 1
+    assert got.measures()["false_per_scan"] == got.measures()["rmse_rho_mm"] == 0
+    assert np.trace(got.confusion[:, :3]) == got.confusion.sum() > 0
+
+
+def test_rooms_and_poses_are_the_same_in_every_condition():
+    some = [accuracy.random_scans(c, 2, 2, seed=3) for c in (BASE, Condition("", sensors=32), accuracy.HARD)]
+    places = [{tuple(np.round(place, 9)) for true in scans.truth for place in true.place} for scans in some]
+    assert all(len(places[0] & other) > 0.6 * min(len(places[0]), len(other)) for other in places[1:])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_single_reflectors_answer_where_they_are(kind):
+    scans = accuracy.single_reflectors(EXACT, kind, 20, seed=4)
+    position, log = np.asarray(scans.ring.position), scans.log
+    for k, true in enumerate(scans.truth):
+        assert true.kind.tolist() == [KINDS.index(kind)]
+        own = slice(log.start[k], log.start[k + 1])
+        a, b = position[log.tx[own]], position[log.rx[own]]
+        n = np.array([np.cos(true.place[0, 1]), np.sin(true.place[0, 1])])
+        at = true.place[0, 0] * n
+        middle = (a + b) / 2
+        way = {
+            "plane": np.linalg.norm(a + 2 * (at - a) @ np.outer(n, n) - b, axis=-1),
+            "corner": 2 * np.linalg.norm(middle - at, axis=-1),
+            "edge": np.linalg.norm(a - at, axis=-1) + np.linalg.norm(b - at, axis=-1),
+        }[kind]
+        np.testing.assert_allclose(2 * log.range[own], way, rtol=0, atol=1e-9)
+        assert true.heard.tolist() == [len(way)]
+        assert len(way) >= 4
+
+
+def test_three_walls_are_three_and_apart():
+    scans = accuracy.three_walls(accuracy.THREE_WALLS, 10, seed=5)
+    for true in scans.truth:
+        assert len(true.place) == 3
+        turn = np.abs(wrap_angle(true.place[:, None, 1] - true.place[:, 1]))[np.triu_indices(3, 1)]
+        assert (turn > np.radians(59.9)).all()
+    found = score(scans.truth, [Reported.of_lines(true.place + np.array([0.001, 0.01])) for true in scans.truth])
+    got = accuracy.worst_of_three(found)
+    assert got["all_found"] == 1
+    assert got["rho_mm_p50"] == pytest.approx(1.0)
+    assert got["theta_deg_p90"] == pytest.approx(np.degrees(0.01))
+
+
+def test_rings_of_conditions():
+    assert BASE.ring.neighbors == 3
+    assert Condition("", cone_deg=120).ring.neighbors == 7
+    assert Condition("", sensors=32).ring.neighbors == 4
+    assert isinstance(BASE.ring, Ring)
+    names = [c.name for c in accuracy.CONDITIONS]
+    assert len(set(names)) == len(names)
+
+
+def test_a_tiny_run_makes_every_file(tmp_path):
+    methods = {name: way for name, way in accuracy.METHODS.items() if not name.startswith("ml")}
+    noise = np.random.default_rng(0)
+
+    def nearly(ring, log, sigma):  # something with a covariance, kinds, and what is undecided
+        for said in accuracy.METHODS["consensus of pairs"](ring, log, sigma):
+            cov = np.zeros((len(said.lines), 2, 2)) + np.diag([1e-6, 1e-4])
+            other = noise.uniform(0.5, 1.5, (2, 2))
+            yield Reported(said.lines, cov, other, np.array([1, 3]))
+
+    settings = {"rooms": 1, "poses": 2, "single": 3, "seed": 0}
+    said = []
+    conditions = [BASE, Condition("sigma 1 mm", sigma=0.001), Condition("clean", lost=0.0, false=0.0)]
+    found = accuracy.run(
+        conditions, accuracy.ISOLATED[:1], methods | {"nearly": nearly}, **settings, progress=said.append
+    )
+    told = accuracy.write(found, tmp_path, settings)
+    assert len(said) == len(conditions) + 2
+    names = {path.name for path in tmp_path.iterdir()}
+    figures = {f"{name}.{suffix}" for name in ("crb", "robustness", "confusion", "nees") for suffix in ("svg", "png")}
+    assert names == figures | {"accuracy.json"}
+    read = json.loads((tmp_path / "accuracy.json").read_text(), parse_constant=pytest.fail)
+    assert [row["name"] for row in read["conditions"]] == [c.name for c in conditions]
+    assert set(read["conditions"][0]["methods"]) == {*methods, "nearly"}
+    assert read["versions"]["jax"]
+    assert read["settings"]["seed"] == 0
+    assert [table.row_count > 0 for table in accuracy.accuracy_figures.tables(told)] == [True] * 4

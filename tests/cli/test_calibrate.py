@@ -1,0 +1,128 @@
+"""Command calibrate: a ring file as documented, one line for every mistake, and nothing written then."""
+
+import shlex
+import shutil
+import tomllib
+
+import numpy as np
+import pytest
+from support.commands import HEADER, OFFICE, PATH, RING, call, contents
+
+from jaxsonar import load_ring
+
+# With one mode nothing is sharpened, and the shapes are those of test_calibration.
+CALIBRATE = "calibrate log.csv --ring faw --free speed"
+FASTER = 1.01
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    """The office as a ring in warmer air hears it, and the ring that is found from it."""
+    folder = tmp_path_factory.mktemp("office")
+    (folder / "warm.toml").write_text(RING.replace("name = 'r'", f"name = 'r'\nspeed_of_sound = {FASTER * 343.2}"))
+    simulated = ["simulate", OFFICE, "--ring", folder / "warm.toml", "--path", PATH, "--sigma", "0.001"]
+    assert call(*simulated, "-o", folder / "log.csv") == 0
+    arguments = ["calibrate", folder / "log.csv", "--ring", "faw", "--free", "speed", "-o", folder / "ring.toml"]
+    assert call(*arguments, "--figure", folder / "figure.svg") == 0
+    return folder
+
+
+@pytest.fixture
+def here(office, tmp_path, monkeypatch):
+    for name in ("log.csv", "ring.toml"):
+        shutil.copy(office / name, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_ring_that_is_written_is_a_ring_with_its_calibration(office):
+    ring = load_ring(office / "ring.toml")
+    assert float(ring.speed_of_sound) == pytest.approx(FASTER * 343.2, rel=1e-3)
+    np.testing.assert_allclose(ring.position, load_ring("faw").position, atol=1e-12)
+    table = tomllib.loads((office / "ring.toml").read_text())["calibration"]
+    assert table["estimated"] == ["speed"]
+    assert table["scans"] == 17
+    assert set(table["held"]) >= {"offset", "position", "radius", "heading"}
+    assert table["residual_rms_after"] < table["residual_rms_before"]
+
+
+def test_the_figure_is_drawn(office):
+    text = (office / "figure.svg").read_text()
+    assert text.startswith("<?xml")
+    assert "<svg" in text
+
+
+def test_a_dash_writes_to_standard_output_and_words_go_elsewhere(here, capsys):
+    before = contents(here)
+    assert call(*CALIBRATE.split(), "-o", "-") == 0
+    came = capsys.readouterr()
+    assert tomllib.loads(came.out) == tomllib.loads((here / "ring.toml").read_text())
+    assert "17 scans" in came.err
+    assert "speed of sound" in came.err
+    assert contents(here) == before
+
+
+NO_POSES = HEADER + "".join(f"{k},{k},,,,3,3,1.0\n" for k in range(20))
+HALF = RING.replace("name = 'r'", "name = 'r'\nspeed_of_sound = 171.6")
+OUT = f"{CALIBRATE} -o out.toml"
+MISTAKES = {
+    "no log": ("calibrate --ring faw -o out.toml", {}, ["LOG"]),
+    "no ring": ("calibrate log.csv -o out.toml", {}, ["--ring"]),
+    "no output": (CALIBRATE, {}, ["--output"]),
+    "unknown option": (f"{OUT} --scan 3", {}, ["--scan"]),
+    "abbreviated option": (f"{OUT} --temp 20", {}, ["--temp"]),
+    "missing log": ("calibrate no.csv --ring faw -o out.toml", {}, ["no.csv", "No such file"]),
+    "one of two logs missing": ("calibrate log.csv no.csv --ring faw -o out.toml", {}, ["no.csv", "No such file"]),
+    "no such ring": ("calibrate log.csv --ring fawn -o out.toml", {}, ["fawn", "faw"]),
+    "sensor beyond the ring": ("calibrate log.csv --ring corridor8 -o out.toml", {}, ["log.csv", "tx", "0 to 7"]),
+    "unknown freedom": (f"{OUT} --free speed,colour", {}, ["colour", "offset", "heading"]),
+    "no freedom": (f"{OUT} --free ''", {}, ["free", "offset"]),
+    "unknown poses": (f"{OUT} --poses guess", {}, ["guess", "trust", "estimate"]),
+    "temperature of the moon": (f"{OUT} --temperature 120", {}, ["--temperature", "120", "85"]),
+    "temperature that is no number": (f"{OUT} --temperature warm", {}, ["--temperature", "warm"]),
+    "odometry of 0": (f"{OUT} --odometry 0", {}, ["--odometry", "0"]),
+    "sigma of 0": (f"{OUT} --sigma 0", {}, ["--sigma", "0"]),
+    "sigma without end": (f"{OUT} --sigma inf", {}, ["--sigma", "inf"]),
+    "window of nothing": (f"{OUT} --window 0", {}, ["--window", "0"]),
+    "ring with half the speed of sound": (
+        "calibrate log.csv --ring half.toml -o out.toml",
+        {"half.toml": HALF},
+        ["log.csv", "speed_of_sound 171.6", "290 to 380"],
+    ),
+    "log without poses": (
+        "calibrate bad.csv --ring faw --free speed -o out.toml",
+        {"bad.csv": NO_POSES},
+        ["bad.csv", "0 of 20 scans", "3 or more"],
+    ),
+    "log without walls": (
+        "calibrate bad.csv --ring faw --free speed -o out.toml",
+        {"bad.csv": HEADER + "".join(f"{k},{k},0,0,0,3,3,{0.3 + 0.08 * k}\n" for k in range(20))},
+        ["bad.csv", "allowed"],
+    ),
+    "log that is none": (
+        "calibrate bad.csv --ring faw -o out.toml",
+        {"bad.csv": "some\ntext\n"},
+        ["bad.csv", "row 1"],
+    ),
+    "figure of unknown suffix": (f"{OUT} --figure a.gif", {}, ["--figure", "a.gif", ".svg"]),
+    "figure into a missing folder": (f"{OUT} --figure no/a.svg", {}, ["no/a.svg", "folder"]),
+    "ring into a missing folder": (f"{CALIBRATE} -o no/out.toml", {}, ["no/out.toml", "folder"]),
+    "ring that is a folder": (f"{CALIBRATE} -o dir", {"dir": None}, ["dir", "directory"]),
+    "ring over its log": (f"{CALIBRATE} -o log.csv", {}, ["log.csv", "another file"]),
+    "ring over itself": ("calibrate log.csv --ring ring.toml -o ring.toml", {}, ["ring.toml", "another file"]),
+}
+
+
+@pytest.mark.parametrize(("command", "files", "words"), MISTAKES.values(), ids=MISTAKES.keys())
+def test_a_mistake_is_one_line_and_writes_nothing(here, capsys, command, files, words):
+    for name, text in files.items():
+        (here / name).mkdir() if text is None else (here / name).write_text(text)
+    before = contents(here)
+    assert call(*shlex.split(command)) == 2
+    came = capsys.readouterr()
+    assert came.out == ""
+    [line] = came.err.splitlines()
+    assert line.startswith("jaxsonar")
+    for word in words:
+        assert word in line
+    assert contents(here) == before

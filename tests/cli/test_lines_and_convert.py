@@ -1,0 +1,506 @@
+"""The command line: files as documented, the same result from the same call, one line for every mistake."""
+
+import csv
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.commands import DATA, HEADER, OFFICE, PATH, RING, SIMULATE, call, contents, interrupted_after, script
+
+from jaxsonar import load_log, load_ring, save_log
+from jaxsonar.cli import app as cli
+from jaxsonar.detection.settings_toml import load_settings
+from jaxsonar.reports.plot_style import FORMATS
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    """A folder with the office's log and its lines."""
+    folder = tmp_path_factory.mktemp("office")
+    assert call(*SIMULATE, "-o", folder / "log.csv") == 0
+    assert call("lines", folder / "log.csv", "--ring", "faw", "-o", folder / "lines.jsonl") == 0
+    return folder
+
+
+@pytest.fixture
+def here(office, tmp_path, monkeypatch):
+    """A working folder with copies of the log and the lines."""
+    for name in ("log.csv", "lines.jsonl"):
+        shutil.copy(office / name, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def read_models(path):
+    def refuse(constant):
+        raise ValueError(f"{constant} is no JSON")
+
+    return [json.loads(line, parse_constant=refuse) for line in Path(path).read_text().splitlines()]
+
+
+# What is written
+
+
+def test_a_simulated_log_is_a_scan_log_of_the_path(here):
+    with open("log.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == [*HEADER.strip().split(","), "amplitude"]
+    with open(PATH, newline="") as file:
+        poses = list(csv.DictReader(file))
+    scans = list(dict.fromkeys(row["scan"] for row in rows))
+    assert scans == [str(k) for k in range(len(poses))]
+    listened = {tuple(pair) for pair in load_ring("faw").paths.tolist()}
+    for row in rows:
+        pose = poses[int(row["scan"])]
+        assert all(float(row[key]) == float(pose[key]) for key in ("stamp", "x", "y", "theta"))
+        assert (int(row["tx"]), int(row["rx"])) in listened
+        assert 0 < float(row["range"]) < 2.02
+
+
+@pytest.mark.parametrize("method", ["ml", "hough"])
+def test_lines_are_as_documented(here, method):
+    if method == "hough":
+        assert call("lines", "log.csv", "--ring", "faw", "--method", "hough", "-o", "lines.jsonl") == 0
+    models, log = read_models("lines.jsonl"), load_log("log.csv")
+    listened = {tuple(pair) for pair in load_ring("faw").paths.tolist()}
+    more = {"points", "undecided", "sigma"} if method == "ml" else set()
+    strength = {"cov", "evidence"} if method == "ml" else {"votes"}
+    assert [model["scan"] for model in models] == log.scan.tolist()
+    assert [model["stamp"] for model in models] == log.stamp.tolist()
+    for model in models:
+        assert set(model) - {"empty"} == {"scan", "stamp", "lines"} | more
+        assert model["lines"] or model["empty"]
+        for line in model["lines"]:
+            assert set(line) == {"rho", "theta", "segment", "echoes", "paths"} | strength
+            assert line["rho"] >= 0
+            assert -math.pi <= line["theta"] < math.pi
+            assert isinstance(line["echoes"], int)
+            assert line["echoes"] >= len(line["paths"]) > 0
+            assert {tuple(path) for path in line["paths"]} <= listened
+            normal = np.array([math.cos(line["theta"]), math.sin(line["theta"])])
+            assert np.shape(line["segment"]) == (2, 2)
+            np.testing.assert_allclose(np.array(line["segment"]) @ normal, line["rho"], atol=1e-5)
+            first, last = np.array(line["segment"]) @ np.array([-normal[1], normal[0]])
+            assert first <= last, "counter-clockwise as seen from the robot"
+            if method == "ml":
+                assert (np.linalg.eigvalsh(line["cov"]) > 0).all()
+
+
+def test_settings_are_written_beside_the_result_and_give_it_again(here, office):
+    settings = office / "lines.settings.toml"
+    assert set(tomllib.loads(settings.read_text())) == {
+        *("theta_cells", "rho_cells", "rho_cell", "point_pitch", "smoothing", "threshold", "min_echoes")
+    }
+    assert call("lines", "log.csv", "--ring", "faw", "--settings", settings, "-o", "again.jsonl") == 0
+    assert Path("again.jsonl").read_bytes() == Path("lines.jsonl").read_bytes()
+    assert Path("again.settings.toml").read_bytes() == settings.read_bytes()
+
+
+def test_settings_change_the_result_and_are_those_that_are_written(here):
+    Path("mine.toml").write_text("threshold = 0.35\nmin_echoes = 5\nsmoothing = [1, 2, 3, 2, 1]\n")
+    paper = ["lines", "log.csv", "--ring", "faw", "--method", "hough"]
+    assert call(*paper, "-o", "paper.jsonl") == 0
+    assert call(*paper, "--settings", "mine.toml", "-o", "again.jsonl") == 0
+    assert load_settings("again.settings.toml") == load_settings("mine.toml")
+    lines = [line for model in read_models("again.jsonl") for line in model["lines"]]
+    assert lines
+    assert min(line["echoes"] for line in lines) >= 5
+    assert Path("again.jsonl").read_bytes() != Path("paper.jsonl").read_bytes()
+
+
+def test_lines_to_standard_output(here, capsys):
+    before = contents(here)
+    assert call("lines", "log.csv", "--ring", "faw", "-o", "-") == 0
+    came = capsys.readouterr()
+    assert came.out.encode() == Path("lines.jsonl").read_bytes()
+    assert came.err.startswith("17 scans, ")
+    assert contents(here) == before
+
+
+def test_a_simulation_to_standard_output(here, capsys):
+    before = contents(here)
+    assert call(*SIMULATE, "-o", "-") == 0
+    came = capsys.readouterr()
+    assert came.out.encode() == Path("log.csv").read_bytes()
+    assert len(came.err.splitlines()) == 1
+    assert contents(here) == before
+
+
+def test_lines_through_a_named_pipe_leave_nothing_beside_it(here):
+    os.mkfifo("pipe.jsonl")
+    with ThreadPoolExecutor() as pool:
+        came = pool.submit(Path("pipe.jsonl").read_bytes)
+        before = contents(here)
+        assert call("lines", "log.csv", "--ring", "faw", "-o", "pipe.jsonl") == 0
+        assert came.result(timeout=60) == Path("lines.jsonl").read_bytes()
+    assert contents(here) == before
+
+
+def test_output_of_the_installed_command_can_be_appended_to_a_file(here):
+    Path("both.csv").write_bytes(b"before\n")
+    with open("both.csv", "a") as file:
+        command = [Path(sys.executable).parent / "jaxsonar", *SIMULATE, "-o", "-"]
+        assert subprocess.run([*map(str, command)], stdout=file, stderr=subprocess.PIPE, timeout=120).returncode == 0
+    assert Path("both.csv").read_bytes() == b"before\n" + Path("log.csv").read_bytes()
+
+
+def test_the_same_seed_gives_the_same_log(here):
+    for name, seed in (("same.csv", 1), ("other.csv", 2)):
+        assert call(*SIMULATE[:-1], seed, "-o", name) == 0
+    assert Path("same.csv").read_bytes() == Path("log.csv").read_bytes()
+    assert Path("other.csv").read_bytes() != Path("log.csv").read_bytes()
+
+
+def test_errors_of_the_ring_are_simulated(here):
+    options = ("--drift", "0.01", "--dropout", "0.5", "--clutter", "0.3", "--max-echoes", "1")
+    assert call(*SIMULATE, *options, "-o", "bad.csv") == 0
+    good, bad = load_log("log.csv"), load_log("bad.csv")
+    assert len(bad) == len(good)
+    assert 0.2 * len(good.tx) < len(bad.tx) < 0.9 * len(good.tx)
+    places = np.stack([bad.echo_scan, bad.tx, bad.rx], axis=-1)
+    assert len(np.unique(places, axis=0)) == len(places), "one echo a path"
+
+
+def test_conversions_lose_nothing(here):
+    pytest.importorskip("pyarrow")
+    assert call("convert", "log.csv", "log.parquet") == 0
+    assert call("convert", "log.parquet", "back.csv") == 0
+    assert Path("back.csv").read_bytes() == Path("log.csv").read_bytes()
+    assert load_log("log.parquet") == load_log("log.csv")
+    shutil.move("log.parquet", "log.data")
+    assert call("convert", "log.data", "named.csv", "--from", "parquet") == 0
+    assert Path("named.csv").read_bytes() == Path("log.csv").read_bytes()
+
+
+def test_parquet_is_as_good_as_csv(here):
+    pytest.importorskip("pyarrow")
+    assert call(*SIMULATE, "-o", "log.parquet") == 0
+    assert call("lines", "log.parquet", "--ring", "faw", "-o", "again.jsonl") == 0
+    assert Path("again.jsonl").read_bytes() == Path("lines.jsonl").read_bytes()
+
+
+@pytest.mark.parametrize(("suffix", "start"), [("svg", b"<?xml"), ("png", b"\x89PNG"), ("PDF", b"%PDF")])
+def test_a_figure_of_one_scan(here, suffix, start):
+    figure = Path(f"scan.{suffix}")
+    assert call("lines", "log.csv", "--ring", "faw", "-o", "again.jsonl", "--figure", figure, "--scan", 3) == 0
+    assert figure.read_bytes().startswith(start)
+    assert Path("again.jsonl").read_bytes() == Path("lines.jsonl").read_bytes()
+
+
+def test_scan_chooses_what_is_drawn(here):
+    def drawn(*chosen):
+        assert call("lines", "log.csv", "--ring", "faw", "-o", "again.jsonl", "--figure", "a.svg", *chosen) == 0
+        return Path("a.svg").read_bytes()
+
+    assert drawn() == drawn("--scan", 0)
+    assert drawn() != drawn("--scan", 3)
+
+
+def test_the_command_line_knows_the_figures_formats():
+    assert cli.FIGURES == FORMATS
+
+
+def test_logs_without_scans_or_echoes_are_no_mistake(here, capsys):
+    Path("empty.csv").write_text(HEADER)
+    assert call("lines", "empty.csv", "--ring", "faw", "-o", "empty.jsonl") == 0
+    assert Path("empty.jsonl").read_bytes() == b""
+    assert call("convert", "empty.csv", "copy.csv") == 0
+    assert Path("copy.csv").read_text() == HEADER
+    Path("silent.csv").write_text(HEADER + "-7,,,,,,,\n9,1.5,,,,,,\n")
+    silent = ["lines", "silent.csv", "--ring", "faw", "--method", "hough", "-o", "silent.jsonl"]
+    assert call(*silent, "--figure", "a.svg") == 0
+    models = read_models("silent.jsonl")
+    assert [(model["scan"], model["stamp"], model["lines"]) for model in models] == [(-7, None, []), (9, 1.5, [])]
+    assert all(model["empty"] for model in models)
+    assert "2 scans, 0 lines" in capsys.readouterr().err
+
+
+def test_echoes_that_the_ring_does_not_listen_to_are_told(here, capsys):
+    Path("wide.csv").write_text(HEADER + "0,,,,,3,12,1.0\n0,,,,,3,3,1.0\n")
+    assert call("lines", "wide.csv", "--ring", "faw", "--method", "hough", "-o", "wide.jsonl") == 0
+    assert "left out 1 echo" in capsys.readouterr().err
+
+
+# Mistakes: what came, what is allowed, and nothing written
+
+ROOM = '{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"kind": "%s"}, "geometry": %s}]}'
+SIMULATE_ANY = "simulate {office} --ring faw --path {path} -o out.csv"
+LINES = "lines log.csv --ring faw -o out.jsonl"
+
+MISTAKES = {
+    "no command": ("", {}, ["COMMAND"]),
+    "unknown command": ("slam2 log.csv", {}, ["slam2", "demo", "lines", "simulate", "convert"]),
+    "no ring": ("lines log.csv -o out.jsonl", {}, ["--ring"]),
+    "no output": ("lines log.csv --ring faw", {}, ["--output"]),
+    "unknown option": (f"{LINES} --speed 3", {}, ["--speed"]),
+    "abbreviated option": ("lines log.csv --rin faw -o out.jsonl", {}, ["--ring"]),
+    "unknown method": (f"{LINES} --method best", {}, ["best", "hough"]),
+    "missing log": ("lines no.csv --ring faw -o out.jsonl", {}, ["no.csv", "No such file"]),
+    "log that is a directory": ("lines dir.csv --ring faw -o out.jsonl", {"dir.csv": None}, ["dir.csv", "directory"]),
+    "log of unknown suffix": (
+        "lines log.txt --ring faw -o out.jsonl",
+        {"log.txt": HEADER},
+        [".txt", ".csv", ".parquet"],
+    ),
+    "log that is no number": (
+        "lines bad.csv --ring faw -o out.jsonl",
+        {"bad.csv": HEADER + "0,,,,,3,3,1.0\n0,,,,,3,3,one\n"},
+        ["bad.csv", "row 3", "column range", "one", "above 0"],
+    ),
+    "log with a column too few": (
+        "lines bad.csv --ring faw -o out.jsonl",
+        {"bad.csv": HEADER + "0,,,,3,3,1.0\n"},
+        ["bad.csv", "row 2", "7 columns", "8"],
+    ),
+    "log without a header": ("lines bad.csv --ring faw -o out.jsonl", {"bad.csv": ""}, ["bad.csv", "row 1", "header"]),
+    "no such ring": ("lines log.csv --ring fawn -o out.jsonl", {}, ["fawn", "faw", "corridor8", "scitos24", "sew-amr"]),
+    "ring with an unknown key": (
+        "lines log.csv --ring ring.toml -o out.jsonl",
+        {"ring.toml": RING + "colour = 'red'\n"},
+        ["ring.toml", "ring.colour", "count", "radius"],
+    ),
+    "ring out of range": (
+        "lines log.csv --ring ring.toml -o out.jsonl",
+        {"ring.toml": RING.replace("= 60", "= 190")},
+        ["ring.toml", "ring.beam_deg", "190", "180"],
+    ),
+    "ring with a missing key": (
+        "lines log.csv --ring ring.toml -o out.jsonl",
+        {"ring.toml": RING.replace("radius = 0.28\n", "")},
+        ["ring.toml", "ring.radius", "missing"],
+    ),
+    "ring that is no TOML": ("lines log.csv --ring ring.toml -o o.jsonl", {"ring.toml": "{]"}, ["ring.toml", "TOML"]),
+    "sensor that the ring does not have": (
+        "lines log.csv --ring corridor8 -o out.jsonl",
+        {},
+        ["scan 0", "tx", "0 to 7", "corridor8"],
+    ),
+    "scan that the log does not have": (f"{LINES} --figure a.svg --scan 17", {}, ["17", "log.csv", "0 to 16"]),
+    "scan that is no number": (f"{LINES} --figure a.svg --scan one", {}, ["--scan", "one", "whole number"]),
+    "scan without a figure": (f"{LINES} --scan 3", {}, ["--scan 3", "--figure"]),
+    "figure of unknown suffix": (f"{LINES} --figure a.gif", {}, ["a.gif", ".svg", ".png", ".pdf"]),
+    "figure without a suffix": (f"{LINES} --figure png", {}, ["png", ".svg", ".png", ".pdf"]),
+    "missing output folder": ("lines log.csv --ring faw -o no/out.jsonl", {}, ["no/out.jsonl", "no such folder"]),
+    "output folder that is a file": (
+        "lines log.csv --ring faw -o log.csv/out.jsonl",
+        {},
+        ["log.csv/out.jsonl", "no such folder"],
+    ),
+    "output that is a folder": ("lines log.csv --ring faw -o dir", {"dir": None}, ["dir", "directory"]),
+    "missing settings": (f"{LINES} --settings no.toml", {}, ["no.toml", "No such file"]),
+    "settings that are no TOML": (
+        f"{LINES} --settings s.toml",
+        {"s.toml": "theta_cells"},
+        ["s.toml", "'='", "TOML"],
+    ),
+    "settings with an unknown key": (f"{LINES} --settings s.toml", {"s.toml": "cells = 9"}, ["cells", "theta_cells"]),
+    "settings of a wrong type": (
+        f"{LINES} --settings s.toml",
+        {"s.toml": "theta_cells = 'many'"},
+        ["s.toml", "theta_cells", "int"],
+    ),
+    "settings out of range": (
+        f"{LINES} --settings s.toml",
+        {"s.toml": "theta_cells = 7"},
+        ["s.toml", "theta_cells = 7", "even"],
+    ),
+    "settings that are not finite": (
+        f"{LINES} --settings s.toml",
+        {"s.toml": "rho_cell = nan"},
+        ["rho_cell = nan", "0 m"],
+    ),
+    "settings too small for the ring": (
+        f"{LINES} --settings s.toml",
+        {"s.toml": "rho_cells = 20"},
+        ["rho_cells 20", "0.8 m", "2.28"],
+    ),
+    "dropout beyond 1": (f"{SIMULATE_ANY} --dropout 1.5", {}, ["--dropout", "1.5", "0 to 1"]),
+    "sigma below 0": (f"{SIMULATE_ANY} --sigma -1", {}, ["--sigma", "-1", "from 0"]),
+    "sigma that is not a number": (f"{SIMULATE_ANY} --sigma nan", {}, ["--sigma", "nan", "from 0"]),
+    "sigma without end": (f"{SIMULATE_ANY} --sigma inf", {}, ["--sigma", "inf", "from 0"]),
+    "drift that is no number": (f"{SIMULATE_ANY} --drift much", {}, ["--drift", "much", "from 0"]),
+    "more clutter than a log can hold": (f"{SIMULATE_ANY} --clutter 1e9", {}, ["--clutter", "1e9", "0 to 100"]),
+    "clutter below 0": (f"{SIMULATE_ANY} --clutter=-0.1", {}, ["--clutter", "-0.1", "from 0"]),
+    "seed below 0": (f"{SIMULATE_ANY} --seed -1", {}, ["--seed", "-1", "from 0"]),
+    "seed that is not whole": (f"{SIMULATE_ANY} --seed 1.5", {}, ["--seed", "1.5", "whole number"]),
+    "no echo a path": (f"{SIMULATE_ANY} --max-echoes 0", {}, ["--max-echoes", "0", "1 to 64"]),
+    "log of unknown suffix from a simulation": (
+        SIMULATE_ANY.replace("out.csv", "out.log"),
+        {},
+        ["out.log", ".csv", ".parquet"],
+    ),
+    "missing room": ("simulate no.geojson --ring faw --path {path} -o out.csv", {}, ["no.geojson", "No such file"]),
+    "room that is no JSON": (
+        "simulate r.geojson --ring faw --path {path} -o out.csv",
+        {"r.geojson": "{"},
+        ["r.geojson", "JSON", "FeatureCollection"],
+    ),
+    "room with a point of unknown kind": (
+        "simulate r.geojson --ring faw --path {path} -o out.csv",
+        {"r.geojson": ROOM % ("tree", '{"type": "Point", "coordinates": [1, 2]}')},
+        ["r.geojson", "feature 0", "tree", "pole"],
+    ),
+    "room with half a wall": (
+        "simulate r.geojson --ring faw --path {path} -o out.csv",
+        {"r.geojson": ROOM % ("wall", '{"type": "LineString", "coordinates": [[1], [2]]}')},
+        ["r.geojson", "feature 0", "[1]", "[x, y]"],
+    ),
+    "missing path": ("simulate {office} --ring faw --path no.csv -o out.csv", {}, ["no.csv", "No such file"]),
+    "path with a missing column": (
+        "simulate {office} --ring faw --path p.csv -o out.csv",
+        {"p.csv": "x,y\n0,0\n"},
+        ["p.csv", "row 1", "x,y", "theta"],
+    ),
+    "path that is not a number": (
+        "simulate {office} --ring faw --path p.csv -o out.csv",
+        {"p.csv": "x,y,theta\n0,0,0\n0,nan,0\n"},
+        ["p.csv", "row 3", "column y", "nan", "finite"],
+    ),
+    "path without a pose": (
+        "simulate {office} --ring faw --path p.csv -o out.csv",
+        {"p.csv": "x,y,theta\n"},
+        ["p.csv", "no pose"],
+    ),
+    "output over its input": (
+        "lines log.csv --ring faw -o log.csv",
+        {},
+        ["log.csv", "another file"],
+    ),
+    "figure into a missing folder": (f"{LINES} --figure nowhere/a.svg", {}, ["nowhere/a.svg", "folder"]),
+    "ring far too large": (
+        "lines log.csv --ring ring.toml -o o.jsonl",
+        {"ring.toml": RING.replace("max_range = 2", "max_range = 200")},
+        ["ring.toml", "max_range", "100 m"],
+    ),
+    "settings nested deeply": (f"{LINES} --settings s.toml", {"s.toml": "a = " + "[" * 3000}, ["s.toml", "TOML"]),
+    "settings with too many cells": (
+        f"{LINES} --settings s.toml",
+        {"s.toml": "theta_cells = 10000\nrho_cells = 10000"},
+        ["s.toml", "rho_cells", "million"],
+    ),
+    "path with an endless field": (
+        "simulate {office} --ring faw --path p.csv -o out.csv",
+        {"p.csv": "x,y,theta\n" + "1" * 200_000 + ",0,0\n"},
+        ["p.csv", "row 2", "finite"],
+    ),
+    "path back in time": (
+        "simulate {office} --ring faw --path p.csv -o out.csv",
+        {"p.csv": "stamp,x,y,theta\n1,0,0,0\n0,0,0,0\n"},
+        ["p.csv", "row 3", "stamp", "no earlier"],
+    ),
+    "log to an unknown suffix": ("convert log.csv out.txt", {}, ["out.txt", ".txt", ".csv", ".parquet"]),
+    "log from an unknown suffix": (
+        "convert log.dat out.csv",
+        {"log.dat": HEADER},
+        ["log.dat", "scitos24", "corridor8"],
+    ),
+    "log from an unknown format": ("convert log.csv out.csv --from bag", {}, ["bag", "scitos24", "parquet"]),
+    "log from what it is not": ("convert log.csv out.csv --from parquet", {}, ["log.csv", "Parquet"]),
+    "recording from what it is not": ("convert log.csv out.csv --from scitos24", {}, ["log.csv"]),
+    "demo into a file": ("demo -o log.csv", {}, ["log.csv", "folder"]),
+    "demo of no seed": ("demo -o d --seed x", {}, ["--seed", "x", "whole number"]),
+}
+
+
+@pytest.mark.parametrize(("line", "files", "said"), list(MISTAKES.values()), ids=list(MISTAKES))
+def test_a_mistake_is_one_line_and_leaves_everything_as_it_was(here, capsys, line, files, said):
+    if "parquet" in line:
+        pytest.importorskip("pyarrow")
+    for name, text in files.items():
+        Path(name).mkdir() if text is None else Path(name).write_text(text)
+    for name in ("out.jsonl", "out.csv", "a.svg"):
+        Path(name).write_text("what was here before\n")
+    before = contents(here)
+    assert call(*line.format(office=OFFICE, path=PATH).split()) == 2
+    came = capsys.readouterr()
+    assert came.out == ""
+    assert came.err.endswith("\n")
+    assert len(came.err.splitlines()) == 1, came.err
+    assert came.err.startswith("jaxsonar")
+    for words in said:
+        assert words in came.err
+    assert contents(here) == before
+
+
+def test_a_mistake_with_a_line_break_is_one_line(here, capsys):
+    assert call("lines", "log.csv", "--ring", "faw", "-o", "out.jsonl", "--two\nlines") == 2
+    assert call("lines", "two\nlines.csv", "--ring", "faw", "-o", "out.jsonl") == 2
+    assert call("lines", "log.csv", "--ring", "two\nlines", "-o", "out.jsonl") == 2
+    assert len(capsys.readouterr().err.splitlines()) == 3
+
+
+def test_mistakes_of_the_installed_command(here):
+    done = script("convert", "no.csv", "out.csv")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert "no.csv" in done.stderr
+
+
+def test_ctrl_c_leaves_no_half_result(here, capsys, monkeypatch, faw_ring):
+    from jaxsonar.detection import extract as local
+
+    models = list(local.local_models(faw_ring, load_log("log.csv")[:2]))
+    monkeypatch.setattr(local, "local_models", interrupted_after(models))
+    before = contents(here)
+    assert call("lines", "log.csv", "--ring", "faw", "-o", "out.jsonl") == 1
+    came = capsys.readouterr()
+    assert came.out == ""
+    assert came.err == "jaxsonar lines: interrupted\n"
+    assert contents(here) == before
+
+
+@pytest.mark.parametrize(
+    "command", [SIMULATE, ["lines", "long.csv", "--ring", "faw", "--method", "hough"]], ids=["simulate", "lines"]
+)
+def test_a_reader_that_leaves_early_is_no_accident(here, command):
+    log = load_log("log.csv")
+    rows = Path("log.csv").read_text().splitlines(keepends=True)
+    if command[0] == "lines":  # more than a pipe holds
+        texts = [
+            f"{k * len(log) + int(row.partition(',')[0])},{row.partition(',')[2]}"
+            for k in range(20)
+            for row in rows[1:]
+        ]
+        Path("long.csv").write_text("".join([rows[0], *texts]))
+    arguments = [str(Path(sys.executable).parent / "jaxsonar"), *map(str, command), "-o", "-"]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        first = process.stdout.readline()
+        process.stdout.close()
+        err = process.stderr.read()
+        code = process.wait(timeout=120)
+    assert first.startswith("scan," if command[0] == "simulate" else '{"scan": 0')
+    assert code in (0, 1)  # 0 where all was written before the reader had gone
+    assert "Traceback" not in err
+    assert "Exception" not in err
+    assert len(err.splitlines()) <= 1
+
+
+def test_version(capsys):
+    project = tomllib.loads((DATA.parents[1] / "pyproject.toml").read_text())["project"]
+    assert call("--version") == 0
+    assert capsys.readouterr().out == f"jaxsonar {project['version']}\n"
+
+
+def test_a_saved_log_is_what_the_command_reads(here):
+    """Round trip through the library between two commands."""
+    log = load_log("log.csv")
+    save_log(log[3:5], "part.csv")
+    assert call("lines", "part.csv", "--ring", "faw", "-o", "part.jsonl") == 0
+    part, whole = read_models("part.jsonl"), read_models("lines.jsonl")
+    assert len(part) == 2
+    for mine, its in zip(part, whole[3:5], strict=True):  # the sums of other shapes may round differently
+        assert mine["scan"] == its["scan"]
+        assert [line["paths"] for line in mine["lines"]] == [line["paths"] for line in its["lines"]]
+        for key in ("rho", "theta", "segment"):
+            ours, theirs = ([line[key] for line in model["lines"]] for model in (mine, its))
+            np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-5)

@@ -1,0 +1,90 @@
+"""What ``jaxsonar simulate`` puts beside the echoes: odometry that drifts, no poses, the truth in a file of its own."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxsonar import load_log
+from jaxsonar.cli import app as cli
+from jaxsonar.estimation.trajectory import load_trajectory
+from jaxsonar.simulation.office import load_office
+from jaxsonar.simulation.wheel_odometry import drifted
+
+DATA = Path(__file__).resolve().parents[2] / "jaxsonar" / "data"
+SIMULATE = ["simulate", DATA / "office.geojson", "--ring", "faw", "--path", DATA / "office-path.csv", "--seed", "5"]
+OFFICE = load_office()
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def call(*arguments):
+    try:
+        return cli.main([str(argument) for argument in (*SIMULATE, *arguments)])
+    except SystemExit as end:  # how argparse ends
+        return end.code
+
+
+def test_the_same_echoes_with_any_poses():
+    assert call("-o", "true.csv") == 0
+    assert call("-o", "drift.csv", "--odometry", "2,1", "--truth", "truth.tum") == 0
+    assert call("-o", "none.csv", "--no-odometry") == 0
+    true, drift, none = (load_log(name) for name in ("true.csv", "drift.csv", "none.csv"))
+    for log in (drift, none):
+        for column in ("scan", "stamp", "start", "tx", "rx", "range"):
+            np.testing.assert_array_equal(getattr(log, column), getattr(true, column))
+    np.testing.assert_array_equal(true.pose, OFFICE.poses)
+    expected = drifted(OFFICE.poses, distance=0.02, turn=float(np.radians(1.0)), seed=5)
+    np.testing.assert_array_equal(drift.pose, expected)
+    assert np.isnan(none.pose).all()
+    truth = load_trajectory("truth.tum")
+    np.testing.assert_array_equal(truth.stamp, OFFICE.stamps)
+    np.testing.assert_allclose(truth.poses, OFFICE.poses, atol=1e-15)
+
+
+def test_what_was_asked_for_stands_beside_the_log():
+    assert call("-o", "a.csv") == 0
+    assert call("-o", "b.csv", "--odometry", "0.5,1e-1", "--truth", "b.tum") == 0
+    assert call("-o", "c.csv", "--no-odometry") == 0
+    a, b, c = (tomllib.loads(Path(f"{name}.settings.toml").read_text()) for name in "abc")
+    assert not {"odometry", "no_odometry", "truth"} & set(a)
+    assert b == a | {"odometry": [0.5, 0.1]}
+    assert c == a | {"no_odometry": True}
+
+
+def test_standard_output_holds_the_log_or_the_truth(capsys):
+    assert call("-o", "-", "--odometry", "2,1") == 0
+    assert capsys.readouterr().out.startswith("scan,stamp")
+    assert call("-o", "a.csv", "--truth", "-") == 0
+    assert len(capsys.readouterr().out.splitlines()) == 18
+
+
+MISTAKES = {
+    "one number": (["--odometry", "2"], ["--odometry", "'2'", "PERCENT,DEG"]),
+    "three numbers": (["--odometry", "2,1,0"], ["2,1,0", "two numbers"]),
+    "a word": (["--odometry", "2,one"], ["2,one", "PERCENT,DEG"]),
+    "less than nothing": (["--odometry=-1,1"], ["-1,1", "0 to 100"]),
+    "not a number": (["--odometry", "nan,1"], ["nan,1"]),
+    "both": (["--odometry", "2,1", "--no-odometry"], ["--no-odometry", "not allowed with", "--odometry"]),
+    "truth over the path": (["--truth", DATA / "office-path.csv"], ["--truth", "input"]),
+    "truth over the log": (["--truth", "out.csv"], ["--truth", "-o"]),
+    "truth over the settings": (["--truth", "out.settings.toml"], ["--truth", "settings beside the log"]),
+    "truth into a missing folder": (["--truth", "no/a.tum"], ["no/a.tum", "folder"]),
+    "two on standard output": (["-o", "-", "--truth", "-"], ["--truth -", "standard output"]),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_wrong_call_is_one_line(mistake, capsys):
+    arguments, said = MISTAKES[mistake]
+    assert call("-o", "out.csv", *arguments) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert len(shown.err.splitlines()) == 1
+    for word in said:
+        assert word in shown.err
+    assert not list(Path().iterdir())

@@ -1,0 +1,176 @@
+"""Commands slam, localize and stream --slam: files as documented, errors told, one line for every mistake."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.commands import call
+from support.slam_scene import RING, ROOM, SLIP, log, truth
+
+from jaxsonar import load_log, save_log
+from jaxsonar.estimation.trajectory import Trajectory, load_trajectory, save_trajectory, stamps_of
+from jaxsonar.mapping.build_map import build_map
+from jaxsonar.mapping.map_geojson import load_map, save_map
+
+ODOMETRY = f"{100 * SLIP.place:g},{np.degrees(SLIP.heading):g}"
+COUNT = 14
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A log with odometry, the truth, a map made with the true poses; and what the command made of the log."""
+    folder = tmp_path_factory.mktemp("slam")
+    some = log()[:COUNT]
+    save_log(some, folder / "log.csv")
+    save_trajectory(Trajectory(stamps_of(some), truth()[:COUNT]), folder / "truth.tum")
+    save_map(build_map(RING, replace(log(seed=2), pose=truth())), folder / "known.geojson")
+    files = "-o map.geojson --trajectory poses.tum --figure run.svg --json run.json --truth truth.tum"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert call("slam", "log.csv", "--ring", "faw", *files.split(), "--odometry", ODOMETRY) == 0
+    return folder
+
+
+@pytest.fixture
+def here(made, tmp_path, monkeypatch):
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_slam_writes_what_it_was_asked_for(here):
+    poses, given = load_trajectory(here / "poses.tum"), load_trajectory(here / "truth.tum")
+    assert len(poses) == COUNT
+    np.testing.assert_allclose(poses.poses[0], load_log(here / "log.csv").pose[0], atol=0.02)
+    world = load_map(here / "map.geojson")
+    assert len(world) >= 3
+    assert (here / "run.svg").read_text().lstrip().startswith("<?xml")
+    said = json.loads((here / "run.json").read_text())
+    assert said["scans"] == COUNT
+    assert said["left_out"] == []
+    assert 0.001 < said["sigma"] < 0.003
+    assert said["errors"]["estimate"]["poses"] == COUNT
+    assert said["errors"]["estimate"]["ate"] < said["errors"]["odometry"]["ate"]
+    assert said["closures"] == []
+    assert len(given) == COUNT
+
+
+def test_errors_are_told_and_a_trajectory_may_go_to_standard_output(here, capsys):
+    arguments = ("--odometry", ODOMETRY, "--no-smoothing", "--truth", "truth.tum", "--trajectory", "-")
+    assert call("slam", "log.csv", "--ring", "faw", "-o", "again.geojson", *arguments) == 0
+    out, said = capsys.readouterr()
+    assert len([line for line in out.splitlines() if not line.startswith("#")]) == COUNT
+    assert f"{COUNT} scans, {COUNT} of them placed" in said
+    assert "error, first pose on the truth: " in said
+    assert "error, best alignment: " in said
+    assert "odometry's error, first pose on the truth: " in said
+    assert "mm" in said
+
+
+BAD = {
+    "slam no.csv --ring faw -o out.geojson": "no.csv",
+    "slam log.csv --ring faw -o log.csv": "log.csv",
+    "slam log.csv --ring faw -o out.geojson --trajectory out.geojson": "out.geojson",
+    "slam log.csv --ring faw -o out.geojson --sigma -1": "--sigma",
+    "slam log.csv --ring faw -o out.geojson --odometry 3": "--odometry",
+    "slam log.csv --ring faw -o - --trajectory -": "standard output",
+    "slam log.csv --ring faw -o out.geojson --scale --no-smoothing": "without smoothing",
+    "slam log.csv --ring faw -o out.geojson --truth other.tum": "--truth",
+    "slam log.csv --ring faw -o out.geojson --figure run.xyz": "--figure",
+    "slam log.csv --ring faw": "-o",
+    "slam nowhere.csv --ring faw -o out.geojson --window 1": "odometry",
+    "localize log.csv --ring faw --map no.geojson --trajectory out.tum": "no.geojson",
+    "localize log.csv --ring faw --map known.geojson --trajectory known.geojson": "known.geojson",
+    "localize log.csv --ring faw --map known.geojson --trajectory out.tum --start 1,2": "X,Y,DEG",
+    "localize log.csv --ring faw --map known.geojson --trajectory out.tum --start 1,2,nan": "X,Y,DEG",
+    "localize log.csv --ring faw --map empty.geojson --trajectory out.tum": "empty.geojson: no wall",
+    "localize log.csv --ring faw --trajectory out.tum": "--map",
+    "stream file:log.csv --ring faw --trajectory out.tum": "--slam",
+}
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_a_bad_call_is_answered_in_one_line(here, capsys, line):
+    save_trajectory(Trajectory(np.array([1e6]), np.zeros((1, 3))), here / "other.tum")
+    text = (here / "log.csv").read_text().splitlines()
+    header = text[0].split(",")
+    rows = [dict(zip(header, row.split(","), strict=True)) | dict.fromkeys(("x", "y", "theta"), "") for row in text[1:]]
+    (here / "nowhere.csv").write_text("\n".join([text[0], *(",".join(row.values()) for row in rows)]) + "\n")
+    (here / "empty.geojson").write_text('{"type": "FeatureCollection", "features": []}')
+    before = {path.name: path.read_bytes() for path in here.iterdir()}
+    assert call(*line.split()) == 2
+    said = capsys.readouterr().err
+    last = [part for part in said.splitlines() if part.strip()]
+    assert len(last) == 1, said
+    assert BAD[line] in last[0]
+    assert {path.name: path.read_bytes() for path in here.iterdir()} == before
+
+
+def test_localize_in_a_map(here, capsys):
+    """From nothing, and from about where it is."""
+    pose = truth()[0]
+    start = f"--start={pose[0] + 0.2:.2f},{pose[1] - 0.1:.2f},{np.degrees(pose[2]) + 5:.1f}"
+    for more in ((), (start, "--figure", "where.svg")):
+        files = ("--map", "known.geojson", "--trajectory", "where.tum")
+        assert call("localize", "log.csv", "--ring", "faw", *files, *more) == 0
+        found = load_trajectory(here / "where.tum")
+        np.testing.assert_allclose(found.poses, truth()[:COUNT], atol=0.06)  # some scans see no wall across the way
+        assert "the first one at" in capsys.readouterr().err
+    assert (here / "where.svg").exists()
+
+
+def test_localize_in_a_floor_plan_with_a_negative_start(here, capsys):
+    from jaxsonar.floor_plans.room_geojson import save_room
+
+    save_room(ROOM, here / "plan.geojson")
+    x, y, theta = truth()[0]
+    near = f"{x - 0.2:.2f},{y:.2f},{np.degrees(theta):.1f}"
+    arguments = ("localize", "log.csv", "--ring", "faw", "--map", "plan.geojson", "--trajectory")
+    assert call(*arguments, "p.tum", "--start", near) == 0
+    np.testing.assert_allclose(load_trajectory(here / "p.tum").poses, truth()[:COUNT], atol=0.06)
+    # Far below the origin: understood, and nothing there.
+    assert call(*arguments, "q.tum", "--start", "-9,-9,0") == 1
+    assert "no place" in capsys.readouterr().err
+    assert not (here / "q.tum").exists()
+
+
+def test_truth_needs_stamps_that_rise(here, capsys):
+    falling = load_log(here / "log.csv")
+    save_log(replace(falling, stamp=falling.stamp[::-1].copy()), here / "falling.csv")
+    assert call("slam", "falling.csv", "--ring", "faw", "-o", "out.geojson", "--truth", "truth.tum") == 2
+    assert "do not rise" in capsys.readouterr().err
+    assert not (here / "out.geojson").exists()
+
+
+def test_localize_says_where_it_is_not_sure(here, capsys):
+    """Half a turn of a rectangle: code 1, both places, no file."""
+    from jaxsonar import Room, simulate
+
+    corners = np.array([[0, 0], [3, 0], [3, 2], [0, 2]], dtype=float)
+    room = Room(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
+    poses = np.array([[0.8 + 0.12 * k, 0.7 + 0.03 * k, 0.2 + 0.05 * k] for k in range(5)])
+    given = simulate(RING, room, poses, sigma=0.001, seed=2).as_log(RING, poses)
+    save_log(given, here / "alike.csv")
+    # The map knows both ends of the room.
+    both = np.concatenate([poses, np.array([3.0, 2.0, 0.0]) - poses * [1, 1, -1] + [0, 0, np.pi]])
+    known = simulate(RING, room, both, sigma=0.001, seed=3).as_log(RING, both)
+    save_map(build_map(RING, known), here / "alike.geojson")
+    files = ("--map", "alike.geojson", "--trajectory", "where.tum")
+    assert call("localize", "alike.csv", "--ring", "faw", *files) == 1
+    said = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+    assert len(said) == 1
+    assert "ambiguous, 2 places look alike" in said[0]
+    assert not (here / "where.tum").exists()
+
+
+def test_stream_estimates_poses(here):
+    """Poses of the device are odometry; the trajectory is written at the end."""
+    options = ("--slam", "--odometry", ODOMETRY, "--trajectory", "live.tum", "--map", "live.geojson")
+    assert call("stream", "file:log.csv", "--ring", "faw", *options) == 0
+    found = load_trajectory(here / "live.tum")
+    assert len(found) == COUNT
+    first = load_log(here / "log.csv").pose[0]
+    np.testing.assert_allclose(found.poses[0], first, atol=1e-6)
+    assert len(ROOM.walls) >= len(load_map(here / "live.geojson")) >= 3

@@ -1,0 +1,326 @@
+"""Rooms: GeoJSON there and back, where walls meet, lines in the robot frame, random rooms and poses."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxsonar import Room, load_room, random_pose, random_room, save_room
+from jaxsonar.floor_plans.room import lines_in, point_to_walls
+from jaxsonar.hardware.errors import SonarError
+
+SQUARE = [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]]
+seeds = st.integers(0, 2**32 - 1)
+
+
+def loop(points):
+    points = np.array(points, dtype=np.float64)
+    return np.stack([points, np.roll(points, -1, axis=0)], axis=1)
+
+
+def widths_at(room, point):
+    """Wedges around the vertex at this point, degrees, ascending; none where there is no vertex."""
+    junctions = room.junctions
+    vertex = np.flatnonzero(np.linalg.norm(junctions.vertices - point, axis=-1) < 1e-3)
+    return np.sort(np.degrees(junctions.wedge_width[np.isin(junctions.wedge_vertex, vertex)]))
+
+
+# Where walls meet.
+
+
+def test_a_rectangle_has_four_right_angles_inside_and_four_edges_outside():
+    junctions = Room(loop(SQUARE)).junctions
+    assert len(junctions.vertices) == len(junctions.corners) == len(junctions.edges) == 4
+    assert np.allclose(junctions.wedge_width[junctions.corners], np.pi / 2)
+    assert np.allclose(junctions.wedge_width[junctions.edges], 3 * np.pi / 2)
+    assert np.array_equal(junctions.right_angled.sum(axis=0), [2, 2, 2, 2])
+    assert np.allclose(np.sort(junctions.wedge_reach[junctions.corners], axis=1), [[3.0, 4.0]] * 4)
+
+
+def test_a_free_standing_segment_has_two_ends_of_a_full_turn():
+    junctions = Room(np.array([[[0.0, 0.0], [1.0, 0.0]]])).junctions
+    assert np.allclose(junctions.wedge_width, 2 * np.pi)
+    assert np.array_equal(junctions.edges, [0, 1])
+    assert len(junctions.corners) == 0
+
+
+def test_wedges_of_a_t_an_x_and_a_straight_node():
+    through = [[-1.0, 0.0], [1.0, 0.0]]
+    assert np.allclose(widths_at(Room(np.array([through, [[0.0, 0.0], [0.0, 1.0]]])), [0, 0]), [90, 90, 180])
+    assert np.allclose(widths_at(Room(np.array([through, [[0.0, -1.0], [0.0, 1.0]]])), [0, 0]), [90] * 4)
+    assert np.allclose(widths_at(Room(np.array([through, [[1.0, 0.0], [3.0, 0.0]]])), [1, 0]), [180, 180])
+
+
+def test_walls_that_lie_on_one_another_are_one_direction():
+    room = Room(np.array([[[0.0, 0.0], [2.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]]))
+    assert np.allclose(widths_at(room, [0, 0]), [90, 270])
+    assert room.junctions.right_angled.sum() == 4  # both walls along x with the one along y, both orders
+    corner = room.junctions.corners
+    assert np.allclose(np.sort(room.junctions.wedge_reach[corner]), [[1.0, 2.0]])
+    leftwards = Room(np.array([[[0.0, 0.0], [-1.0, 1e-17]], [[0.0, 0.0], [-1.0, -1e-17]], [[0.0, 0.0], [0.0, 1.0]]]))
+    assert np.allclose(widths_at(leftwards, [0, 0]), [90, 270])  # on both sides of the seam at pi
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.9e-3])
+def test_ends_within_a_millimetre_are_one_vertex_and_leave_no_gap(gap):
+    room = Room(np.array([[[0.0, 0.0], [1.0, 0.0]], [[1.0, gap], [1.0, 1.0]]]))
+    assert np.array_equal(room.walls[0, 1], room.walls[1, 0])
+    assert len(room.junctions.vertices) == 3
+    assert np.allclose(widths_at(room, [1, 0]), [90, 270], atol=0.1)
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.9e-3, -0.9e-3])
+def test_an_end_within_a_millimetre_of_a_wall_touches_it(gap):
+    room = Room(np.array([[[-1.0, 0.0], [1.0, 0.0]], [[0.1, gap], [0.1, 1.0]]]))
+    assert np.allclose(room.walls[1, 0], [0.1, 0.0], atol=1e-15)
+    assert np.allclose(widths_at(room, [0.1, 0]), [90, 90, 180])
+
+
+def test_ends_farther_apart_stay_apart():
+    room = Room(np.array([[[0.0, 0.0], [1.0, 0.0]], [[1.0, 2e-3], [1.0, 1.0]]]))
+    assert len(room.junctions.vertices) == 4
+
+
+@given(seed=seeds)
+def test_wedges_around_a_vertex_make_a_full_turn_and_turn_with_the_room(seed):
+    room = random_room(np.random.default_rng(seed), box=1.0, segment=1.0)
+    junctions = room.junctions
+    turns = np.bincount(junctions.wedge_vertex, junctions.wedge_width)
+    assert np.allclose(turns, 2 * np.pi)
+    angle = 1.234
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turned = Room(room.walls @ turn.T + [3.0, -5.0]).junctions
+    assert np.allclose(np.sort(turned.wedge_width), np.sort(junctions.wedge_width))
+    assert np.array_equal(turned.right_angled, junctions.right_angled)
+
+
+@pytest.mark.parametrize(
+    ("walls", "names", "poles", "words"),
+    [
+        ([[[0, 0], [1, np.nan]]], (), [], "wall 0"),
+        ([[[0, 0], [1, 0]], [[2, 2], [2, 2]]], ("a", "b"), [], "wall 1 (b)"),
+        ([[[0, 0], [1, 0]]], ("a", "b"), [], "2 names for 1 walls"),
+        ([[[0, 0], [1, 0]]], ("two\nlines",), [], "printable"),
+        ([[[0, 0], [1, 0]]], (), [[np.inf, 0]], "pole"),
+    ],
+)
+def test_a_room_that_cannot_be_says_why(walls, names, poles, words):
+    with pytest.raises(SonarError) as caught:
+        Room(np.array(walls, dtype=float), names, np.array(poles, dtype=float).reshape(-1, 2))
+    assert words in str(caught.value)
+    assert "allowed" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_room_cannot_be_changed():
+    given_walls = loop(SQUARE)
+    room = Room(given_walls)
+    given_walls[:] = 7.0
+    assert room.walls.max() == 4.0
+    with pytest.raises(ValueError, match="read-only"):
+        room.walls[0] = 0.0
+
+
+# GeoJSON.
+
+
+def feature(form, coordinates, **properties):
+    return {"type": "Feature", "properties": properties, "geometry": {"type": form, "coordinates": coordinates}}
+
+
+def write(path, *features):
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": list(features)}))
+    return path
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_saved_room_is_the_same_room(seed, tmp_path):
+    room = random_room(np.random.default_rng(seed))
+    room = Room(room.walls, (*room.wall_names[:-1], 'Tür "1"'), np.array([[0.1, 1 / 3], [-2e-9, 7.0]]))
+    save_room(room, tmp_path / "room.geojson")
+    again = load_room(tmp_path / "room.geojson")
+    assert np.array_equal(again.walls, room.walls)
+    assert np.array_equal(again.poles, room.poles)
+    assert again.wall_names == room.wall_names
+
+
+def test_every_geometry_becomes_walls_and_poles(tmp_path):
+    ring = [*SQUARE, SQUARE[0]]
+    hole = [[1, 1], [2, 1], [2, 1], [2, 2], [1, 1]]  # a position twice
+    room = load_room(
+        write(
+            tmp_path / "room.geojson",
+            feature("LineString", [[0, 5], [1, 5], [1, 6]], name="bent"),
+            feature("MultiLineString", [[[7, 0], [8, 0]], [[7, 1], [8, 1, 99.0]]], name="pair"),
+            feature("Polygon", [ring, hole], name="hall"),
+            feature("MultiPolygon", [[[[x + 20, y] for x, y in ring]]]),
+            feature("Point", [3, 2], kind="pole"),
+            feature("Point", [0, 0], kind="corner"),
+            feature("Point", [1, 2], kind="edge"),
+        )
+    )
+    assert room.wall_names == ("bent",) * 2 + ("pair",) * 2 + ("hall",) * 7 + ("",) * 4
+    assert np.array_equal(room.walls[:4, 1], [[1, 5], [1, 6], [8, 0], [8, 1]])
+    assert np.array_equal(room.walls[4:8], loop(SQUARE))
+    assert np.array_equal(room.walls[8:11], loop([[1, 1], [2, 1], [2, 2]]))
+    assert np.array_equal(room.poles, [[3.0, 2.0]])
+
+
+GOOD = feature("LineString", [[0, 0], [1, 0]])
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (feature("LineString", [[0, 0], [0, 0]]), "no length at (0, 0)"),
+        (feature("LineString", [[0, 0]]), "1 positions"),
+        (feature("LineString", [[0, 0], [1]]), "[1]"),
+        (feature("LineString", [[0, 0], [1, float("nan")]]), "nan"),
+        (feature("LineString", [[0, 0], [1, 10**400]]), "position"),
+        (feature("LineString", [[0, 0], ["1", 0]]), "'1'"),
+        (feature("LineString", [[0, 0], [True, 0]]), "True"),
+        (feature("LineString", None), "None"),
+        (feature("MultiLineString", [3]), "3"),
+        (feature("Polygon", 3), "Polygon"),
+        (feature("Polygon", [SQUARE]), "open"),
+        (feature("Polygon", [[[0, 0], [0, 0], [0, 0], [0, 0]]]), "1 positions"),
+        (feature("Point", [0, 0]), "kind None"),
+        (feature("Point", [0, 0], kind="lamp"), "'lamp'"),
+        (feature("Point", [], kind="pole"), "position []"),
+        (feature("Point", "here", kind="pole"), "here"),
+        (feature("Circle", [0, 0]), "Circle"),
+        (feature("LineString", [[0, 0], [0, 1]], name=3), "name 3"),
+        ({"type": "Feature", "properties": None, "geometry": None}, "geometry"),
+        ({"type": "Feature", "properties": [], "geometry": GOOD["geometry"]}, "properties"),
+        ({"type": "Feature", "properties": {}, "geometry": {"type": "LineString"}}, "coordinates"),
+        (7, "Feature"),
+    ],
+)
+def test_a_bad_feature_is_named_in_one_line(bad, words, tmp_path):
+    path = write(tmp_path / "room.geojson", GOOD, bad)
+    with pytest.raises(SonarError) as caught:
+        load_room(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: feature 1: ")
+    assert words in message
+    assert "allowed" in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "{", "[]", "null", "[" * 100_000, "\xff\x00", '{"type": "Feature"}', '{"type": "FeatureCollection"}'),
+        '{"type": "FeatureCollection", "features": []}',
+    ],
+)
+def test_a_file_that_is_no_room_is_named_in_one_line(text, tmp_path):
+    path = tmp_path / "room.geojson"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(SonarError) as caught:
+        load_room(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_or_folder_is_named(tmp_path):
+    for act in (load_room, lambda path: save_room(Room(loop(SQUARE)), path)):
+        with pytest.raises(SonarError, match="nowhere"):
+            act(tmp_path / "nowhere" / "room.geojson")
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "room.geojson"
+    save_room(Room(loop(SQUARE)), path)
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(SonarError, match="No space left"):
+        save_room(Room(loop(SQUARE)[:2]), path)
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["room.geojson"]
+
+
+# Lines, random rooms.
+
+
+@given(seed=seeds)
+def test_lines_go_through_their_walls_in_the_robot_frame(seed):
+    rng = np.random.default_rng(seed)
+    room = random_room(rng)
+    pose = np.append(rng.uniform(-5, 5, 2), rng.uniform(-10, 10))
+    rho, theta = lines_in(room, pose)
+    assert (rho >= 0).all()
+    assert ((theta >= -np.pi) & (theta < np.pi)).all()
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    p_robot = (room.walls - pose[:2]) @ np.array([[cos, -sin], [sin, cos]])
+    normal = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    assert np.allclose((p_robot * normal[:, None]).sum(-1), rho[:, None], atol=1e-12)
+
+
+def test_theta_stays_below_pi():
+    room = Room(np.array([[[-1.0, -1.0], [-1.0, 1.0]]]))
+    rho, theta = lines_in(room, np.zeros(3))
+    assert rho[0] == 1.0
+    assert theta[0] == -np.pi
+    assert lines_in(room, np.array([0.0, 0.0, 1e-17]))[1][0] == -np.pi
+
+
+@given(seed=seeds)
+def test_random_rooms_are_closed_and_poses_keep_clear(seed):
+    shapely = pytest.importorskip("shapely")
+    rng = np.random.default_rng(seed)
+    room = random_room(rng)
+    shell = sum(name.startswith("wall") for name in room.wall_names)
+    outline = shapely.Polygon(room.walls[:shell, 0])
+    assert outline.is_valid
+    assert np.array_equal(np.roll(room.walls[:shell, 0], -1, axis=0), room.walls[:shell, 1])
+    assert 4 <= shell <= 7 + 4
+    assert 2.5 < np.ptp(room.walls[:shell], axis=(0, 1)).max() <= 7.0
+    x, y, theta = random_pose(rng, room)
+    assert outline.contains(shapely.Point(x, y))
+    assert -np.pi <= theta < np.pi
+    assert point_to_walls(np.array([[x, y]]), room.walls).min() >= 0.45
+    assert np.linalg.norm(room.poles - [x, y], axis=-1).min(initial=np.inf) >= 0.45
+
+
+def test_random_rooms_are_of_every_kind():
+    rng = np.random.default_rng(0)
+    rooms = [random_room(rng) for _ in range(60)]
+    corners = [len(room.junctions.corners) for room in rooms]
+    assert 0 in corners
+    assert max(corners) >= 4
+    for name in ("box", "segment"):
+        assert 0 < sum(name in room.wall_names for room in rooms) < 60
+    assert 0 < sum(len(room.poles) for room in rooms) < 60
+    assert len({sum(name.startswith("wall") for name in room.wall_names) for room in rooms}) >= 4
+
+
+def test_the_same_generator_gives_the_same_room_and_pose():
+    one, two = (np.random.default_rng(5) for _ in range(2))
+    first, second = random_room(one), random_room(two)
+    assert np.array_equal(first.walls, second.walls)
+    assert np.array_equal(random_pose(one, first), random_pose(two, second))
+
+
+@pytest.mark.parametrize("walls", [loop(SQUARE)[:3], loop(SQUARE) / 10, np.zeros((0, 2, 2))])
+def test_no_pose_in_an_open_or_small_room(walls):
+    with pytest.raises(SonarError, match="closed room"):
+        random_pose(np.random.default_rng(0), Room(walls))
+
+
+def test_clearance_is_checked():
+    with pytest.raises(SonarError, match="clearance -1"):
+        random_pose(np.random.default_rng(0), Room(loop(SQUARE)), clearance=-1.0)
+
+
+def test_rooms_need_no_jax():
+    code = "import sys, jaxsonar.rooms, jaxsonar.reflections; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,375 @@
+"""The step from scan to scan: an iterated Kalman update against a dense one, who is whom, and what motion does."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from jaxsonar import Ring, Room, kernels, local_model, simulate
+from jaxsonar.estimation.motion_model import moved, placed, step_variance
+from jaxsonar.estimation.odometry_noise import Slip
+from jaxsonar.geometry.se2 import composed, rotation, unit, wrap_angle
+from jaxsonar.graph_slam.frontend import Track, begin, finished, update
+from jaxsonar.graph_slam.joint_compatibility import Features, Known, match, seen_from
+from jaxsonar.simulation.office import load_office
+from jaxsonar.simulation.simulator import Kind
+
+RING = Ring.circular()
+PLANE, CORNER, EDGE = kernels.PLANE, kernels.CORNER, kernels.EDGE
+SIGMA = 0.001
+ECHOES = 60
+
+
+@pytest.fixture(autouse=True)
+def in_double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+# The update
+
+
+def reach_of(state, kind, anchor, ends):
+    """Half the way from tx by one reflector to rx: the readable way to say it. ``ends`` in the robot frame."""
+    place = ends @ rotation(state[2]).T + state[:2]
+    own = state[3:]
+    if kind == PLANE:
+        normal = unit(own[1])
+        level = own[0] + normal @ anchor
+        mirrored = place[1] + 2 * (level - normal @ place[1]) * normal
+        return np.linalg.norm(place[0] - mirrored) / 2
+    point = anchor + own
+    if kind == CORNER:
+        return np.linalg.norm(place[0] + place[1] - 2 * point) / 2
+    return (np.linalg.norm(place[0] - point) + np.linalg.norm(place[1] - point)) / 2
+
+
+KINDS = np.array([PLANE, CORNER, EDGE, PLANE], dtype=np.int32)
+ANCHORS = np.array([[1.2, 0.3], [0.2, 1.1], [-0.9, -0.6], [0.1, -1.0]])
+PARAMETERS = np.array([[0.05, 0.1], [0.03, -0.02], [0.01, 0.04], [-0.02, -1.5]])
+ROWS = np.tile([0, 1, 2, 3], ECHOES // 4)
+
+
+def expected_of(state, path, rows=ROWS):
+    sensors = np.asarray(RING.position)[RING.paths[path]]
+    pick = [np.r_[0:3, 3 + 2 * k, 4 + 2 * k] for k in rows]
+    return np.array(
+        [reach_of(state[p], KINDS[k], ANCHORS[k], ends) for p, k, ends in zip(pick, rows, sensors, strict=True)]
+    )
+
+
+def paths_of(path):
+    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64)[path], RING.echo_paths)
+
+
+def scene_of(parameters, kinds=KINDS, anchors=ANCHORS):
+    return kernels.Scene(kinds, parameters, anchors, np.tile([-1.0, 1.0], (len(kinds), 1)))
+
+
+@pytest.fixture
+def case(rng):
+    """A belief, and echoes of a truth that it allows."""
+    mean = np.concatenate([[0.02, -0.05, 0.3], PARAMETERS.ravel()])
+    root = rng.standard_normal((11, 11)) * 0.002
+    prior = root @ root.T + np.diag([0.02, 0.02, 0.02] + [0.01] * 8) ** 2
+    truth = rng.multivariate_normal(mean, prior)
+    path = rng.integers(len(RING.paths), size=ECHOES)
+    ranges = expected_of(truth, path) + SIGMA * rng.standard_normal(ECHOES)
+    return mean, prior, path, ranges, truth
+
+
+def dense(mean, prior, path, ranges, rows=ROWS):
+    """Least squares on prior and ranges, slopes by central differences; the inverse of the information."""
+    state, information = mean.copy(), np.linalg.inv(prior)
+    whole = information
+    for _ in range(8):
+        ways = 1e-6 * np.eye(len(state))
+        slope = np.stack(
+            [(expected_of(state + w, path, rows) - expected_of(state - w, path, rows)) / 2e-6 for w in ways], -1
+        )
+        whole = information + slope.T @ slope / SIGMA**2
+        gradient = slope.T @ (ranges - expected_of(state, path, rows)) / SIGMA**2 - information @ (state - mean)
+        state = state + np.linalg.solve(whole, gradient)
+    return state, np.linalg.inv(whole)
+
+
+def tracked(mean, prior, path, ranges, rows=ROWS, kinds=KINDS, anchors=ANCHORS):
+    belief = kernels.Belief(mean[:3], scene_of(mean[3:].reshape(-1, 2), kinds, anchors), prior)
+    found = kernels.track(belief, paths_of(path), ranges, rows.astype(np.int32), np.float64(SIGMA**2))
+    state = np.concatenate([found.belief.pose, np.asarray(found.belief.scene.parameters).ravel()])
+    return state, np.asarray(found.belief.covariance), found
+
+
+def test_an_update_is_least_squares_on_prior_and_ranges(case):
+    mean, prior, path, ranges, truth = case
+    state, covariance, found = tracked(mean, prior, path, ranges)
+    wanted, wanted_cov = dense(mean, prior, path, ranges)
+    assert np.asarray(found.used).all()
+    sd = np.sqrt(np.diag(wanted_cov))
+    np.testing.assert_array_less(np.abs(state - wanted), 0.02 * sd)  # a few steps do
+    np.testing.assert_allclose(covariance / np.outer(sd, sd), wanted_cov / np.outer(sd, sd), atol=2e-3)
+    off = state - truth
+    assert off @ np.linalg.solve(covariance, off) < 31.3  # chi2, 11, 0.001
+    np.testing.assert_allclose(found.residual, ranges - expected_of(state, path), atol=1e-12)
+
+
+def test_wrong_echoes_are_left_out(case, rng):
+    """Some centimetres off: what remains is as if they had never been."""
+    mean, prior, path, ranges, _ = case
+    bad = rng.permutation(ECHOES)[:9]
+    spoilt = ranges.copy()
+    spoilt[bad] += rng.choice([-1, 1], 9) * rng.uniform(0.05, 0.3, 9)
+    state, covariance, found = tracked(mean, prior, path, spoilt)
+    assert sorted(np.flatnonzero(np.asarray(found.used) == 0)) == sorted(bad)
+    good = np.setdiff1d(np.arange(ECHOES), bad)
+    wanted, wanted_cov = dense(mean, prior, path[good], ranges[good], ROWS[good])
+    np.testing.assert_array_less(np.abs(state - wanted), 0.02 * np.sqrt(np.diag(wanted_cov)))
+    np.testing.assert_allclose(covariance, wanted_cov, atol=2e-3 * wanted_cov.max())
+
+
+def test_neither_order_nor_padding_matters(case, rng):
+    mean, prior, path, ranges, _ = case
+    plain, plain_cov, found = tracked(mean, prior, path, ranges)
+    order = rng.permutation(ECHOES)
+    # Echoes of nothing, and reflectors that are free.
+    more_path, more_range = np.pad(path[order], (0, 20)), np.pad(ranges[order], (0, 20))
+    more_rows = np.pad(ROWS[order], (0, 20), constant_values=-1)
+    wide, kinds, anchors = np.zeros((15, 15)), np.append(KINDS, [-1, -1]).astype(np.int32), np.zeros((6, 2))
+    wide[:11, :11], anchors[:4] = prior, ANCHORS
+    state, covariance, padded = tracked(np.pad(mean, (0, 4)), wide, more_path, more_range, more_rows, kinds, anchors)
+    np.testing.assert_allclose(state[:11], plain, atol=1e-10)
+    np.testing.assert_allclose(covariance[:11, :11], plain_cov, atol=1e-12)
+    np.testing.assert_allclose(np.asarray(padded.residual)[:ECHOES], np.asarray(found.residual)[order], atol=1e-10)
+    assert not np.asarray(padded.used)[ECHOES:].any()
+    predicted = kernels.predict(padded.belief, paths_of(more_path))
+    assert np.isinf(np.asarray(predicted.expected)[4:]).all()
+
+
+def test_a_wall_alone_says_nothing_of_the_way_along_it(rng):
+    """What is known of y is what the prior says, by the heading that y hangs on."""
+    path = rng.integers(len(RING.paths), size=40)
+    prior = np.zeros((5, 5))
+    prior[:3, :3] = [[4e-4, 0, 0], [0, 9e-4, 3e-4], [0, 3e-4, 4e-4]]
+    mean = np.array([0.0, 0.0, 0.0, 0.0, 0.0])
+    kinds, anchors, rows = np.array([PLANE], np.int32), np.array([[1.0, 0.0]]), np.zeros(40, int)
+    sensors = np.asarray(RING.position)[RING.paths[path]]
+    truth = np.array([0.01, 0.02, 0.015, 0, 0])
+    ranges = np.array([reach_of(truth, PLANE, anchors[0], ends) for ends in sensors])
+    state, cov, _ = tracked(mean, prior, path, ranges, rows, kinds, anchors)
+    np.testing.assert_allclose(state[[0, 2]], truth[[0, 2]], atol=3e-4)
+    slope = prior[1, 2] / prior[2, 2]
+    np.testing.assert_allclose(state[1], slope * state[2], atol=1e-9)
+    np.testing.assert_allclose(cov[1, 1], prior[1, 1] - slope**2 * (prior[2, 2] - cov[2, 2]), rtol=1e-9)
+    np.testing.assert_allclose(cov[1, 2], slope * cov[2, 2], rtol=1e-9)
+    assert cov[0, 0] < SIGMA**2
+
+
+def test_ranges_are_those_that_the_simulator_hears():
+    """Every first echo of a wall of the office, to the micrometre; and what is expected besides is little."""
+    office = load_office()
+    room, pose = office.room, office.poses[5]
+    heard = simulate(RING, room, pose[None], sigma=0.0)
+    middle = room.walls.mean(axis=1)
+    along = room.walls[:, 1] - room.walls[:, 0]
+    half = np.linalg.norm(along, axis=-1) / 2
+    theta = np.arctan2(along[:, 1], along[:, 0]) - np.pi / 2
+    away = (unit(theta) * (middle - pose[:2])).sum(-1) > 0
+    theta = wrap_angle(np.where(away, theta, theta + np.pi))
+    count = len(middle)
+    scene = kernels.Scene(
+        np.full(count, PLANE, np.int32),
+        np.stack([np.zeros(count), theta], -1),
+        middle,
+        half[:, None] * [-1.0, 1.0],
+    )
+    expected = np.asarray(kernels.expected_ranges(pose, scene, paths_of(np.arange(len(RING.paths)))))
+    wall = heard.kind == Kind.PLANE
+    assert wall.sum() > 20
+    np.testing.assert_allclose(expected[heard.reflector[wall], heard.path[wall]], heard.range[wall], atol=2e-6)
+
+
+# Motion
+
+
+def slopes(function, at):
+    return np.stack([(function(at + w) - function(at - w)) / 2e-6 for w in 1e-6 * np.eye(len(at))], -1)
+
+
+def test_motion_spreads_as_its_slopes_say(rng):
+    pose, step, variance = np.array([0.4, -0.2, 0.7]), np.array([0.3, 0.05, 0.2]), np.array([4e-4, 1e-4, 9e-4])
+    root = rng.standard_normal((5, 5))
+    covariance = root @ root.T * 1e-3
+    after, found = moved(pose, covariance, step, variance)
+    np.testing.assert_allclose(after, composed(pose, step), atol=1e-12)
+    by_all = np.eye(5)
+    by_all[:3, :3] = slopes(lambda p: composed(p, step), pose)
+    by_step = slopes(lambda s: composed(pose, s), step)
+    wanted = by_all @ covariance @ by_all.T
+    wanted[:3, :3] += by_step @ np.diag(variance) @ by_step.T
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+
+
+def test_a_pose_of_a_frame_spreads_as_both(rng):
+    base, pose = np.array([1.0, 2.0, 2.8]), np.array([0.5, -0.4, 1.1])
+    a, b = (root @ root.T * 1e-4 for root in rng.standard_normal((2, 3, 3)))
+    world, found = placed(base, a, pose, b)
+    np.testing.assert_allclose(world, composed(base, pose), atol=1e-12)
+    samples = np.array(
+        [
+            composed(one, other)
+            for one, other in zip(
+                rng.multivariate_normal(base, a, 20_000), rng.multivariate_normal(pose, b, 20_000), strict=True
+            )
+        ]
+    )
+    off = samples - world
+    off[:, 2] = wrap_angle(off[:, 2])
+    sd = np.sqrt(np.diag(found))
+    np.testing.assert_allclose(np.cov(off.T) / np.outer(sd, sd), found / np.outer(sd, sd), atol=0.05)
+
+
+def test_motion_that_nobody_measured_may_be_any():
+    unknown = step_variance(Slip(), np.full(3, np.nan))
+    assert (unknown > 50 * step_variance(Slip(), np.array([0.15, 0.0, 0.1]))).all()
+
+
+# Who is whom
+
+
+def known_of(walls, points=(), *, pose_sd=(0.05, 0.05, 0.02), own_sd=1e-3):
+    """Walls (distance, theta) of some metres through their feet, and corners, around a robot at the origin."""
+    count = len(walls) + len(points)
+    foot = [rho * unit(np.array(theta)) for rho, theta in walls]
+    size = 3 + 2 * count
+    covariance = np.eye(size) * own_sd**2
+    covariance[:3, :3] = np.diag(np.square(pose_sd))
+    return Known(
+        pose=np.zeros(3),
+        kind=np.array([PLANE] * len(walls) + [CORNER] * len(points), np.int32),
+        parameters=np.array([(0.0, theta) for _, theta in walls] + [(0.0, 0.0)] * len(points)).reshape(-1, 2),
+        anchor=np.array([*foot, *points], dtype=np.float64).reshape(-1, 2),
+        ends=np.array([(-1.0, 1.0)] * len(walls) + [(0.0, 0.0)] * len(points)).reshape(-1, 2),
+        covariance=covariance,
+        scans=np.full(count, 3, np.int64),
+    )
+
+
+def seen_of(walls, points=(), *, sd=1e-3):
+    count = len(walls) + len(points)
+    segments = [
+        [rho * unit(np.array(theta)) + way * unit(np.array(theta + np.pi / 2)) for way in (-0.1, 0.1)]
+        for rho, theta in walls
+    ]
+    return Features(
+        kind=np.array([PLANE] * len(walls) + [CORNER] * len(points), np.int32),
+        place=np.array([*walls, *points], dtype=np.float64).reshape(-1, 2),
+        cov=np.tile(np.eye(2) * sd**2, (count, 1, 1)),
+        segment=np.array([*segments, *([p, p] for p in points)], dtype=np.float64).reshape(-1, 2, 2),
+        echoes=np.full(count, 12),
+    )
+
+
+def matched(known, seen):
+    found = match(known, seen, full=12.0)
+    return found.reflector.tolist(), found.fresh.tolist()
+
+
+def test_slopes_of_what_is_seen_are_differences():
+    known = known_of([(1.0, 0.2), (1.5, 2.0)], [(0.5, -0.8)])
+    known = replace(known, pose=np.array([0.1, 0.2, 0.4]))
+    _, slope = seen_from(known.pose, known)
+    for row in range(3):
+
+        def place(v, row=row):
+            parameters = known.parameters.copy()
+            parameters[row] = v[3:]
+            return seen_from(v[:3], replace(known, pose=v[:3], parameters=parameters))[0][row]
+
+        np.testing.assert_allclose(slope[row], slopes(place, np.append(known.pose, known.parameters[row])), atol=1e-8)
+
+
+def test_each_is_the_others_nearest():
+    """Two features by one wall: the nearer one is it; the other one is none, and too near to be new."""
+    known = known_of([(1.0, 0.0), (1.2, np.pi / 2)])
+    seen = seen_of([(1.02, 0.0), (1.06, 0.0), (1.21, np.pi / 2)])
+    assert matched(known, seen) == ([0, -1, 1], [False, False, False])
+
+
+def test_what_is_far_from_all_is_new():
+    known = known_of([(1.0, 0.0)])
+    assert matched(known, seen_of([(1.0, 0.0), (1.4, 1.8)], [(0.3, -0.9)])) == ([0, -1, -1], [False, True, True])
+    assert matched(begin().known, seen_of([(1.0, 0.0)])) == ([-1], [True])
+
+
+def test_pairs_must_agree_with_each_other():
+    """One wall says 9 cm ahead, the opposite one 9 cm back: each may be, both together not."""
+    known = known_of([(1.0, 0.0), (1.2, -np.pi)])
+    assert matched(known, seen_of([(0.91, 0.0)]))[0] == [0]
+    assert matched(known, seen_of([(1.1, -np.pi)]))[0] == [1]
+    assert matched(known, seen_of([(0.91, 0.0), (1.29, -np.pi)]))[0] == [0, 1]
+    assert sorted(matched(known, seen_of([(0.91, 0.0), (1.10, -np.pi)]))[0]) == [-1, 0]
+
+
+def test_the_back_of_a_wall_is_another_wall():
+    """It is 2 cm behind the robot; seen from the other side its normal leads the other way."""
+    known = replace(known_of([(0.02, 0.0)], pose_sd=(0.2, 0.2, 0.05)), pose=np.array([0.04, 0.0, 0.0]))
+    assert matched(known, seen_of([(0.3, 0.0)]))[0] == [-1]
+
+
+def test_a_wall_is_where_it_was_seen():
+    """The same line, two metres beside it: not that wall, and new."""
+    known, seen = known_of([(1.0, 0.0)]), seen_of([(1.0, 0.0)])
+    beside = seen._replace(segment=seen.segment + np.array([0.0, 2.0]))
+    assert matched(known, beside)[0] == [-1]
+
+
+def test_corners_are_no_walls():
+    assert matched(known_of([(1.0, 0.0)]), seen_of([], [(1.0, 0.0)]))[0] == [-1]
+
+
+# Submaps
+
+
+@pytest.mark.parametrize(("distance", "carried"), [(8.0, False), (0.8, True)])
+def test_only_walls_that_should_be_heard_tell_that_the_robot_was_carried(distance, carried):
+    """Around a corner all is new, and becomes known; where walls that face the ring are silent it is elsewhere."""
+    x, y = 1.5, 1.3
+    room = Room(np.array([[[x, -y], [x, y]], [[x, y], [-x, y]], [[-x, y], [-x, -y]], [[-x, -y], [x, -y]]]))
+    scan = simulate(RING, room, np.zeros((1, 3)), sigma=SIGMA, seed=1).as_log(RING, np.zeros((1, 3)))[0]
+    known = replace(known_of([(distance, 0.0), (distance, 2.0)]), scans=np.array([5, 5]))
+    with jax.enable_x64(False):
+        model = local_model(RING, scan, method="hough")
+    track = update(RING, Track(known), scan, model, row=7)
+    assert track.strange == int(carried)
+    assert (len(track.known) == 2) == carried
+
+
+def test_a_submap_forgets_what_one_scan_saw():
+    known = known_of([(1.0, 0.0), (1.5, 1.0), (2.0, 2.0)])
+    root = np.random.default_rng(0).standard_normal((9, 9))
+    known = replace(known, scans=np.array([3, 1, 2]), covariance=root @ root.T, pose=np.array([0.5, 0.1, 0.2]))
+    poses = tuple(np.full(3, 0.1 * k) for k in range(4))
+    track = Track(known, rows=(4, 5, 6, 7), poses=poses, covs=tuple(np.eye(3) * k for k in range(4)))
+    submap = finished(track)
+    np.testing.assert_array_equal(submap.anchor, known.anchor[[0, 2]])
+    np.testing.assert_array_equal(
+        submap.covariance, known.covariance[np.ix_([0, 1, 2, 3, 4, 7, 8], [0, 1, 2, 3, 4, 7, 8])]
+    )
+    np.testing.assert_array_equal(submap.exit, known.pose)
+    assert submap.rows.tolist() == [4, 5, 6, 7]
+    np.testing.assert_array_equal(submap.poses, poses)
+    lost = finished(track, lost=True)
+    assert (np.diag(lost.covariance - submap.covariance)[:3] > 0.2).all()
+    np.testing.assert_allclose(submap.segments[0], [[1.0, -1.0], [1.0, 1.0]], atol=1e-12)
+
+
+def test_the_next_submap_begins_at_its_own_origin():
+    known = known_of([(1.0, 0.0)])
+    before = Track(known, rows=(0, 1), odometry=np.array([1.0, 2.0, 3.0]), squares=4e-6, free=4.0)
+    after = begin(before)
+    assert not len(after.known)
+    assert not after.rows
+    assert not after.pose.any()
+    assert not after.covariance.any()
+    assert after.sigma == before.sigma == pytest.approx(0.001)

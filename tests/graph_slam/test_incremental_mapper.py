@@ -1,0 +1,232 @@
+"""A map built scan by scan is the map of all scans; states stay as they were and grow with the walls, not the scans."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from jaxsonar import Log, Ring, Room, SonarError, load_ring, local_model, simulate
+from jaxsonar.geometry.se2 import to_world
+from jaxsonar.graph_slam.incremental_mapper import Mapper, MapState
+from jaxsonar.mapping.build_map import SCANS_KEPT, build_map
+from jaxsonar.mapping.global_map import GlobalMap
+from jaxsonar.simulation.office import load_office
+
+RING = Ring.circular()
+
+
+@pytest.fixture(scope="module")
+def office():
+    return load_office()
+
+
+def office_log(office, seed=0):
+    heard = simulate(office.ring, office.room, office.poses, sigma=0.003, seed=seed, stamps=office.stamps)
+    return heard.as_log(office.ring, office.poses)
+
+
+def driven(mapper, scans):
+    """The state after all scans, and what each came to."""
+    state, infos = mapper.start(), []
+    for scan in scans:
+        state, info = mapper.step(state, scan)
+        infos.append(info)
+    return mapper.finish(state), infos
+
+
+def assert_same_map(one, other, *, atol=1e-9):
+    """Segment by segment in one order, which the numbers of echoes and the places decide."""
+    assert len(one) == len(other)
+    for name in ("segments", "rho", "theta", "sigma_rho", "sigma_theta"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=atol, rtol=1e-6)
+    assert one.echoes.tolist() == other.echoes.tolist()
+    assert one.scans == other.scans
+
+
+def arrays_of(value):
+    """All arrays within a state."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from arrays_of(getattr(value, field.name))
+    elif isinstance(value, tuple | list):
+        for part in value:
+            yield from arrays_of(part)
+    elif hasattr(value, "values"):
+        for part in value.values():
+            yield from arrays_of(part)
+
+
+def size_of(state):
+    return sum(array.nbytes for array in arrays_of(state))
+
+
+@pytest.mark.parametrize(("order", "merging"), [("driven", "fused"), ("shuffled", "fused"), ("shuffled", "paper")])
+def test_scan_by_scan_is_all_at_once(office, order, merging):
+    log = office_log(office)
+    rows = {
+        "driven": np.arange(17),
+        "reversed": np.arange(17)[::-1],
+        "shuffled": np.random.default_rng(3).permutation(17),
+    }
+    mapper = Mapper(ring=RING, merging=merging)
+    state, infos = driven(mapper, [log[int(row)] for row in rows[order]])
+    assert_same_map(mapper.map(state), build_map(RING, log, merging=merging), atol=1e-9 if merging == "fused" else 1e-5)
+    assert [info.ignored for info in infos] == [""] * 17
+    assert max(map(len, mapper.map(state).scans)) <= SCANS_KEPT
+
+
+def test_every_map_on_the_way_is_that_of_the_scans_so_far(office):
+    """Also the map of nothing; and old states still give their maps when all is done."""
+    log, mapper = office_log(office, seed=1), Mapper(ring=RING)
+    states = [mapper.start()]
+    for scan in log:
+        states.append(mapper.step(states[-1], scan)[0])
+    bytes_before = [[array.tobytes() for array in arrays_of(state)] for state in states]
+    for k in (0, 1, 5, 17):
+        assert_same_map(mapper.map(states[k]), build_map(RING, log[:k]))
+    assert [[array.tobytes() for array in arrays_of(state)] for state in states] == bytes_before
+
+
+def test_two_ways_from_one_state_do_not_disturb_each_other(office):
+    log, mapper = office_log(office), Mapper(ring=RING)
+    middle, _ = driven(mapper, log[:8])
+    scans = list(log)
+    there, _ = mapper.step(middle, scans[8])
+    elsewhere, _ = mapper.step(middle, scans[12])
+    assert_same_map(mapper.map(there), build_map(RING, log[:9]))
+    assert_same_map(mapper.map(elsewhere), build_map(RING, Log.from_scans([*scans[:8], scans[12]])))
+    assert_same_map(mapper.map(middle), build_map(RING, log[:8]))
+
+
+def test_a_step_tells_what_the_scan_came_to(office):
+    """Its local model, and the segments of that in the world."""
+    mapper, state = Mapper(ring=RING), Mapper(ring=RING).start()
+    for scan in office_log(office)[:6]:
+        state, info = mapper.step(state, scan)
+        wanted = local_model(RING, scan)
+        assert info.model is not None
+        assert [line.rho for line in info.model.lines] == [line.rho for line in wanted.lines]
+        assert info.model.scan == scan.scan
+        world = np.array([to_world(scan.pose, line.segment) for line in wanted.lines]).reshape(-1, 2, 2)
+        np.testing.assert_allclose(np.sort(info.segments, axis=1), np.sort(world, axis=1), atol=1e-3)
+
+
+def test_scans_without_a_pose_are_ignored_and_said_so(office):
+    """With windows too, below."""
+    log, mapper = office_log(office), Mapper(ring=RING)
+    scans = [
+        dataclasses.replace(scan, pose=np.full(3, np.nan)) if k in (0, 4, 9) else scan for k, scan in enumerate(log)
+    ]
+    state, infos = driven(mapper, scans)
+    assert [k for k, info in enumerate(infos) if info.ignored] == [0, 4, 9]
+    assert {info.ignored for info in infos} == {"", "no pose"}
+    assert all(not info.ignored or info.model is None for info in infos)
+    assert_same_map(mapper.map(state), build_map(RING, Log.from_scans(scans)))
+
+
+def test_scans_that_heard_nothing_or_everything_at_once_are_taken_in():
+    """Silence is evidence too; and a robot that is shut in claims no free place at all."""
+    mapper, none = Mapper(ring=RING), np.zeros(0, int)
+    silent = Log.from_echoes(none, none, none, np.zeros(0), stamp=np.zeros(1), pose=np.zeros((1, 3)))[0]
+    tx = np.arange(24)
+    shut_in = Log.from_echoes(tx * 0, tx, tx, np.full(24, 0.12), stamp=np.ones(1), pose=np.zeros((1, 3)))[0]
+    state, info = mapper.step(mapper.start(), silent)
+    assert info.ignored == ""
+    assert info.segments.shape == (0, 2, 2)
+    assert state.evidence.seen.tiles
+    state, info = mapper.step(state, shut_in)
+    assert isinstance(mapper.map(state), GlobalMap)
+    assert state.evidence.models == 2
+
+
+def test_unusable_arguments_are_refused_at_once():
+    with pytest.raises(SonarError, match=r"merging 'best'; allowed is"):
+        Mapper(ring=RING, merging="best")
+    with pytest.raises(SonarError, match=r"method 'best'; allowed is"):
+        Mapper(ring=RING, method="best")
+    with pytest.raises(SonarError, match=r"window = -1 m; allowed is"):
+        Mapper(ring=RING, window=-1.0)
+    stranger = Log.from_echoes(
+        np.array([0]), np.array([3]), np.array([24]), np.array([1.0]), stamp=np.zeros(1), pose=np.zeros((1, 3))
+    )
+    with pytest.raises(SonarError, match="tx 3, rx 24; allowed are 0 to 23"):
+        Mapper(ring=RING).step(Mapper(ring=RING).start(), stranger[0])
+
+
+CORRIDOR = Room(
+    np.array([[[-1, -0.9], [4.0, -0.9]], [[4.9, -0.9], [9, -0.9]], [[-1, 1.0], [9, 1.0]], [[9, -0.9], [9, 1.0]]])
+)
+"""Eight metres long, 1.9 m wide, with an open door on the right."""
+
+
+def corridor_log(seed=0):
+    x = np.arange(0, 5.0, 0.1)
+    poses = np.column_stack([x, 0.05 * np.sin(x), 0.05 * np.cos(x)])
+    poses[30:36] = poses[30]  # it waits
+    ring = load_ring("corridor8")
+    return ring, simulate(ring, CORRIDOR, poses, sigma=0.005, seed=seed).as_log(ring, poses)
+
+
+@pytest.mark.parametrize("lost", [(), (0, 20, 21, 44)])
+def test_windows_scan_by_scan_are_those_of_the_whole_log(lost):
+    """Along the path, with a robot that waits, and with poses missing."""
+    ring, log = corridor_log()
+    scans = [dataclasses.replace(s, pose=np.full(3, np.nan)) if k in lost else s for k, s in enumerate(log)]
+    mapper = Mapper(ring=ring, window=2.0)
+    state, infos = driven(mapper, scans)
+    came, wanted = mapper.map(state), build_map(ring, Log.from_scans(scans), window=2.0)
+    assert len(wanted) >= 2
+    assert_same_map(came, dataclasses.replace(wanted, scans=came.scans))
+    for few, all_ in zip(came.scans, wanted.scans, strict=True):
+        assert set(few) <= set(all_)
+    assert sum(info.model is not None for info in infos) >= 3
+    assert state.waiting == ()
+    assert [k for k, info in enumerate(infos) if info.ignored] == list(lost)
+
+
+def test_finishing_twice_or_with_nothing_changes_nothing():
+    ring, log = corridor_log()
+    mapper = Mapper(ring=ring, window=2.0)
+    state, _ = driven(mapper, list(log)[:22])
+    assert mapper.finish(state) is state
+    assert len(mapper.map(mapper.finish(mapper.start()))) == 0
+    assert mapper.finish(Mapper(ring=RING).start()).evidence.models == 0
+
+
+def a_round(number):
+    """A closed way through a room, a little off each time, with other noise."""
+    room = Room(
+        np.array([[[-2, -1.6], [2, -1.6]], [[2, -1.6], [2, 1.6]], [[2, 1.6], [-2, 1.6]], [[-2, 1.6], [-2, -1.6]]])
+    )
+    rng = np.random.default_rng(number)
+    angle = 2 * math.pi * np.arange(10) / 10
+    poses = np.column_stack([1.0 * np.cos(angle), 0.6 * np.sin(angle), angle + math.pi / 2])
+    poses += rng.normal(0, [0.02, 0.02, 0.02], poses.shape)
+    log = simulate(RING, room, poses, sigma=0.003, seed=number).as_log(RING, poses)
+    return [
+        dataclasses.replace(scan, scan=10 * number + k, stamp=100.0 * number + scan.stamp) for k, scan in enumerate(log)
+    ]
+
+
+def test_driving_the_same_round_again_needs_no_more_memory():
+    """Pieces, tiles and numbers of scans are bounded by the walls: ten rounds are hardly more than three."""
+    mapper = Mapper(ring=RING)
+    state, sizes, pieces, tiles = mapper.start(), {}, {}, {}
+    for number in range(10):
+        for scan in a_round(number):
+            state, _ = mapper.step(state, scan)
+        sizes[number + 1] = size_of(state)
+        pieces[number + 1] = len(state.evidence.pieces)
+        tiles[number + 1] = len(state.evidence.seen.tiles)
+    assert tiles[10] == tiles[1]
+    assert sizes[10] < 1.5 * sizes[3]
+    assert pieces[10] < 2.5 * pieces[3]
+    assert size_of(state) - size_of(state.evidence.seen) < 1_000_000
+    assert np.bincount(state.evidence.pieces.scans[0]).max() <= SCANS_KEPT
+    assert state.evidence.models == 100
+    world = mapper.map(state)
+    assert isinstance(state, MapState)
+    assert len(world) == 4

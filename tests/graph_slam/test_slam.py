@@ -1,0 +1,189 @@
+"""Poses and map together: better than odometry, honest about it, the same scan by scan and all at once."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from support.slam_scene import COUNT, RING, ROOM, SIGMA, SLIP, log, truth
+
+from jaxsonar import SonarError, local_models, simulate
+from jaxsonar.estimation.trajectory import Trajectory, errors
+from jaxsonar.geometry.se2 import composed, relative
+from jaxsonar.graph_slam.incremental_mapper import Mapper
+from jaxsonar.graph_slam.slam import Slam, Tracker, slam
+from jaxsonar.mapping.build_map import build_map
+from jaxsonar.scans.scan_log import Scan
+
+
+@cache
+def models():
+    return tuple(local_models(RING, log()))
+
+
+@cache
+def tracked():
+    tracker = Tracker(ring=RING, slip=SLIP)
+    state, steps = tracker.start(), []
+    for scan, model in zip(log(), models(), strict=True):
+        state, step = tracker.step(state, scan, model=model)
+        steps.append(step)
+    return tracker, state, steps
+
+
+def assert_near(found, *, share):
+    """Errors are at most this share of odometry's, and as large as is said."""
+    real = Trajectory(found.stamp, truth())
+    own = errors(found, real, align="first")
+    wheels = errors(Trajectory(found.stamp, np.array(log().pose)), real, align="first")
+    assert own.ate < share * wheels.ate
+    assert own.ate_heading < 0.5 * wheels.ate_heading
+    assert 0.05 < own.nees < 4.0
+
+
+def test_scan_by_scan_is_the_log_without_smoothing_and_much_better_than_odometry():
+    tracker, state, _ = tracked()
+    poses, covariance = tracker.poses(tracker.finish(state))
+    found = slam(RING, log(), slip=SLIP, smooth=False)
+    np.testing.assert_allclose(found.poses, poses, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, covariance, atol=1e-9)
+    assert isinstance(found, Slam)
+    assert not len(found.left_out)
+    assert len(found.world) >= 6
+    np.testing.assert_array_equal(found.odometry, log().pose)
+    assert found.smoothed is None
+    assert len(found.step_ms) == COUNT
+    assert_near(found.trajectory, share=0.2)
+
+
+def test_a_step_leaves_the_state_given_as_it_was():
+    """Two ways from one state; and the first pose is that of odometry."""
+    tracker, _, steps = tracked()
+    state = tracker.start()
+    for scan, model in zip(log()[:6], models()[:6], strict=True):
+        state, _ = tracker.step(state, scan, model=model)
+    before = [state.track.pose.copy(), state.track.known.covariance.copy(), state.graph.poses.copy(), state.scans]
+    one, _ = tracker.step(state, log()[6], model=models()[6])
+    tracker.step(one, log()[7], model=models()[7])
+    tracker.finish(state)
+    _, again = tracker.step(state, log()[6], model=models()[6])
+    for was, now in zip(
+        before,
+        [state.track.pose, state.track.known.covariance, state.graph.poses, state.scans],
+        strict=True,
+    ):
+        np.testing.assert_array_equal(was, now)
+    np.testing.assert_array_equal(again.pose, steps[6].pose)
+    np.testing.assert_allclose(steps[0].pose, log().pose[0], atol=1e-9)
+    np.testing.assert_allclose(steps[0].covariance, 0, atol=1e-12)
+    assert all(np.linalg.eigvalsh(step.covariance)[0] >= -1e-15 for step in steps)
+
+
+def test_without_odometry_scans_are_placed_by_what_they_see():
+    some = log()[:16]
+    found = slam(RING, replace(some, pose=np.full((16, 3), np.nan)), smooth=False)
+    known = np.isfinite(found.poses[:, 0])
+    assert known.sum() >= 8
+    assert np.isnan(found.covariance[~known]).all()
+    first, *rest = np.flatnonzero(known)
+    np.testing.assert_allclose(found.covariance[first], 0, atol=1e-8)
+    assert (np.linalg.eigvalsh(found.covariance[rest]) > 0).all()
+    own = errors(Trajectory(found.stamp[known], found.poses[known]), Trajectory(found.stamp, truth()[:16]))
+    assert own.ate < 0.1
+
+
+@pytest.mark.parametrize("missing", [[5], [4, 5, 11]])
+def test_scans_without_odometry_between_others_bend_nothing(missing):
+    """The odometry leads on over them; what they see places them, or they are left out."""
+    some = log()[:16]
+    pose = np.array(some.pose)
+    pose[missing] = np.nan
+    found = slam(RING, replace(some, pose=pose))
+    kept = np.setdiff1d(np.arange(16), missing)
+    assert np.isfinite(found.poses[kept]).all()
+    known = np.isfinite(found.poses[:, 0])
+    own = errors(
+        Trajectory(found.stamp[known], found.poses[known], found.covariance[known]),
+        Trajectory(found.stamp, truth()[:16]),
+        align="first",
+    )
+    assert own.ate < 0.08  # a motion that counts twice is 15 cm off at once, and with all that follows
+    assert own.nees < 4
+
+
+def test_a_step_over_a_scan_without_odometry_is_the_whole_step():
+    """With ranges that say nothing, the pose after it is where odometry says."""
+    tracker = Tracker(ring=RING, sigma=SIGMA)
+    state, pose = tracker.start(), np.full(3, np.nan)
+    none = np.zeros(0, dtype=np.int64)
+    for x in (0.0, 0.5, np.nan, 1.5):
+        scan = Scan(0, np.nan, np.array([x, 0.0 * x, 0.0 * x]), none, none, np.zeros(0), np.zeros(0))
+        state, step = tracker.step(state, scan)
+        pose = step.pose
+    np.testing.assert_allclose(pose, [1.5, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("pose", "choices", "said"),
+    [
+        ([0, 1], {}, "odometry in 2 of 16 scans"),
+        ([], {"scale": True}, "no scan has any"),
+        (range(16), {"scale": True, "smooth": False}, "without smoothing"),
+    ],
+)
+def test_what_odometry_can_not_do_is_refused_before_the_work(pose, choices, said):
+    some = log()[:16]
+    kept = np.full((16, 3), np.nan)
+    kept[list(pose)] = some.pose[list(pose)]
+    with pytest.raises(SonarError, match=said):
+        slam(RING, replace(some, pose=kept), **choices)
+
+
+def test_a_robot_that_was_carried_begins_anew():
+    """Odometry knows nothing of it: another submap, and no pose that is sure of the wrong place."""
+    there = composed(np.array([1.5, 0.6, 2.0]), np.array([relative(truth()[0], one) for one in truth()[:8]]))
+    poses = np.concatenate([truth()[:8], there])
+    odometry = np.concatenate([truth()[:8], composed(truth()[7], np.array([relative(there[0], one) for one in there]))])
+    heard = simulate(RING, ROOM, poses, sigma=SIGMA, seed=3).as_log(RING, odometry)
+    tracker = Tracker(ring=RING, sigma=SIGMA)
+    state, steps = tracker.start(), []
+    for scan in heard:
+        state, step = tracker.step(state, scan)
+        steps.append(step)
+    assert len(state.graph.submaps) >= 1
+    assert len(state.graph.submaps[0].rows) > 8
+    off = relative(poses[-1], steps[-1].pose)
+    sd = np.sqrt(np.diag(steps[-1].covariance))
+    assert np.hypot(*off[:2]) < 4 * max(sd[:2]) or np.hypot(*off[:2]) < 0.05
+
+
+def test_a_mapper_estimates_poses_and_draws_its_map_there():
+    mapper = Mapper(ring=RING, slip=SLIP)
+    state, infos = mapper.start(), []
+    for scan, model in zip(log()[:20], models(), strict=False):
+        state, info = mapper.step(state, scan, model=model)
+        infos.append(info)
+    _, _, steps = tracked()
+    for info, step in zip(infos, steps, strict=False):
+        np.testing.assert_array_equal(info.pose, step.pose)
+        np.testing.assert_array_equal(info.covariance, step.covariance)
+    poses, _ = mapper.trajectory(mapper.finish(state))
+    world, wanted = mapper.map(state), build_map(RING, replace(log()[:20], pose=poses))
+    assert len(world) == len(wanted)
+    order, other = np.lexsort(world.segments[:, 0].T.round(3)), np.lexsort(wanted.segments[:, 0].T.round(3))
+    np.testing.assert_allclose(world.segments[order], wanted.segments[other], atol=1e-4)
+    with pytest.raises(SonarError, match="slip"):
+        Mapper(ring=RING).trajectory(Mapper(ring=RING).start())
+    with pytest.raises(SonarError, match="slip"):
+        Mapper(ring=RING, slip=SLIP, window=1.0)
+
+
+def test_bad_calls():
+    with pytest.raises(SonarError, match="no scan"):
+        slam(RING, log()[:0])
+    with pytest.raises(SonarError, match="no scan has a pose"):
+        slam(RING, replace(log()[:3], pose=np.full((3, 3), np.nan)), window=1.0)
+    with pytest.raises(SonarError, match="sigma"):
+        Tracker(ring=RING, sigma=-1.0)
+    with pytest.raises(SonarError, match="sigma"):
+        slam(RING, log()[:2], sigma=float("inf"))

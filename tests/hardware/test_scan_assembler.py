@@ -1,0 +1,276 @@
+"""Groups to scans: whatever a link does to messages, what comes out is what was sent, or less, never anything else."""
+
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxsonar.hardware.drop_oldest_queue import NewestQueue
+from jaxsonar.hardware.messages import ECHO, Group, Pose
+from jaxsonar.hardware.scan_assembler import MOST_ECHOES, MOST_GROUPS, REFERENCE_SPEED_OF_SOUND, Assembler
+from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND as RING_REFERENCE
+
+GROUPS, PERIOD_US = 8, 11_700
+
+
+def device(scans, *, first=0, sequence=0, time_us=5_000_000, poses=True, groups=GROUPS, temperature=float("nan")):
+    """Messages of a device: a pose before every group, one echo a group that tells its scan and group."""
+    messages = []
+    for scan in range(first, first + scans):
+        for group in range(groups):
+            if poses:
+                messages.append(Pose(sequence, time_us, float(scan), float(group), 0.1))
+                sequence += 1
+            echoes = np.zeros(1, ECHO)
+            echoes["tx"] = echoes["rx"] = group
+            echoes["time_us"] = 1000 + scan
+            echoes["amplitude"] = 0.5
+            messages.append(Group(sequence, time_us, scan, group, groups, temperature, echoes))
+            sequence += 1
+            time_us += PERIOD_US
+    return messages
+
+
+def assembled(messages, assembler=None, *, flush=True):
+    assembler = assembler or Assembler()
+    scans = [scan for k, message in enumerate(messages) for scan in assembler.push(message, 0.01 * k)]
+    return (scans + assembler.flush() if flush else scans), assembler.counts
+
+
+def assert_true(scan):
+    """Every echo of a scan is of this scan, and stands in the group that it says."""
+    assert (scan.echoes["time_us"] == 1000 + scan.scan).all()
+    assert (scan.echoes["tx"] == scan.group).all()
+    known = np.isfinite(scan.group_pose[:, 0])
+    assert (scan.group_pose[known, 0] == scan.scan).all()
+    assert (scan.group_pose[known, 1] == np.flatnonzero(known)).all()
+
+
+def test_what_is_sent_in_order_comes_out_at_once():
+    assembler = Assembler()
+    for k, message in enumerate(device(5)):
+        out = assembler.push(message, 0.0)
+        last = isinstance(message, Group) and message.group == GROUPS - 1
+        assert len(out) == last, k
+        for scan in out:
+            assert_true(scan)
+            assert scan.missing == 0
+            assert len(scan.echoes) == GROUPS
+            assert scan.stamp == pytest.approx(5.0 + scan.scan * GROUPS * PERIOD_US * 1e-6, abs=1e-9)
+            assert scan.pose.tolist() == [scan.scan, GROUPS - 1, 0.1]  # that of the last group
+    counts = assembler.counts
+    assert (counts.scans, counts.echoes, counts.lost, counts.late, counts.restarts) == (5, 40, 0, 0, 0)
+
+
+@pytest.mark.parametrize("groups", [1, 3, 8])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_neighbors_in_any_order_make_no_difference(groups, seed):
+    """A link that mixes up to three neighbors loses nothing, and no group gets the pose of another one."""
+    rng = np.random.default_rng(seed)
+    sent = device(6, groups=groups)
+    place = np.arange(len(sent)) + rng.uniform(0, 2.9, len(sent))
+    place[0] = 0  # before the first message that comes there is nothing to miss
+    scans, counts = assembled([sent[k] for k in np.argsort(place, kind="stable")])
+    assert sorted(scan.scan for scan in scans) == list(range(6))
+    assert counts.restarts == counts.lost == 0
+    for scan in scans:
+        assert_true(scan)
+        assert scan.missing == 0
+        assert np.isfinite(scan.group_pose).all()
+
+
+@given(seed=st.integers(0, 2**32 - 1), loss=st.floats(0, 0.6), again=st.floats(0, 0.5))
+def test_lost_repeated_and_late_messages(seed, loss, again):
+    """No echo twice, none in a wrong scan, none with another group's pose; what is missing is counted."""
+    rng = np.random.default_rng(seed)
+    sent = device(12)
+    kept = [m for m in sent if rng.random() >= loss]
+    arriving = [m for m in kept for _ in range(1 + (rng.random() < again))]
+    order = np.argsort(np.arange(len(arriving)) + rng.uniform(0, 6, len(arriving)), kind="stable")
+    scans, counts = assembled([arriving[k] for k in order])
+    groups_kept = sum(isinstance(m, Group) for m in kept)
+    assert counts.restarts == 0
+    assert len({scan.scan for scan in scans}) == len(scans)
+    for scan in scans:
+        assert_true(scan)
+        assert scan.missing == GROUPS - len(scan.echoes)
+    heard = sum(len(scan.echoes) for scan in scans)
+    assert groups_kept - counts.late <= heard <= groups_kept
+    if kept:
+        inside = max(m.sequence for m in kept) - min(m.sequence for m in kept) + 1
+        assert counts.lost == inside - len(kept)
+
+
+def test_a_lost_pose_leaves_no_stale_one():
+    """Where a pose may have been lost the group has none: a wall would stand in the wrong place."""
+    sent = device(4)
+    gone = sent[5 * 2]  # the pose before group 5 of scan 0
+    scans, _ = assembled([m for m in sent if m is not gone])
+    assert np.isnan(scans[0].group_pose[5]).all()
+    assert np.isfinite(np.delete(scans[0].group_pose, 5, axis=0)).all()
+    for other in scans[1:]:
+        assert np.isfinite(other.group_pose).all()
+
+
+def test_a_lost_group_does_not_cost_a_pose():
+    sent = [m for m in device(3) if isinstance(m, Group) or m.y == 0]  # a pose a scan, before its first group
+    for k, message in enumerate(sent):
+        object.__setattr__(message, "sequence", k)
+    gone = next(m for m in sent if isinstance(m, Group) and (m.scan, m.group) == (1, 4))
+    scans, counts = assembled([m for m in sent if m is not gone])
+    assert counts.missing == counts.lost == 1
+    assert np.isfinite(np.delete(scans[1].group_pose, 4, axis=0)).all()
+
+
+def test_a_sender_that_says_unknown_things_keeps_its_poses():
+    sent = [m for m in device(3) if m.sequence % 5 != 2 or isinstance(m, Group)]
+    assembler = Assembler()
+    assembler.skipped = True
+    scans, _ = assembled(sent, assembler)
+    assert all(np.isfinite(scan.pose).all() for scan in scans)
+
+
+@pytest.mark.parametrize("run", [0, 1, 3, 10, 100, 500])
+@pytest.mark.parametrize("poses", [True, False])
+def test_a_sender_that_starts_anew_goes_on(run, poses):
+    """However little or much came before: all scans of the new run come out, under numbers and stamps that go on."""
+    before, after = device(run, poses=poses), device(6, poses=poses, time_us=1_000)
+    assembler = Assembler()
+    first = [s for m in before for s in assembler.push(m, 100.0)]
+    second = [s for m in after for s in assembler.push(m, 130.0)] + assembler.flush()
+    assert [s.scan for s in first] == list(range(run))
+    assert sum(len(s.echoes) for s in second) == 6 * GROUPS
+    assert assembler.counts.restarts == (run > 0)
+    assert assembler.counts.late == 0
+    numbers = [s.scan for s in first + second]
+    assert len(set(numbers)) == len(numbers) == run + 6
+    stamps = np.array([s.stamp for s in first + second])
+    assert (np.diff(stamps) > 0).all()
+    if run:
+        assert 29.5 < stamps[run] - stamps[run - 1] < 30.5, "the gap is in the record"
+
+
+def test_a_counter_of_scans_alone_that_starts_anew():
+    sent = device(300)
+    for message in sent[200 * 16 :]:
+        if isinstance(message, Group):
+            object.__setattr__(message, "scan", message.scan - 200)
+    scans, counts = assembled(sent)
+    assert len(scans) == 300
+    assert len({scan.scan for scan in scans}) == 300
+    assert counts.restarts == counts.late == 0
+
+
+def test_one_message_from_the_past_is_no_new_start():
+    sent = device(40)
+    scans, counts = assembled([*sent[:600], sent[3], *sent[600:]])
+    assert [scan.scan for scan in scans] == list(range(40))
+    assert (counts.restarts, counts.late) == (0, 1)
+
+
+def test_sequence_numbers_and_their_overflow():
+    start = 2**32 - 40
+    sent = device(6)
+    for message in sent:
+        object.__setattr__(message, "sequence", (message.sequence + start) % 2**32)
+    scans, counts = assembled(sent)
+    assert [scan.scan for scan in scans] == list(range(6))
+    assert counts.lost == counts.restarts == 0
+
+
+def test_an_incomplete_scan_is_handed_on_in_time():
+    sent = device(1)[:-4]
+    assembler = Assembler(waited=0.5)
+    for message in sent:
+        assert assembler.push(message, 10.0) == []
+    assert assembler.expire(10.4) == []
+    (scan,) = assembler.expire(10.6)
+    assert (scan.missing, len(scan.echoes)) == (2, 6)
+    assert assembler.expire(99.0) == assembler.flush() == []
+
+
+def test_hostile_groups_need_no_room():
+    assembler = Assembler()
+    echoes = np.zeros(1, ECHO)
+    for k in range(3000):
+        assembler.push(Group(k, k, (k * 7919) % 2**32, k % 500, 500 if k % 2 else 40_000, float("nan"), echoes), 0.0)
+    assert assembler.counts.impossible == 3000
+    assert MOST_GROUPS < 500
+    for k in range(3000):  # a new scan with every group
+        assembler.push(Group(3000 + k, 3000 + k, k * 1000, 0, 8, float("nan"), echoes), 0.0)
+    assert len(assembler.flush()) <= 3
+    assert len(assembler._seen) <= 256
+
+
+def test_a_scan_of_too_many_echoes_keeps_those_that_came_first():
+    assembler = Assembler()
+    echoes = np.zeros(4096, ECHO)
+    for k in range(8):
+        assembler.push(Group(k, k, 0, k, 8, float("nan"), echoes), 0.0)
+    (scan,) = assembler.flush()
+    assert len(scan.echoes) == MOST_ECHOES == 4 * 4096
+    assert (scan.missing, assembler.counts.impossible) == (4, 4)
+
+
+def test_scans_without_echoes_temperatures_and_ranges():
+    sent = device(2, temperature=21.5)
+    for message in sent:
+        if isinstance(message, Group) and message.scan == 0:
+            object.__setattr__(message, "echoes", np.zeros(0, ECHO))
+    (silent, heard), _ = assembled(sent)
+    assert len(silent.echoes) == len(silent.ranges) == 0
+    assert silent.temperature == 21.5
+    np.testing.assert_allclose(heard.ranges, 1001e-6 * 343.2 / 2)
+    assert REFERENCE_SPEED_OF_SOUND == RING_REFERENCE
+
+
+def test_echoes_stand_in_the_order_of_the_paths(faw_ring):
+    rng = np.random.default_rng(0)
+    echoes = np.zeros(100, ECHO)
+    echoes["tx"], echoes["rx"] = faw_ring.paths[rng.integers(len(faw_ring.paths), size=100)].T
+    echoes["time_us"] = rng.uniform(1000, 9000, 100)
+    (scan,) = Assembler(sensors=24).push(Group(0, 0, 0, 0, 1, float("nan"), echoes), 0.0)
+    path = faw_ring.path_index[scan.echoes["tx"], scan.echoes["rx"]]
+    key = list(zip(path.tolist(), scan.echoes["time_us"].tolist(), strict=True))
+    assert key == sorted(key)
+
+
+def test_a_pose_that_is_not_known_any_more_ends_the_one_before():
+    echoes = np.zeros(1, ECHO)
+    nowhere = Pose(2, 2, *[float("nan")] * 3)
+    sent = [Pose(0, 0, 1.0, 2.0, 0.1), Group(1, 1, 0, 0, 1, 20.0, echoes), nowhere, Group(3, 3, 1, 0, 1, 20.0, echoes)]
+    (known, unknown), counts = assembled(sent)
+    assert known.pose.tolist() == [1.0, 2.0, 0.1]
+    assert np.isnan(unknown.pose).all()
+    assert counts.lost == 0
+
+
+def test_large_items_make_room_as_many_small_ones_do():
+    queue = NewestQueue[int](100, size=lambda item: item, room=10)
+    for item in (4, 4, 4, 1, 30, 2, 3):  # one that is too large alone stays until the next one comes
+        queue.put(item)
+    assert queue.dropped == 5
+    assert queue.get(0.0, most=9) == [2, 3]
+    queue.put(8)
+    stop = threading.Event()
+    stop.set()
+    queue.put(9, wait=stop)
+    assert queue.get(0.0, most=9) == [9]
+
+
+def test_the_newest_win_and_are_counted():
+    queue = NewestQueue[int](3)
+    for k in range(10):
+        queue.put(k)
+    assert (queue.dropped, len(queue)) == (7, 3)
+    assert queue.get(0.0, most=2) == [7, 8]
+    queue.close(ValueError("the cable"))
+    queue.put(11)
+    assert queue.get(0.0) == [9]
+    assert not queue.ended
+    with pytest.raises(ValueError, match="the cable"):
+        queue.get(0.0)
+    assert queue.ended
+    assert queue.get(5.0) == []

@@ -1,0 +1,488 @@
+"""Reflectors that explain a scan: exact without noise, at the bound with it, honest about both; no echo twice.
+
+All scans run in one compiled shape with room for 64 echoes, the product's, whatever the ring.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import oracles
+
+from jaxsonar import HoughSettings, Ring, Room, kernels, load_ring, random_pose, random_room, simulate
+from jaxsonar.detection.extract import arcs_of
+from jaxsonar.floor_plans.room import lines_in
+from jaxsonar.scans.echo_batches import DEAR_SCANS_PER_STEP
+from jaxsonar.simulation.simulator import Acoustics, Kind
+
+RING, SETTINGS, EXPECTED = Ring.circular(), HoughSettings(), kernels.Expectations()
+SCANS, ROOM, PATHS, POINTS = DEAR_SCANS_PER_STEP[0], 64, 168, 64
+DECIDED = 0.7
+PLAIN: dict[str, Any] = {"box": 0.0, "segment": 0.0, "pole": 0.0}
+ORIGIN = np.zeros((1, 3))
+CORNERED = Room(np.array([[[1.2, 1.0], [-40, 1.0]], [[1.2, 1.0], [1.2, -40]]]))
+"""Two long walls and the right-angled corner between them, at (1.2, 1.0)."""
+
+
+def polygon(*lines):
+    """A closed room from the lines (rho, theta) of its walls, counter-clockwise around the origin."""
+    n = np.array([[math.cos(theta), math.sin(theta)] for _, theta in lines])
+    rho = np.array([rho for rho, _ in lines])
+    vertices = np.array([np.linalg.solve(n[[k - 1, k]], rho[[k - 1, k]]) for k in range(len(lines))])
+    return Room(np.stack([vertices, np.roll(vertices, -1, axis=0)], axis=1))
+
+
+TRIANGLE = polygon((1.4, 0.1), (1.6, 2.2), (1.3, -2.0))
+
+
+def explained(scans, sigma=math.nan, arcs=None):
+    """The explanation of scans, each a list of (path, range); one array a field."""
+    arcs = arcs_of(RING, SETTINGS) if arcs is None else arcs
+    parts = []
+    for begin in range(0, len(scans), SCANS):
+        some = scans[begin : begin + SCANS]
+        path, reported = np.zeros((SCANS, ROOM), np.int32), np.full((SCANS, ROOM), np.nan, np.float32)
+        for row, echoes in enumerate(some):
+            if len(echoes):
+                path[row, : len(echoes)], reported[row, : len(echoes)] = zip(*echoes, strict=True)
+        echoes = kernels.Echoes(jnp.asarray(path), jnp.asarray(reported))
+        found = kernels.explain(arcs, echoes, jnp.float32(sigma), settings=SETTINGS, expected=EXPECTED)
+        real = slice(0, len(some))
+        parts.append(jax.tree.map(lambda leaf, rows=real: np.asarray(leaf)[rows], found))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def heard(room, poses, ring=RING, **options):
+    """Scans as lists of (path, range), and the simulation they are of."""
+    came = simulate(ring, room, np.atleast_2d(poses), **options)
+    scans = [
+        list(zip(came.path[came.scan == k].tolist(), came.range[came.scan == k].tolist(), strict=True))
+        for k in range(len(came.stamps))
+    ]
+    assert max(map(len, scans)) <= ROOM
+    return scans, came
+
+
+def some_rooms(count, **options):
+    """Random rooms with a pose in each."""
+    rngs = [np.random.default_rng(seed) for seed in range(count)]
+    rooms = [random_room(rng, **options) for rng in rngs]
+    return list(zip(rooms, (random_pose(rng, room) for rng, room in zip(rngs, rooms, strict=True)), strict=True))
+
+
+def scans_of_rooms(count, *, sigma=0.001, dropout=0.0, clutter=0.0, ring=RING, **options):
+    """A scan in each of some random rooms; in the first ones in which there are not too many echoes."""
+    scans = []
+    for seed, (room, pose) in enumerate(some_rooms(count + 8, **options)):
+        came = simulate(ring, room, pose[None], seed=seed, sigma=sigma, dropout=dropout, clutter=clutter)
+        if len(came.path) <= ROOM:
+            scans.append(list(zip(came.path.tolist(), came.range.tolist(), strict=True)))
+    assert len(scans) >= count
+    return scans[:count]
+
+
+def decided(found):
+    """(scans, reflectors) kind of what is decided, else -1."""
+    sure = (found.kind >= 0) & (found.probability.max(axis=-1) >= DECIDED)
+    return np.where(sure & (found.probability.argmax(axis=-1) == found.kind), found.kind, -1)
+
+
+def reflectors_of(found, scan, kind):
+    return found.parameters[scan][decided(found)[scan] == kind].astype(float)
+
+
+def one_row(found, scan):
+    return jax.tree.map(lambda leaf: leaf[scan], found)
+
+
+def same_reflectors(here, there, change=lambda x, kind: x):
+    """Whether the reflectors of two scans are the same but for ``change`` of their parameters, in any order."""
+    assert (here.kind >= 0).sum() == (there.kind >= 0).sum()
+    for k in np.flatnonzero(here.kind >= 0):
+        wanted, plane = change(here.parameters[k].astype(float), here.kind[k]), here.kind[k] == kernels.PLANE
+        off = there.parameters - wanted
+        off[:, 1] = oracles.wrap(off[:, 1]) if plane else off[:, 1]
+        twin = np.argmin(np.where(there.kind == here.kind[k], np.abs(off).max(axis=1), np.inf))
+        assert there.kind[twin] == here.kind[k]
+        assert np.abs(off[twin]).max() < 1e-3
+        assert there.involved[twin].sum() == here.involved[k].sum()
+        assert there.evidence[twin] == pytest.approx(here.evidence[k], abs=0.1)
+        np.testing.assert_allclose(there.probability[twin], here.probability[k], atol=0.02)
+    assert there.sigma == pytest.approx(here.sigma, rel=0.01)
+
+
+def permuted(scans, change):
+    """The scans with their paths' sensors changed."""
+    return [[(int(RING.path_index[tuple(change(RING.paths[k]) % RING.count)]), r) for k, r in scan] for scan in scans]
+
+
+# what holds for every scan
+
+
+@pytest.mark.parametrize("sigma", [math.nan, 0.003])
+def test_every_echo_explains_itself_once_and_everything_is_finite(sigma):
+    scans = scans_of_rooms(32, sigma=0.003, dropout=0.2, clutter=0.2)
+    found = explained(scans, sigma)
+    there = found.kind >= 0
+    assert there.any(axis=1).all()
+    assert (found.involved.sum(axis=1) <= 1).all()
+    real = np.arange(ROOM) < np.array([len(scan) for scan in scans])[:, None]
+    assert not found.involved[np.broadcast_to(~real[:, None], found.involved.shape)].any()
+    assert not found.involved[~there].any()
+    assert (found.involved.sum(axis=-1)[there] >= 2).all(), "two parameters"
+    assert (np.diff(there.astype(int), axis=1) <= 0).all(), "first come those that are"
+    for name in ("parameters", "covariance", "probability", "evidence", "segment"):
+        assert np.isfinite(getattr(found, name)[there]).all(), name
+    np.testing.assert_allclose(found.probability[there].sum(axis=-1), 1, atol=1e-5)
+    assert (found.probability >= 0).all()
+    assert (found.evidence[there] > 0).all()
+    planes = found.kind == kernels.PLANE
+    rho, theta = found.parameters[planes].T
+    assert (rho >= 0).all()
+    assert ((theta >= -np.float32(np.pi)) & (theta < np.float32(np.pi))).all()
+    np.testing.assert_array_equal(found.covariance, np.swapaxes(found.covariance, -1, -2))
+    assert (np.linalg.eigvalsh(found.covariance[there].astype(float)) > 0).all()
+    assert np.isfinite(found.sigma).all()
+    if math.isfinite(sigma):
+        np.testing.assert_allclose(found.sigma, sigma, rtol=1e-6)
+
+
+def test_ends_of_walls_are_the_feet_of_their_outermost_sensors():
+    scans = scans_of_rooms(16)
+    found = explained(scans)
+    middle = RING.position[RING.paths].mean(axis=1)
+    for row, k in np.argwhere(found.kind == kernels.PLANE):
+        rho, theta = found.parameters[row, k].astype(float)
+        n, t = np.array([math.cos(theta), math.sin(theta)]), np.array([-math.sin(theta), math.cos(theta)])
+        along = np.array([middle[scans[row][e][0]] @ t for e in np.flatnonzero(found.involved[row, k])])
+        ends = [rho * n + along.min() * t, rho * n + along.max() * t]
+        np.testing.assert_allclose(found.segment[row, k], ends, atol=1e-4)
+
+
+def test_the_order_of_echoes_changes_nothing_but_the_order_of_columns(rng):
+    scans = scans_of_rooms(16, **PLAIN)
+    orders = [rng.permutation(len(scan)) for scan in scans]
+    found = explained(scans, 0.001)
+    shuffled = explained([[scan[k] for k in order] for scan, order in zip(scans, orders, strict=True)], 0.001)
+    np.testing.assert_array_equal(shuffled.kind, found.kind)
+    there = found.kind >= 0
+    np.testing.assert_allclose(shuffled.parameters[there], found.parameters[there], atol=1e-4)
+    for row, order in enumerate(orders):
+        np.testing.assert_array_equal(shuffled.involved[row][:, : len(order)], found.involved[row][:, order])
+
+
+def test_turning_the_robot_by_a_sensor_shifts_theta_and_nothing_else():
+    scans = scans_of_rooms(16, **PLAIN)
+    here, there = explained(scans, 0.001), explained(permuted(scans, lambda pair: pair - 1), 0.001)
+    pitch = 2 * math.pi / RING.count
+    turn = np.array([[math.cos(pitch), math.sin(pitch)], [-math.sin(pitch), math.cos(pitch)]])
+
+    def turned(x, kind):
+        return x - [0, pitch] if kind == kernels.PLANE else turn @ x
+
+    for scan in range(len(scans)):
+        same_reflectors(one_row(here, scan), one_row(there, scan), turned)
+
+
+def test_a_mirrored_room_is_explained_by_mirrored_reflectors():
+    scans = scans_of_rooms(16, **PLAIN)
+    here, there = explained(scans, 0.001), explained(permuted(scans, lambda pair: -pair), 0.001)
+    for scan in range(len(scans)):
+        same_reflectors(one_row(here, scan), one_row(there, scan), lambda x, kind: x * [1, -1])
+
+
+def test_there_and_back_of_a_pair_can_be_told_in_either_order():
+    scans = scans_of_rooms(16, **PLAIN)
+    here, there = explained(scans, 0.001), explained(permuted(scans, lambda pair: pair[::-1]), 0.001)
+    for scan in range(len(scans)):
+        same_reflectors(one_row(here, scan), one_row(there, scan))
+
+
+@pytest.mark.parametrize("sigma", [math.nan, 0.003])
+def test_where_nothing_is_heard_nothing_stands(sigma):
+    nothing = [], [(0, math.nan)], [(k, 2.0) for k in range(30)], [(k, 5.0) for k in range(30)], [(3, 1.0)]
+    found = explained(list(nothing), sigma)
+    assert (found.kind == -1).all()
+    assert not found.involved.any()
+    assert np.isfinite(found.probability).all()
+    assert np.isfinite(found.sigma).all()
+
+
+def test_scans_of_a_batch_do_not_know_of_each_other():
+    scans = scans_of_rooms(16, sigma=0.003, dropout=0.2, clutter=0.2)
+    together = explained(scans)
+    for row in (0, 7, 15):
+        alone = explained([scans[row]])
+        jax.tree.map(np.testing.assert_array_equal, one_row(alone, 0), one_row(together, row))
+    elsewhere = explained(scans[::-1])
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[::-1]), together, elsewhere)
+
+
+def test_echoes_beyond_the_maximum_range_change_nothing():
+    scans = scans_of_rooms(16)
+    more = [scan + [(k, 2.0 + 0.1 * k) for k in range(ROOM - len(scan))] for scan in scans]
+    here, there = explained(scans), explained(more)
+    assert not there.involved[:, :, max(map(len, scans)) :].any()
+    jax.tree.map(np.testing.assert_array_equal, here, there)
+
+
+def test_compiles_once_whatever_is_heard():
+    explained([[]])
+    compiled: Any = kernels.explain
+    size = compiled._cache_size()
+    explained(scans_of_rooms(3), 0.002)
+    explained([[]] * 40)
+    assert compiled._cache_size() == size
+
+
+# what stands there
+
+
+def test_a_single_wall_is_exact_without_noise():
+    angles = np.linspace(-math.pi, math.pi, 32, endpoint=False) + 0.013
+    distances = np.resize([0.5, 0.9, 1.3, 1.7, 1.9], len(angles))
+    scans = []
+    for rho, theta in zip(distances, angles, strict=True):
+        n, t = np.array([math.cos(theta), math.sin(theta)]), np.array([-math.sin(theta), math.cos(theta)])
+        scans += heard(Room(np.stack([rho * n - 40 * t, rho * n + 40 * t])[None]), ORIGIN)[0]
+    for sigma in (0.001, math.nan):
+        found = explained(scans, sigma)
+        assert (decided(found)[:, 0] == kernels.PLANE).all()
+        assert (found.kind[:, 1:] == -1).all()
+        assert (found.involved[:, 0].sum(axis=-1) == [len(scan) for scan in scans]).all()
+        np.testing.assert_allclose(found.parameters[:, 0, 0], distances, atol=1e-4)
+        np.testing.assert_allclose(oracles.wrap(found.parameters[:, 0, 1] - angles), 0, atol=np.radians(0.05))
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.001])
+def test_a_corner_between_two_walls_is_a_point_and_no_line(sigma):
+    """In all directions, seen from all sides."""
+    rng = np.random.default_rng(5)
+    place, scans = [], []
+    for seed in range(32):
+        x, y, heading = *rng.uniform(-0.15, 0.15, 2), rng.uniform(-math.pi, math.pi)
+        scans += heard(CORNERED, [x, y, heading], sigma=sigma, seed=seed)[0]
+        place.append((np.linalg.inv(oracles.matrix((x, y, heading))) @ [1.2, 1.0, 1])[:2])
+    found = explained(scans, max(sigma, 0.001))
+    for scan, corner in enumerate(place):
+        bearing = math.atan2(*corner[::-1])
+        walls = reflectors_of(found, scan, kernels.PLANE)
+        assert len(walls) == 2
+        assert (np.abs(oracles.wrap(walls[:, 1] - bearing)) > 0.3).all(), "no line before the corner"
+        (came,) = reflectors_of(found, scan, kernels.CORNER)
+        if sigma == 0:
+            assert np.linalg.norm(came - corner) < 0.001
+        else:
+            cov = found.covariance[scan][decided(found)[scan] == kernels.CORNER][0].astype(float)
+            assert (came - corner) @ np.linalg.inv(cov) @ (came - corner) < 16
+            assert abs(np.linalg.norm(came) - np.linalg.norm(corner)) < 0.004
+        assert len(reflectors_of(found, scan, kernels.EDGE)) == 0
+
+
+def lone_poles(count, **options):
+    rng = np.random.default_rng(7)
+    bearing, distance = rng.uniform(-math.pi, math.pi, count), rng.uniform(0.5, 1.6, count)
+    place = distance[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+    loud = Acoustics(pole_strength=1.0)
+    rooms = [Room(np.zeros((0, 2, 2)), poles=p[None]) for p in place]
+    return place, [heard(room, ORIGIN, acoustics=loud, seed=k, **options)[0][0] for k, room in enumerate(rooms)]
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.001, 0.003])
+def test_a_lone_pole_is_an_edge_there_and_never_a_corner_elsewhere(sigma):
+    place, scans = lone_poles(32, sigma=sigma)
+    found = explained(scans, max(sigma, 0.001))
+    kinds, many = decided(found), np.array([len(scan) for scan in scans]) >= 4
+    assert many.sum() > 16
+    assert (found.kind[many, 0] >= 0).all()
+    for scan, pole in enumerate(place):
+        for kind in (kernels.CORNER, kernels.EDGE):
+            for point in reflectors_of(found, scan, kind):
+                assert abs(np.linalg.norm(point) - np.linalg.norm(pole)) < 0.02
+                assert abs(oracles.wrap(math.atan2(*point[::-1]) - math.atan2(*pole[::-1]))) < 0.1
+    if sigma <= 0.001:
+        assert not (kinds == kernels.PLANE).any()
+        assert not (kinds == kernels.CORNER).any()
+        assert (kinds[many, 0] == kernels.EDGE).mean() > 0.7
+
+
+# how well
+
+
+def image_range(line, tx, rx):
+    n = np.array([math.cos(line[1]), math.sin(line[1])])
+    image = tx + 2 * (line[0] - tx @ n)[..., None] * n
+    return np.linalg.norm(image - rx, axis=-1) / 2
+
+
+def bound(line, paths, sigma):
+    """Cramer-Rao bound of a wall from first-order echoes, covariance, by numerical derivatives of the image source."""
+    tx, rx = RING.position[paths.T]
+    slopes = [(image_range(line + d, tx, rx) - image_range(line - d, tx, rx)) / 2e-6 for d in 1e-6 * np.eye(2)]
+    return sigma**2 * np.linalg.inv(np.array(slopes) @ np.array(slopes).T)
+
+
+def wall_errors(found, came, scan, room, pose, sigma):
+    """Per wall with many first-order echoes the error (rho, theta) of its line, NaN without one, and its bound."""
+    truth = np.stack(lines_in(room, pose), axis=-1)
+    lines = reflectors_of(found, scan, kernels.PLANE)
+    for wall in range(len(truth)):
+        own = (came.scan == scan) & (came.kind == Kind.PLANE) & (came.reflector == wall)
+        if own.sum() < 8:
+            continue
+        off = lines - truth[wall]
+        off[:, 1] = oracles.wrap(off[:, 1])
+        near = (np.abs(off) < [0.1, 0.26]).all(axis=1)
+        yield (
+            off[near][0] if near.sum() == 1 else np.full(2, np.nan),
+            bound(truth[wall], RING.paths[came.path[own]], sigma),
+        )
+
+
+def test_covariances_are_those_of_the_errors():
+    """Monte Carlo: 320 scans of one place, three walls in view."""
+    sigma, pose = 0.002, np.array([-0.1, 0.05, 0.3])
+    poses = np.tile(pose, (320, 1))
+    scans, _ = heard(TRIANGLE, poses, sigma=sigma, seed=3)
+    found = explained(scans, sigma)
+    truth = np.stack(lines_in(TRIANGLE, pose), axis=-1)
+    first = one_row(found, 0)
+    walls = reflectors_of(found, 0, kernels.PLANE)
+    assert len(walls) >= 3
+    assert first.sigma == pytest.approx(sigma)
+    nees = []
+    for line in walls:
+        wall = np.argmin(np.abs(truth[:, 0] - line[0]) + np.abs(oracles.wrap(truth[:, 1] - line[1])))
+        off = found.parameters.astype(float) - truth[wall]
+        off[..., 1] = oracles.wrap(off[..., 1])
+        near = (decided(found) == kernels.PLANE) & (np.abs(off) < [0.05, 0.15]).all(axis=-1)
+        assert near.sum() > 0.98 * len(scans), "found in every scan"
+        assert (near.sum(axis=1) <= 1).all(), "once"
+        errors, reported = off[near], found.covariance[near].astype(float)
+        empirical, mean = np.cov(errors.T), reported.mean(axis=0)
+        np.testing.assert_allclose(np.diag(empirical) / np.diag(mean), 1, atol=0.25)
+        scale = np.sqrt(np.outer(np.diag(mean), np.diag(mean)))
+        assert abs(empirical - mean)[0, 1] < 0.25 * scale[0, 1]
+        assert np.abs(errors.mean(axis=0)).max() < 4 * np.sqrt(np.diag(mean).max() / len(errors))
+        nees.append(np.einsum("ki,kij,kj->k", errors, np.linalg.inv(reported), errors))
+    assert 1.7 < np.concatenate(nees).mean() < 2.3
+
+
+def test_walls_are_found_at_the_bound_of_their_ranges():
+    sigma, errors, bounds = 0.001, [], []
+    for room, pose in some_rooms(8, **PLAIN, recess=0.0):
+        scans, came = heard(room, np.tile(pose, (32, 1)), sigma=sigma, seed=11)
+        found = explained(scans, sigma)
+        for scan in range(len(scans)):
+            for error, cov in wall_errors(found, came, scan, room, pose, sigma):
+                errors.append(error)
+                bounds.append(np.diag(cov))
+    errors, bounds = np.array(errors), np.array(bounds)
+    hit = np.isfinite(errors[:, 0])
+    assert len(hit) > 256
+    assert hit.mean() > 0.85
+    ratio = np.sqrt((errors[hit] ** 2 / bounds[hit]).mean(axis=0))
+    assert (ratio < 1.1).all(), ratio
+    assert (ratio > 0.9).all(), ratio
+
+
+@pytest.mark.parametrize("sigma", [0.001, 0.003, 0.01])
+def test_noise_is_estimated(sigma):
+    found = explained(scans_of_rooms(32, sigma=sigma))
+    assert np.median(found.sigma) == pytest.approx(sigma, rel=0.3)
+
+
+# other rings
+
+
+def roomy(ring):
+    """Arcs of a ring among deaf paths: the shape of all others, so that nothing is compiled anew.
+
+    A path is deaf if its sensors look in opposite directions.
+    """
+    sensors = ring.sensors
+    deaf = PATHS - len(sensors.tx)
+    assert deaf >= 0
+
+    def two_more(values, first, second):
+        more = jnp.asarray(np.stack([first, second]), values.dtype)
+        return jnp.concatenate([values, more])
+
+    return kernels.ring_arcs(
+        dataclasses.replace(
+            sensors,
+            position=two_more(sensors.position, np.zeros(2), np.zeros(2)),
+            heading=two_more(sensors.heading, 0.0, math.pi),
+            beam=two_more(sensors.beam, 0.1, 0.1),
+            range_offset=two_more(sensors.range_offset, 0.0, 0.0),
+            tx=jnp.concatenate([sensors.tx, jnp.full(deaf, ring.count, sensors.tx.dtype)]),
+            rx=jnp.concatenate([sensors.rx, jnp.full(deaf, ring.count + 1, sensors.rx.dtype)]),
+        ),
+        settings=SETTINGS,
+        points=POINTS,
+    )
+
+
+STRANGE = {
+    "corridor8": load_ring("corridor8"),
+    "bumper": Ring(
+        [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
+        np.radians([-15.0, -5.0, 5.0, 15.0]),
+        beam=np.radians(60),
+        neighbors=3,
+        max_range=2.5,
+        range_offset=[0.01, -0.02, 0.03, 0.0],
+        speed_of_sound=340.0,
+    ),
+    "one sensor": Ring([(0.1, 0.0)], [0.0], beam=1.0, neighbors=0, max_range=2.0),
+    "direct echoes only": Ring.circular(neighbors=0),
+    "two sensors in one place": Ring([(0.2, 0.0)] * 2, [0.0, 0.3], beam=1.0, neighbors=1, max_range=2.0),
+}
+
+
+@pytest.mark.parametrize("name", STRANGE)
+def test_strange_rings_explain_what_they_hear(name):
+    ring = STRANGE[name]
+    scans = scans_of_rooms(16, ring=ring, sigma=0.002, clutter=0.1, dropout=0.1)
+    assert any(scans)
+    for sigma in (math.nan, 0.002):
+        found = explained(scans, sigma, roomy(ring))
+        there = found.kind >= 0
+        assert (found.involved.sum(axis=1) <= 1).all()
+        for field in ("parameters", "covariance", "evidence", "segment"):
+            assert np.isfinite(getattr(found, field)[there]).all(), field
+        assert np.isfinite(found.probability).all()
+        assert np.isfinite(found.sigma).all()
+
+
+def test_with_direct_echoes_alone_corner_and_edge_stay_open():
+    """To a path with one sensor both are the same."""
+    ring = STRANGE["direct echoes only"]
+    place, _ = lone_poles(32)
+    scans = [
+        [(path, reach) for _, path, reach in oracles.point_echoes(ring, np.zeros(3), pole, corner=False)]
+        for pole in place
+    ]
+    found = explained(scans, 0.001, roomy(ring))
+    many = np.array([len(scan) for scan in scans]) >= 3
+    there = found.kind[:, 0] >= 0
+    assert (there & many).sum() > 0.8 * many.sum() > 8
+    assert (found.probability[there, 0, 1:] > 0.1).all()
+    assert not (decided(found)[there] > kernels.PLANE).any()
+    points = there & (found.kind[:, 0] != kernels.PLANE)
+    np.testing.assert_allclose(found.parameters[points, 0], place[points], atol=2e-3)
+
+
+def test_deaf_paths_are_deaf():
+    """Those that ``roomy`` adds: neither the threshold nor what is found is another."""
+    ring = dataclasses.replace(RING, neighbors=2)
+    scans = scans_of_rooms(16, ring=ring, **PLAIN)
+    alone = kernels.ring_arcs(ring.sensors, settings=SETTINGS, points=POINTS)
+    assert float(roomy(ring).level) == pytest.approx(float(alone.level))
+    assert float(roomy(ring).full_wall) == pytest.approx(float(alone.full_wall))
+    found = explained(scans, 0.001, roomy(ring))
+    assert (decided(found) == kernels.PLANE).any(axis=1).mean() > 0.8

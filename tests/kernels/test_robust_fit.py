@@ -1,0 +1,314 @@
+"""Planes and points fitted to ranges: the true reflector comes out, outliers do not matter, motions change nothing."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import oracles
+
+from jaxsonar import HoughSettings, Ring, kernels
+from jaxsonar.detection.extract import arcs_of
+from jaxsonar.detection.plane_point_test import BETTER, TOLERANCE
+from jaxsonar.geometry.se2 import relative
+from jaxsonar.kernels import robust_fit as fitting
+
+RING = Ring.circular(count=16, beam=1.0, neighbors=2, first_heading=0.0123)
+ARCS = arcs_of(RING, HoughSettings())
+ROOM, LINES = 256, 4
+seeds = st.integers(0, 10_000)
+fit = jax.jit(fitting.fit, static_argnames=("model", "tolerance"))
+heard = jax.jit(lambda echoes: fitting.heard(ARCS, jax.tree.map(lambda leaf: leaf[0], echoes)))
+
+
+def packed(echoes):
+    """(1, ROOM) echoes from a list of (pose, path, range)."""
+    assert len(echoes) <= ROOM
+    path, reported = np.zeros((1, ROOM), np.int32), np.full((1, ROOM), np.nan, np.float32)
+    pose = np.zeros((1, ROOM, 3), np.float32)
+    for k, (stood, row, reach) in enumerate(echoes):
+        path[0, k], reported[0, k], pose[0, k] = row, reach, stood
+    return kernels.Echoes(jnp.asarray(path), jnp.asarray(reported), jnp.asarray(pose))
+
+
+def fits_of(echoes, *lines):
+    """Fits to the candidates (rho, theta), and NaN beyond: one array a field, without the axis of scans."""
+    rho, theta = np.full((2, 1, LINES), np.nan, np.float32)
+    rho[0, : len(lines)], theta[0, : len(lines)] = np.array(lines).T
+    fits = kernels.fit_candidates(ARCS, packed(echoes), jnp.asarray(rho), jnp.asarray(theta), tolerance=TOLERANCE)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[0], fits)
+
+
+def some_poses(rng, count=8, spread=0.5):
+    return np.column_stack([rng.uniform(-spread, spread, (count, 2)), rng.uniform(-3, 3, count)])
+
+
+def a_plane(rng):
+    """rho, theta beyond all poses, and the first guess a cell or so away."""
+    rho, theta = rng.uniform(0.9, 1.2), rng.uniform(-3, 3)
+    return (rho, theta), (rho + rng.uniform(-0.04, 0.04), theta + rng.uniform(-0.06, 0.06))
+
+
+def echoes_of_plane(poses, plane):
+    return [echo for pose in poses for echo in oracles.plane_echoes(RING, pose, *plane)][:ROOM]
+
+
+def off(fits, plane, k=0):
+    """Distance (m) and angle (rad) between a fitted plane and the true one."""
+    return abs(fits.rho[k] - plane[0]), abs(oracles.wrap(fits.theta[k] - plane[1]))
+
+
+# planes
+
+
+@settings(max_examples=25)
+@given(seeds)
+def test_a_plane_comes_out_and_explains_all_its_echoes_better_than_a_point_does(seed):
+    rng = np.random.default_rng(seed)
+    plane, guess = a_plane(rng)
+    echoes = echoes_of_plane(some_poses(rng), plane)
+    paths = RING.paths[[path for _, path, _ in echoes]]
+    assert (paths[:, 0] == paths[:, 1]).any()
+    assert (paths[:, 0] != paths[:, 1]).any()
+    fits = fits_of(echoes, guess)
+    assert max(off(fits, plane)) < 1e-4
+    assert fits.explained[0, : len(echoes)].all()
+    assert not fits.explained[0, len(echoes) :].any()
+    assert fits.plane_score[0] == pytest.approx(len(echoes), rel=1e-4)
+    assert fits.plane_score[0] > BETTER * fits.point_score[0]
+
+
+@settings(max_examples=10)
+@given(seeds)
+def test_feet_are_those_of_the_virtual_sensors_along_the_plane(seed):
+    rng = np.random.default_rng(seed)
+    plane, guess = a_plane(rng)
+    echoes = echoes_of_plane(some_poses(rng), plane)
+    fits = fits_of(echoes, guess)
+    t = np.array([-math.sin(fits.theta[0]), math.cos(fits.theta[0])])
+    for k, (pose, path, _) in enumerate(echoes):
+        middle = oracles.matrix(pose) @ np.append(RING.position[RING.paths[path]].mean(axis=0), 1)
+        assert fits.foot[0, k] == pytest.approx(middle[:2] @ t, abs=1e-5)
+
+
+@settings(max_examples=25)
+@given(seeds, st.sampled_from([0.1, 0.25, 0.4]))
+def test_false_echoes_do_not_move_the_plane(seed, false):
+    """Up to 40 % of all echoes: 2 mm wherever the robot stood before it."""
+    rng = np.random.default_rng(seed)
+    poses = some_poses(rng, count=10)
+    plane, guess = a_plane(rng)
+    true = echoes_of_plane(poses, plane)[: int(ROOM * (1 - false))]
+    count = int(len(true) * false / (1 - false))
+    lies = [
+        (poses[rng.integers(len(poses))], int(rng.integers(len(RING.paths))), rng.uniform(0.2, RING.max_range))
+        for _ in range(count)
+    ]
+    fits = fits_of(true + lies, guess)
+    assert fits.explained[0, : len(true)].all()
+    t = np.array([-math.sin(plane[1]), math.cos(plane[1])])
+    feet = plane[0] * oracles.matrix((0, 0, plane[1]))[:2, 0] + np.outer(poses[:, :2] @ t, t)
+    n = np.array([math.cos(fits.theta[0]), math.sin(fits.theta[0])])
+    assert np.abs(feet @ n - fits.rho[0]).max() < 2e-3
+
+
+def test_noise_is_averaged_out(rng):
+    plane, guess = a_plane(rng)
+    echoes = echoes_of_plane(some_poses(rng, count=16), plane)
+    noisy = [(pose, path, reach + rng.normal(0, 0.005)) for pose, path, reach in echoes]
+    fits = fits_of(noisy, guess)
+    assert off(fits, plane)[0] < 3 * 0.005 / math.sqrt(len(echoes) / 4)
+    assert fits.explained[0, : len(echoes)].all()
+
+
+@settings(max_examples=25)
+@given(seeds)
+def test_a_motion_of_all_sensors_changes_nothing_but_the_plane(seed):
+    rng = np.random.default_rng(seed)
+    plane, guess = a_plane(rng)
+    echoes = echoes_of_plane(some_poses(rng), plane)
+    frame = np.append(rng.uniform(-0.5, 0.5, 2), rng.uniform(-3, 3))  # on this side of the wall
+    compare_from(frame, echoes, plane, guess)
+
+
+def test_a_wall_that_the_robot_has_passed_is_the_same_wall(rng):
+    """Through a door, say: the frame of the last pose is beyond the wall that the poses before it heard."""
+    plane, guess = (1.0, 0.0), (1.02, 0.03)
+    echoes = echoes_of_plane(some_poses(rng), plane)
+    compare_from(np.array([1.5, 0.1, 0.0]), echoes, plane, guess)
+
+
+def seen_from(frame, line):
+    """The line (rho, theta) in the frame of a pose, rho >= 0 as the votes have it."""
+    rho = line[0] - frame[0] * math.cos(line[1]) - frame[1] * math.sin(line[1])
+    theta = line[1] - frame[2]
+    return (rho, oracles.wrap(theta)) if rho >= 0 else (-rho, oracles.wrap(theta + math.pi))
+
+
+def compare_from(frame, echoes, plane, guess):
+    """The same echoes, candidate and plane from another frame give the same fit."""
+    here = fits_of(echoes, guess)
+    there = fits_of([(relative(frame, pose), path, reach) for pose, path, reach in echoes], seen_from(frame, guess))
+    np.testing.assert_array_equal(there.explained, here.explained)
+    assert there.plane_score[0] == pytest.approx(here.plane_score[0], rel=1e-3)
+    assert there.point_score[0] == pytest.approx(here.point_score[0], rel=0.02, abs=0.2)
+    assert max(off(there, seen_from(frame, plane))) < 1e-4
+    assert np.ptp(there.foot[0, : len(echoes)]) == pytest.approx(np.ptp(here.foot[0, : len(echoes)]), abs=1e-3)
+
+
+def test_a_wall_in_front_is_no_echo_of_one_as_far_behind():
+    """Sensors beyond a plane that look away from it have not heard it."""
+    before = echoes_of_plane([np.array([0.0, y, 0.0]) for y in (-0.4, -0.2, 0.0, 0.2, 0.4)], (0.9, 0.0))
+    beyond = []
+    for y in (-0.3, 0.3):
+        pose = np.array([1.6, y, 0.0])
+        sensor = (oracles.matrix(pose) @ np.append(RING.position[0], 1))[0]
+        beyond += oracles.plane_echoes(RING, pose, 2 * sensor - 0.9, 0.0)[:1]  # sensor 0, as far as the plane behind it
+    assert [path for _, path, _ in beyond] == [0, 0]
+    fits = fits_of(before + beyond, (0.91, 0.01))
+    assert fits.explained[0, : len(before)].all()
+    assert not fits.explained[0, len(before) :].any()
+
+
+def test_echoes_from_where_no_cone_looks_are_not_explained():
+    poses = [np.array([0.0, y, 0.0]) for y in (-0.4, 0.0, 0.4)]
+    echoes = echoes_of_plane(poses, (1.0, 0.0))
+    behind = [(pose, int(RING.path_index[8, 8]), reach) for pose, path, reach in echoes if path == 0]
+    assert len(behind) == 3
+    fits = fits_of(echoes + behind, (1.0, 0.0))
+    assert fits.explained[0, : len(echoes)].all()
+    assert not fits.explained[0, len(echoes) :].any()
+
+
+# points
+
+
+def on_the_way(rng, spread):
+    """Poses along a path that leads past a point 0.9 m to the side, and that point."""
+    along = np.linspace(-spread, spread, 12)
+    return np.column_stack([along, rng.normal(0, 0.02, 12), rng.normal(0, 0.1, 12)]), np.array([0.0, 0.9])
+
+
+@settings(max_examples=15)
+@given(seeds, st.booleans(), st.sampled_from([0.35, 0.7, 1.0]))
+def test_a_point_explains_its_echoes_better_than_a_plane_does(seed, corner, spread):
+    """By more than the factor that decides, once the robot has passed it."""
+    rng = np.random.default_rng(seed)
+    poses, place = on_the_way(rng, spread)
+    echoes = [echo for pose in poses for echo in oracles.point_echoes(RING, pose, place, corner=corner)][:ROOM]
+    guess = 0.9 + rng.uniform(-0.04, 0.04), math.pi / 2 + rng.uniform(-0.06, 0.06)
+    fits = fits_of(echoes, guess)
+    assert fits.point_score[0] == pytest.approx(len(echoes), rel=1e-3)
+    assert fits.point_score[0] > fits.plane_score[0]
+    if spread > 0.5:
+        assert fits.point_score[0] > BETTER * fits.plane_score[0]
+
+
+def tracked(x):
+    return jnp.asarray(x, jnp.float64)
+
+
+@pytest.mark.parametrize("model", [fitting.plane, fitting.corner, fitting.edge])
+def test_gradients_of_the_ranges_agree_with_finite_differences(model: Callable[..., Any], rng):
+    def ranges(x, echo):
+        return model(x, echo)[0]
+
+    forward, backward = jax.jit(jax.jacfwd(ranges)), jax.jit(jax.grad(ranges))
+    with jax.enable_x64(True):
+        for _ in range(5):
+            at = tracked(rng.uniform(0.8, 1.2, 2))
+            zero = jnp.zeros((), jnp.float64)
+            tx, rx = (tracked(p) for p in rng.uniform(-0.2, 0.2, (2, 2)))
+            echo = fitting.Heard(tx, rx, zero, zero, zero)
+            steps = 1e-5 * np.eye(2)
+            numerical = [float(ranges(at + step, echo) - ranges(at - step, echo)) / 2e-5 for step in steps]
+            for slope in (model(at, echo)[1], forward(at, echo), backward(at, echo)):
+                np.testing.assert_allclose(slope, numerical, atol=1e-8)
+
+
+@pytest.mark.parametrize("model", [fitting.plane, fitting.corner, fitting.edge])
+def test_gradients_are_finite_where_a_sensor_sits_on_the_reflector(model: Callable[..., Any]):
+    zero, here = jnp.zeros(()), jnp.asarray([0.5, 0.0])
+    echo = fitting.Heard(here, here, zero, zero, zero)
+    came = jax.jit(model)(here, echo)
+    for values in (*came, jax.jit(jax.grad(lambda x: model(x, echo)[0]))(here)):
+        assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("model", [fitting.plane, fitting.corner, fitting.edge])
+def test_ranges_are_those_of_the_oracle(model: Callable[..., Any], rng):
+    """One fit of one model to its own echoes: nothing is left of any residual."""
+    poses, place = on_the_way(rng, 0.7)
+    if model is fitting.plane:
+        truth, echoes = np.array([0.9, math.pi / 2]), echoes_of_plane(poses, (0.9, math.pi / 2))
+    else:
+        truth, corner = place, model is fitting.corner
+        echoes = [echo for pose in poses for echo in oracles.point_echoes(RING, pose, place, corner=corner)][:ROOM]
+    start = jnp.asarray(truth + np.array([0.03, -0.03]), jnp.float32)
+    came, score = fit(model, start, heard(packed(echoes)), tolerance=TOLERANCE)
+    np.testing.assert_allclose(came, truth, atol=1e-4)
+    np.testing.assert_allclose(score[: len(echoes)], 1, atol=1e-4)
+    assert not np.asarray(score)[len(echoes) :].any()
+
+
+# shapes and missing things
+
+
+def test_candidates_that_are_none_explain_nothing_and_disturb_nobody(rng):
+    plane, guess = a_plane(rng)
+    echoes = echoes_of_plane(some_poses(rng), plane)
+    alone, among = fits_of(echoes, guess), fits_of(echoes, (np.nan, np.nan), guess, (np.nan, 0.3), (0.5, np.nan))
+    for name in ("rho", "theta", "explained", "foot", "plane_score", "point_score"):
+        np.testing.assert_array_equal(getattr(among, name)[1], getattr(alone, name)[0])
+        assert np.isfinite(getattr(among, name)[1]).all()
+    for nobody in (0, 2, 3):
+        assert not among.explained[nobody].any()
+        assert among.plane_score[nobody] == 0
+        assert among.point_score[nobody] == 0
+
+
+def test_echoes_that_are_none_are_not_explained():
+    """Missing, beyond the maximum range, and impossible ones; also where nothing else was heard."""
+    rows = np.array([np.nan, np.inf, 2.5, RING.max_range, 1e6])
+    poses, paths = np.zeros((1, ROOM, 3), np.float32), np.zeros((1, ROOM), np.int32)
+    reported = np.resize(rows, (1, ROOM)).astype(np.float32)
+    echoes = kernels.Echoes(jnp.asarray(paths), jnp.asarray(reported), jnp.asarray(poses))
+    rho, theta = (jnp.full((1, LINES), value, jnp.float32) for value in (1.0, 0.1))
+    fits = kernels.fit_candidates(ARCS, echoes, rho, theta, tolerance=TOLERANCE)
+    assert not fits.explained.any()
+    assert (fits.plane_score == 0).all()
+    assert (fits.point_score == 0).all()
+    assert np.isfinite(fits.rho).all()
+    assert np.isfinite(fits.theta).all()
+
+
+def test_echoes_without_poses_were_all_taken_at_the_origin():
+    echoes = packed(echoes_of_plane(np.zeros((1, 3)), (0.9, 1.0)))
+    plain = kernels.Echoes(echoes.path, echoes.range)
+    jax.tree.map(np.testing.assert_array_equal, heard(echoes), heard(plain))
+
+
+def test_lines_are_folded(rng):
+    """A candidate may come from either side of the origin; what is fitted has rho >= 0, theta in [-pi, pi)."""
+    poses = np.column_stack([np.full(6, -1.0), np.linspace(-0.5, 0.5, 6), np.zeros(6)])
+    fits = fits_of(echoes_of_plane(poses, (-0.02, 0.0)), (0.01, 0.02), (-0.05, 0.02), (0.01, 0.02 + 2 * math.pi))
+    for k in range(3):
+        assert fits.rho[k] == pytest.approx(0.02, abs=1e-4)
+        assert abs(oracles.wrap(fits.theta[k] - math.pi)) < 1e-4
+        assert -np.float32(np.pi) <= fits.theta[k] < np.float32(np.pi)
+
+
+def test_compiles_once_for_a_shape_whatever_is_in_it(rng):
+    compiled: Any = kernels.fit_candidates
+    sizes = []
+    for _ in range(4):
+        plane, guess = a_plane(rng)
+        fits_of(echoes_of_plane(some_poses(rng, count=int(rng.integers(4, 9))), plane), guess)
+        sizes.append(compiled._cache_size())
+    assert sizes[0] >= 1
+    assert len(set(sizes)) == 1

@@ -1,0 +1,308 @@
+"""Closures between submaps of floor plans: right where there is only one answer, none where there are two."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from support.submaps import along, building, ring, room, submap, submaps
+
+from jaxsonar import kernels
+from jaxsonar.estimation.pose_graph import Link, solve
+from jaxsonar.geometry.se2 import composed, relative, wrap_angle
+from jaxsonar.loop_closure.closure import closure
+from jaxsonar.loop_closure.sequential_constraint import joined
+from jaxsonar.loop_closure.submap_graph import SubmapGraph, candidates
+from jaxsonar.loop_closure.submap_matching import Pairs, fitted, misfit, nearest
+from jaxsonar.loop_closure.verification import ACCEPTED, SURE, Closures, Proposal
+
+NICHE = np.array([[0, 0], [4, 0], [4, 3.2], [2.4, 3.2], [2.4, 2.7], [1.2, 2.7], [1.2, 3.2], [0, 3.2]], dtype=float)
+FIRST, SECOND = along((1, 1), (3, 1), (3, 2.2), (1.2, 2.2)), along((3, 2), (1, 1.8), (1, 1), (2.8, 1.2))
+TWINS = building(12, [(3, 0.45, 1.2, 5.2, 3.0), (7.6, 0.45, 5.8, 9.8, 3.0)])
+DOORS = building(20, [(x, 0.45, 0.15) for x in np.arange(1.5, 19, 2.0)])
+
+
+def two(outline, first, second, seed, sigma):
+    """Two submaps, the true earlier_from_newest, and a prior drawn around it."""
+    rng = np.random.default_rng(seed)
+    earlier, newest = (submap(outline, path, path[-1], rng) for path in (first, second))
+    true = relative(first[0], second[0])
+    spread = np.array([sigma, sigma, min(0.2 * sigma, np.radians(20))])
+    return earlier, newest, true, true + rng.normal(size=3) * spread, np.diag(spread**2)
+
+
+def off_by(found, true):
+    """Error of a relative pose in the directions that it determines, and its squared Mahalanobis length."""
+    error = np.append(found.relative[:2] - true[:2], wrap_angle(float(found.relative[2] - true[2])))
+    error = found.basis.T @ error
+    return error, float(error @ (found.basis.T @ found.information @ found.basis) @ error)
+
+
+def test_closures_of_a_room_are_right_and_honest():
+    surprise, rank = [], 0
+    for seed in range(9):
+        earlier, newest, true, prior, cov = two(NICHE, FIRST, SECOND, seed, (0.1, 0.3, 0.7)[seed % 3])
+        found = closure(newest, earlier, prior, cov)
+        if found is not None:
+            error, chi2 = off_by(found, true)
+            assert np.abs(error).max() < 0.1
+            surprise.append(chi2)
+            rank += len(error)
+            assert chi2 < 16 * len(error)
+    assert len(surprise) >= 7  # nearly all are found
+    assert 0.5 < sum(surprise) / rank < 1.8
+
+
+def test_a_room_found_again_after_little_drift_needs_no_confirmation():
+    sure = 0
+    for seed in range(5):
+        earlier, newest, _, prior, cov = two(NICHE, FIRST, SECOND, seed, 0.1)
+        found = closure(newest, earlier, prior, cov)
+        sure += found is not None and found.odds > SURE
+    assert sure >= 4
+
+
+@pytest.mark.parametrize("sigma", [0.3, 1.0, 2.0])
+def test_a_room_like_another_one_is_not_taken_for_it(sigma):
+    first = along((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
+    for seed in range(3):
+        earlier, newest, _, prior, cov = two(TWINS, first, first + np.array([4.6, 0, 0]), seed, sigma)
+        found = closure(newest, earlier, prior, cov)
+        assert found is None or found.odds < SURE - 2
+
+
+def test_not_even_where_drift_has_laid_one_on_the_other():
+    first = along((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
+    for seed in range(4):
+        earlier, newest, _, _, cov = two(TWINS, first, first + np.array([4.6, 0, 0]), seed, 2.0)
+        found = closure(newest, earlier, np.zeros(3), cov)
+        assert found is None or found.odds < SURE - 2
+
+
+def test_a_rectangle_is_not_turned_half_around():
+    outline, half = room(4.0, 3.2), np.array([4.0, 3.2, np.pi])
+    there = composed(half, SECOND)  # the same path from the other side
+    for seed in range(3):
+        earlier, newest, true, prior, cov = two(outline, FIRST, SECOND, seed, 0.3)
+        found = closure(newest, earlier, prior, cov)
+        if found is not None:
+            assert np.abs(off_by(found, true)[0]).max() < 0.1
+        # With every heading possible there are two answers, hence none.
+        found = closure(newest, earlier, composed(true, np.array([0.0, 0.0, 1.5])), np.diag([1.0, 1.0, 9.0]))
+        assert found is None or found.odds < SURE
+        earlier, newest, true, prior, cov = two(outline, FIRST, there, seed, 0.3)
+        found = closure(newest, earlier, prior, cov)
+        assert found is None or np.abs(off_by(found, true)[0]).max() < 0.1
+
+
+def test_doors_that_repeat_are_not_counted_wrongly():
+    for seed in range(4):
+        shift = 2.0 * (seed % 3 - 1)
+        second = along((9.2 + shift, 0.8), (5.9 + shift, 0.8))
+        earlier, newest, _, prior, cov = two(DOORS, along((5.0, 0.9), (8.5, 0.9)), second, seed, 0.8)
+        found = closure(newest, earlier, prior, cov)
+        assert found is None or found.free is not None or found.odds < SURE
+
+
+def test_parallel_walls_leave_the_way_along_them_open():
+    outline = building(20, [])
+    for seed in range(4):
+        first, second = along((6.0, 0.9), (9.0, 0.9)), along((9.4, 0.8), (6.9, 0.8))
+        earlier, newest, true, prior, cov = two(outline, first, second, seed, 0.15)
+        found = closure(newest, earlier, prior, cov)
+        if found is None:
+            continue
+        assert found.free is not None
+        assert abs(found.free @ np.array([1.0, 0.0])) > 0.99
+        free = np.append(found.free, 0.0)
+        assert np.abs(found.information @ free).max() < 1e-6 * np.abs(found.information).max()
+        assert np.linalg.matrix_rank(found.information, tol=1.0) == 2
+        assert off_by(found, true)[1] < 32
+        # In a graph it leaves the variance along the corridor as it was.
+        chain = [Link(0, 1, prior, np.linalg.inv(cov))]
+        graph = solve(np.stack([np.zeros(3), prior]), [*chain, Link(0, 1, found.relative, found.information)])
+        after = graph.covariance(np.array([1]))[0]
+        assert free @ after @ free > 0.9 * (free @ cov @ free)
+
+
+def test_the_misfit_and_its_derivatives(rng):
+    earlier, newest, true, _, _ = two(NICHE, FIRST, SECOND, 3, 0.1)
+    pairs = nearest(earlier, newest, true, np.diag([1e-4, 1e-4, 1e-5]))
+    assert len(pairs) > 5
+    pose = true + np.array([0.05, -0.03, 0.02])
+    seen = misfit(earlier, newest, pairs.earlier, pairs.newest, pose)
+    # Independently: walls and points moved as points on them.
+    for k, (a, b) in enumerate(zip(*pairs, strict=True)):
+        if earlier.kind[a] != kernels.PLANE:
+            place = composed(pose, np.append(newest.anchor[b] + newest.parameters[b], 0.0))[:2]
+            np.testing.assert_allclose(seen.residual[k], place - earlier.anchor[a] - earlier.parameters[a])
+            continue
+        level, theta = newest.parameters[b]
+        foot = newest.anchor[b] + level * np.array([np.cos(theta), np.sin(theta)])
+        moved = composed(pose, np.append(foot, theta))
+        normal = np.array([np.cos(moved[2]), np.sin(moved[2])])
+        expected = [normal @ (moved[:2] - earlier.anchor[a]) - earlier.parameters[a, 0]]
+        expected.append(float(wrap_angle(float(moved[2] - earlier.parameters[a, 1]))))
+        np.testing.assert_allclose(seen.residual[k], expected, atol=1e-12)
+    for k in range(3):
+        step = np.zeros(3)
+        step[k] = 1e-6
+        sides = [misfit(earlier, newest, *pairs, pose + sign * step).residual for sign in (1, -1)]
+        np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, seen.by_pose[..., k], atol=1e-6)
+    for k in range(2):
+        step = np.zeros(2)
+        step[k] = 1e-6
+        sides = [
+            misfit(earlier, replace(newest, parameters=newest.parameters + sign * step), *pairs, pose).residual
+            for sign in (1, -1)
+        ]
+        np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, seen.by_newest[..., k], atol=1e-6)
+
+
+def test_the_fit_is_the_least_squares_solution():
+    earlier, newest, true, _, _ = two(NICHE, FIRST, SECOND, 1, 0.1)
+    pairs = nearest(earlier, newest, true, np.diag([1e-4, 1e-4, 1e-5]))
+    fit = fitted(earlier, newest, pairs, true)
+    for step in 1e-3 * np.concatenate([np.eye(3), -np.eye(3)]):
+        # A quadratic form around the minimum with the information as its curvature: chi2 at other poses, by hand.
+        seen = misfit(earlier, newest, *pairs, fit.pose + step)
+        rows = (3 + 2 * pairs.earlier[:, None] + np.arange(2)).ravel()
+        others = (3 + 2 * pairs.newest[:, None] + np.arange(2)).ravel()
+        design = np.zeros((len(rows), len(others)))
+        for k, block in enumerate(misfit(earlier, newest, *pairs, fit.pose).by_newest):
+            design[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = block
+        cov = earlier.covariance[np.ix_(rows, rows)] + design @ newest.covariance[np.ix_(others, others)] @ design.T
+        off = seen.residual.ravel()
+        expected = fit.chi2 + step @ fit.information @ step
+        assert off @ np.linalg.solve(cov, off) == pytest.approx(expected, abs=0.02 * expected)
+
+
+def test_shared_walls_make_the_chain_better_and_honest():
+    total, joint, before, better, count = 0.0, 0.0, 0.0, 0, 20
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        made, true = submaps(NICHE, along((1, 1), (3, 1), (3, 2.2), (1.2, 2.2), (1, 1)), rng, scans=25, slip=3.0)
+        link, expected = joined(made[0], made[1], 4), relative(true[0], true[1])
+        assert (link.first, link.second) == (4, 5)
+        off = link.relative - expected
+        off[2] = wrap_angle(off[2])
+        total += off @ link.information @ off
+        joint += float(np.abs(off[:2]).sum())
+        before += float(np.abs((made[0].exit - expected)[:2]).sum())
+        better += np.linalg.det(link.information) > 2 * np.linalg.det(np.linalg.inv(made[0].covariance[:3, :3]))
+    assert better >= 0.8 * count  # where doors or corners repeat within the exit's spread it stays as it was
+    assert joint < 0.7 * before
+    assert 0.5 < total / (3 * count) < 1.7
+
+
+def test_without_shared_walls_the_chain_is_the_exit():
+    rng = np.random.default_rng(0)
+    here, there = submap(NICHE, FIRST, FIRST[-1], rng), submap(room(9, 9), along((1.5, 4), (1.5, 6)), FIRST[-1], rng)
+    empty = replace(
+        there,
+        kind=there.kind[:0],
+        parameters=there.parameters[:0],
+        anchor=there.anchor[:0],
+        ends=there.ends[:0],
+        scans=there.scans[:0],
+        covariance=there.covariance[:3, :3],
+    )
+    link = joined(here, empty)
+    np.testing.assert_array_equal(link.relative, here.exit)
+    assert closure(empty, here, np.zeros(3), np.eye(3)) is None
+    assert len(nearest(here, empty, np.zeros(3), np.eye(3))) == 0
+
+
+def around(outline, path, seed, **errors):
+    """A whole way: the graph at its end, and the true poses of the bases."""
+    made, true = submaps(outline, path, np.random.default_rng(seed), **errors)
+    graph = SubmapGraph()
+    for one in made:
+        graph.add(one)
+        graph.settle()
+    return graph, relative(np.broadcast_to(true[0], true.shape), true)
+
+
+@pytest.mark.parametrize("slip", [1.0, 4.0])
+def test_a_way_around_a_block_twice_is_closed_rightly(slip):
+    doors = [(0, 1.7, 0.5, 0.2), (0, 3.9, 0.4, 0.2), (1, 3.0, 0.5, 0.2), (2, 2.1, 0.5, 0.2), (3, 4.0, 0.5, 0.2)]
+    corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
+    path = along(*corners, *corners[:3])
+    graph, true = around(ring(7, 5, doors), path, 2, slip=slip, missed=0.1, spurious=0.5)
+    assert len(graph.closures.accepted) >= 3
+    for one in graph.closures.accepted:
+        error, chi2 = off_by(one.closure, relative(true[one.earlier], true[one.newest]))
+        assert np.abs(error).max() < 0.15
+        assert chi2 < 16 * len(error)
+    off = graph.poses - true
+    assert np.linalg.norm(off[:, :2], axis=1).max() < 0.4
+    assert graph.covariances().shape == (len(true), 3, 3)
+
+
+def test_work_done_piece_by_piece_comes_to_the_same():
+    corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
+    made, _ = submaps(ring(7, 5, [(0, 1.7, 0.5, 0.2)]), along(*corners, *corners[:2]), np.random.default_rng(3))
+    at_once, slowly = SubmapGraph(), SubmapGraph()
+    for one in made:
+        at_once.add(one)
+        decisions = at_once.settle()
+        slowly.add(one)
+        before, said = slowly, []
+        while slowly.busy:
+            before, slowly = slowly, slowly.copy()
+            said += slowly.work()
+            assert before.busy  # what was copied is as it was
+        assert [vars(one) for one in said] == [vars(one) for one in decisions]
+    assert at_once.closures.accepted
+    np.testing.assert_array_equal(at_once.poses, slowly.poses)
+    # What is left is done before the next one comes.
+    late = SubmapGraph()
+    for one in made:
+        late.add(one)
+    late.settle()
+    np.testing.assert_array_equal(at_once.poses, late.poses)
+
+
+def test_a_wrong_closure_is_withdrawn_and_leaves_no_trace():
+    corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
+    doors = [(0, 1.7, 0.5, 0.2), (0, 3.9, 0.4, 0.2), (1, 3.0, 0.5, 0.2)]
+    graph, _ = around(ring(7, 5, doors), along(*corners, *corners[:2]), 1)
+    known = graph.closures
+    good, before = known.accepted[0], graph.graph
+    wrong = good.closure._replace(relative=good.closure.relative + np.array([1.0, 0.0, 0.0]))
+    # As if an early, wide prior had let it in.
+    known.proposals.append(Proposal(good.earlier, good.newest, wrong, good.place, ACCEPTED))
+    after = known.settled(before.poses, graph.chain, len(graph.submaps) - 1)
+    np.testing.assert_allclose(after.poses, before.poses, atol=1e-5)
+    np.testing.assert_allclose(after.covariance(np.arange(5)), before.covariance(np.arange(5)), atol=1e-8)
+    assert [one.state for one in known.decisions][-1] == "withdrawn"
+
+
+def test_a_closure_that_the_chain_forbids_is_refused():
+    earlier, newest, true, _, cov = two(NICHE, FIRST, SECOND, 0, 0.1)
+    found = closure(newest, earlier, true, cov)
+    assert found is not None
+    graph = solve(np.stack([np.zeros(3), true]), [Link(0, 1, true, np.linalg.inv(cov))])
+    for shift, state in ((0.0, ACCEPTED), (2.0, "refused")):
+        known = Closures()
+        moved = found._replace(relative=found.relative + np.array([shift, 0.0, 0.0]))
+        assert known.consider(graph, Proposal(0, 1, moved, np.zeros(2))) == (state == ACCEPTED)
+        assert known.decisions[-1].state == state
+        assert len(known.links) == (state == ACCEPTED)
+
+
+def test_candidates_are_few_and_near():
+    made, true = submaps(building(30, []), along((1, 0.9), (29, 0.9), (1, 0.8)), np.random.default_rng(0))
+    links = [Link(k, k + 1, relative(a, b), 1e4 * np.eye(3)) for k, (a, b) in enumerate(pairwise(true))]
+    graph, newest = solve(true, links), len(made) - 1
+    chosen = candidates(graph, made, newest, most=3)
+    assert 1 <= len(chosen) <= 3
+    assert chosen.max() < newest - 1
+    assert np.linalg.norm(true[chosen, :2] - true[newest, :2], axis=1).max() < 8.0
+    assert len(candidates(graph, made, 1)) == 0
+
+
+def test_leaving_out_a_pair_leaves_the_others():
+    pairs = Pairs(np.array([3, 1, 2]), np.array([0, 4, 5])).without(1)
+    assert pairs.earlier.tolist() == [3, 2]
+    assert pairs.newest.tolist() == [0, 5]

@@ -1,0 +1,339 @@
+"""Silence against a slow oracle and against true walls; what is remembered does not depend on order, nor on where."""
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import oracles
+
+from jaxsonar import Log, Ring, load_ring, local_models, random_pose, random_room, simulate
+from jaxsonar.geometry.se2 import to_world
+from jaxsonar.mapping.build_map import gather_evidence
+from jaxsonar.mapping.free_space import CELL, DIRECTIONS, FACING, HIDDEN, LATEST, MARGIN, SURE, SeenThrough, silence
+from jaxsonar.simulation.office import load_office
+
+STEP = 2 * math.pi / DIRECTIONS
+RAYS, POINTS = 17, 33
+"""Rays of a cone, as the code has them; the oracle shares the samples, not the arithmetic."""
+BUMPER = Ring(
+    [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
+    np.radians([-15.0, -5.0, 5.0, 15.0]),
+    beam=np.radians(70),
+    neighbors=3,
+    max_range=2.5,
+)
+
+
+def direction_of(theta):
+    return math.floor((theta % (2 * math.pi)) / STEP) % DIRECTIONS
+
+
+def place_of(point, theta):
+    """(cell x, cell y, direction) of a wall at a point with a normal."""
+    return math.floor(point[0] / CELL), math.floor(point[1] / CELL), direction_of(theta)
+
+
+def centre_of(cells):
+    """A point and a normal in the middle of each cell."""
+    cells = np.asarray(cells)
+    return (cells[:, :2] + 0.5) * CELL, (cells[:, 2] + 0.5) * STEP
+
+
+def some_cells(rng, count, *, around=(0, 0)):
+    """Cells over several tiles on both sides of a place, many of them more than once."""
+    cells = np.column_stack([rng.integers(-40, 40, (count, 2)), rng.integers(0, DIRECTIONS, count)])
+    cells = cells[rng.integers(0, max(count // 4, 1), count)]
+    return cells + np.array([*around, 0]), rng.integers(-5, 50, count).astype(float)
+
+
+def assert_same(one, other):
+    assert one.tiles.keys() == other.tiles.keys()
+    for key, times in one.tiles.items():
+        np.testing.assert_array_equal(times, other.tiles[key])
+
+
+def copied(seen):
+    return {key: times.copy() for key, times in seen.tiles.items()}
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10_000), st.integers(0, 300), st.integers(1, 6))
+def test_any_split_and_order_of_the_scans_is_remembered_alike(seed, count, parts):
+    rng = np.random.default_rng(seed)
+    cells, when = some_cells(rng, count)
+    whole = SeenThrough().including(cells, when)
+    apart = SeenThrough()
+    for rows in np.array_split(rng.permutation(count), parts):
+        apart = apart.including(cells[rows], when[rows])
+    assert_same(whole, apart)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10_000), st.integers(1, 300), st.sampled_from([(0, 0), (-37, 1), (10**6, -(10**6))]))
+def test_the_latest_are_remembered_and_told_latest_first(seed, count, around):
+    """Against sorting the times of every cell by hand; also on both sides of the origin and 100 km from it."""
+    rng = np.random.default_rng(seed)
+    cells, when = some_cells(rng, count, around=around)
+    seen = SeenThrough().including(cells, when)
+    points, theta = centre_of(cells)
+    told = seen.look(points, theta + 2 * math.pi * rng.integers(-2, 3, count))
+    for cell, times in zip(cells, told, strict=True):
+        by_hand = sorted(when[(cells == cell).all(axis=1)].tolist(), reverse=True)[:LATEST]
+        assert times.tolist() == by_hand + [-np.inf] * (LATEST - len(by_hand))
+
+
+def test_what_was_never_seen_through_is_not_told(rng):
+    cells, when = some_cells(rng, 200)
+    seen = SeenThrough().including(cells, when)
+    known = set(map(tuple, cells.tolist()))
+    others = [cell for cell in map(tuple, some_cells(rng, 2000)[0].tolist()) if cell not in known]
+    assert len(others) > 100
+    assert np.isneginf(seen.look(*centre_of(others))).all()
+    assert np.isneginf(SeenThrough().look(*centre_of(cells))).all()
+    assert seen.look(np.zeros((0, 2)), np.zeros(0)).shape == (0, LATEST)
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 10_000), st.lists(st.integers(0, 120), min_size=3, max_size=3))
+def test_joining_is_a_sum(seed, counts):
+    """Commutative, associative, neutral with nothing, and the same as including all at once."""
+    rng = np.random.default_rng(seed)
+    parts = [some_cells(rng, count) for count in counts]
+    a, b, c = (SeenThrough().including(*part) for part in parts)
+    assert_same(a.joined(b), b.joined(a))
+    assert_same(a.joined(b).joined(c), a.joined(b.joined(c)))
+    assert_same(a.joined(SeenThrough()), a)
+    assert_same(SeenThrough().joined(a), a)
+    cells, when = (np.concatenate(column) for column in zip(*parts, strict=True))
+    assert_same(a.joined(b).joined(c), SeenThrough().including(cells, when))
+
+
+def test_old_states_stay_as_they_were(rng):
+    first = SeenThrough().including(*some_cells(rng, 300))
+    second = SeenThrough().including(*some_cells(rng, 300))
+    before, before_second = copied(first), copied(second)
+    first.including(*some_cells(rng, 300)).including(*some_cells(rng, 300))
+    first.joined(second)
+    second.joined(first)
+    assert_same(first, SeenThrough(before))
+    assert_same(second, SeenThrough(before_second))
+
+
+def path_geometry(ring, path):
+    """Midpoint, first direction and width of what a path hears, from the cones of its two sensors."""
+    tx, rx = ring.paths[path]
+    turn = oracles.wrap(ring.heading[rx] - ring.heading[tx])
+    first = max(-ring.beam[tx] / 2, turn - ring.beam[rx] / 2)
+    last = min(ring.beam[tx] / 2, turn + ring.beam[rx] / 2)
+    return (ring.position[tx] + ring.position[rx]) / 2, ring.heading[tx] + first, last - first
+
+
+def slow_silence(ring, pose, echoes, walls):
+    """Cells that one scan (path, reach) saw through: loops over sensors, rays and distances, shapely for what hides."""
+    hides = []
+    for start, end in walls:
+        beyond = HIDDEN * (end - start) / np.linalg.norm(end - start)
+        normal = math.atan2(beyond[0], -beyond[1])
+        hides.append((normal, shapely.LineString([start, end]), shapely.LineString([start - beyond, end + beyond])))
+    votes = {}
+    for path, (tx, rx) in enumerate(ring.paths):
+        if tx != rx:
+            continue
+        middle, first, width = path_geometry(ring, path)
+        sensor = to_world(pose, middle)
+        nearest = min([reach for k, reach in echoes if k == path], default=math.inf)
+        nearest = min(nearest, SURE * ring.max_range + MARGIN)
+        for k in range(RAYS):
+            theta = pose[2] + first + width * (0.5 + SURE * (k / (RAYS - 1) - 0.5))
+            ray = np.array([math.cos(theta), math.sin(theta)])
+            sight = shapely.LineString([sensor, sensor + 100 * ray])
+            # A wall may go on beyond its ends, but whoever faces it there would have heard it.
+            facing = [abs(oracles.wrap(2 * (theta - normal))) / 2 <= FACING for normal, _, _ in hides]
+            met = [seen if faces else guessed for faces, (_, seen, guessed) in zip(facing, hides, strict=True)]
+            met = [sight.intersection(wall) for wall in met if sight.intersects(wall)]
+            hidden = min((shapely.Point(sensor).distance(place) for place in met), default=math.inf)
+            distance = CELL / 2
+            while distance < SURE * ring.max_range:
+                cell = place_of(sensor + distance * ray, theta)
+                middle = (np.array(cell[:2]) + 0.5) * CELL
+                sector = 2 * math.pi / DIRECTIONS
+                faced = (cell[2] * sector - pose[2] - first) % (2 * math.pi) <= width - sector
+                if faced and max(distance, np.linalg.norm(middle - sensor)) < min(nearest, hidden) - MARGIN:
+                    votes.setdefault(cell, set()).add(path)
+                distance += CELL * 0.7
+    against = set()
+    for path, reach in echoes:
+        middle, first, width = path_geometry(ring, path)
+        sensor = to_world(pose, middle)
+        for k in range(POINTS):
+            theta = pose[2] + first + width * k / (POINTS - 1)
+            for distance in (reach - CELL / 2, reach, reach + CELL / 2):
+                point = sensor + distance * np.array([math.cos(theta), math.sin(theta)])
+                against.add(place_of(point, theta))
+    together = sum(path_geometry(ring, k)[2] for k, (tx, rx) in enumerate(ring.paths) if tx == rx) / (2 * math.pi)
+    around = {}
+    for (x, y, facing), sensors in votes.items():
+        around.setdefault((x // 2, y // 2, facing), set()).update(sensors)
+    enough = 2 if together >= 2 else 1
+    return {(x, y, facing) for x, y, facing in votes if len(around[x // 2, y // 2, facing]) >= enough} - against
+
+
+def quick_silence(ring, poses, echoes, walls):
+    """The same from the code, for several scans: a set of cells each."""
+    scan = np.repeat(np.arange(len(poses)), [len(part) for part in echoes])
+    flat = [echo for part in echoes for echo in part]
+    path = np.array([k for k, _ in flat], np.int64)
+    reach = np.array([r for _, r in flat], np.float64)
+    cells, who = silence(ring, np.asarray(poses, np.float64), scan, path, reach, walls)
+    return [set(map(tuple, cells[who == k].tolist())) for k in range(len(poses))]
+
+
+@pytest.mark.parametrize(
+    "ring", [Ring.circular(), Ring.circular(count=12, beam=0.9, neighbors=1), BUMPER, load_ring("corridor8")]
+)
+def test_silence_is_that_of_the_slow_oracle(ring):
+    """Whole scans at once against one at a time by hand; poses near and far, echoes and walls at random."""
+    rng = np.random.default_rng(5)
+    poses, echoes, walls = [], [], []
+    for k in range(5):
+        poses.append(np.append(rng.uniform(-3, 3, 2) * (100 if k == 4 else 1), rng.uniform(-4, 4)))
+        count = int(rng.integers(0, 12)) if k else 0
+        paths = rng.integers(0, len(ring.paths), count)
+        echoes.append([(int(p), float(r)) for p, r in zip(paths, rng.uniform(0.3, ring.max_range, count), strict=True)])
+        walls.append(poses[-1][:2] + rng.uniform(-2, 2, (int(rng.integers(0, 4)), 2, 2)))
+    came = quick_silence(ring, poses, echoes, walls)
+    for pose, heard, shown, cells in zip(poses, echoes, walls, came, strict=True):
+        wanted = slow_silence(ring, pose, heard, shown)
+        assert len(wanted) > 10
+        # Cells are computed in single precision in between: a point on a border may fall to either side.
+        assert len(cells ^ wanted) <= 2
+
+
+def test_no_echo_at_all_rules_out_the_cones(faw_ring):
+    """Up to SURE of the maximum range and of the width, all around; and nothing farther."""
+    (cells,) = quick_silence(faw_ring, [(0.0, 0.0, 0.0)], [[]], [np.zeros((0, 2, 2))])
+    points, theta = centre_of(sorted(cells))
+    farthest = np.linalg.norm(points, axis=-1).max()
+    assert 0.28 + SURE * 2.0 - 2 * CELL < farthest < 0.28 + SURE * 2.0 + CELL
+    # Most places that face a sensor, all around; farther ones lie between the rays.
+    rng = np.random.default_rng(0)
+    claimed = []
+    for _ in range(2000):
+        sensor, distance = int(rng.integers(24)), rng.uniform(0.2, 1.2)
+        turn = faw_ring.heading[sensor] + rng.uniform(-0.1, 0.1)
+        point = faw_ring.position[sensor] + distance * np.array([math.cos(turn), math.sin(turn)])
+        claimed.append((sensor, place_of(point, turn) in cells))
+    share = [np.mean([hit for which, hit in claimed if which == sensor]) for sensor in range(24)]
+    assert np.mean(share) > 0.7
+    assert min(share) > 0.4
+    # None of them faces away from the robot, or along its sight.
+    sight = np.arctan2(points[:, 1], points[:, 0])
+    far = np.linalg.norm(points, axis=-1) > 0.6
+    assert np.abs(oracles.wrap(theta - sight))[far].max() < math.radians(60)
+
+
+def test_nothing_seen_through_changes_nothing(rng):
+    """A scan that claims no place: all sensors heard something close by."""
+    nothing = (np.zeros((0, 3), np.int64), np.zeros(0))
+    assert_same(SeenThrough().including(*nothing), SeenThrough())
+    seen = SeenThrough().including(*some_cells(rng, 50))
+    assert_same(seen.including(*nothing), seen)
+
+
+def test_a_deaf_ring_says_nothing(faw_ring):
+    cells, who = silence(faw_ring, np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), [])
+    assert cells.shape == (0, 3)
+    assert len(who) == 0
+
+
+@settings(max_examples=30)
+@given(st.floats(0.45, 1.9), st.floats(-3.1, 3.1), st.floats(-3.1, 3.1), st.floats(-50, 50))
+def test_the_echo_of_a_wall_keeps_its_place(rho, theta, heading, x):
+    """Of an infinite wall no place is claimed that some sensor is square to, nor anything behind it."""
+    ring = Ring.circular()
+    heard = oracles.wall_echoes(ring, rho, theta)
+    pose = np.array([x, 1.0, heading])
+    (cells,) = quick_silence(ring, [pose], [heard], [np.zeros((0, 2, 2))])
+    normal = np.array([math.cos(theta), math.sin(theta)])
+    for position in ring.position:
+        for shift in (-0.03, 0.0, 0.03):
+            foot = to_world(pose, position + (rho - position @ normal + shift) * normal)
+            assert place_of(foot, theta + heading) not in cells
+    points, facing = centre_of(sorted(cells))
+    robot = (points - pose[:2]) @ np.array(
+        [[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]]
+    )
+    behind = (robot @ normal > rho + CELL) & (np.abs(oracles.wrap(facing - theta - heading)) < math.radians(10))
+    assert not behind.any()
+
+
+def true_places(ring, room, pose):
+    """Places of true walls that face a sensor: the foot is on the wall, in the cone, within range, and in sight."""
+    places = {}
+    for sensor, heading, beam in zip(ring.position, ring.heading, ring.beam, strict=True):
+        at = to_world(pose, sensor)
+        for k, (start, end) in enumerate(room.walls):
+            along = (end - start) / np.linalg.norm(end - start)
+            share = (at - start) @ along
+            foot = start + share * along
+            reach = np.linalg.norm(foot - at)
+            theta = math.atan2(*(foot - at)[::-1])
+            inside = 0.02 < share < np.linalg.norm(end - start) - 0.02
+            if not inside or reach > 0.95 * ring.max_range:
+                continue
+            if abs(oracles.wrap(theta - heading - pose[2])) > 0.95 * beam / 2:
+                continue
+            sight = shapely.LineString([at, foot])
+            others = [shapely.LineString(wall) for j, wall in enumerate(room.walls) if j != k]
+            if not any(sight.intersects(other) for other in others):
+                places[place_of(foot, theta)] = k
+    return places
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_true_wall_is_seen_through(faw_ring, seed):
+    """In random rooms without noise; with what the scans show of walls, and without."""
+    rng = np.random.default_rng(seed)
+    room = random_room(rng)
+    poses = np.array([random_pose(rng, room) for _ in range(6)])
+    heard = simulate(faw_ring, room, poses)
+    near = heard.range < faw_ring.max_range
+    nothing = [np.zeros((0, 2, 2))] * len(poses)
+    cells, who = silence(faw_ring, poses, heard.scan[near], heard.path[near], heard.range[near], nothing)
+    checked = 0
+    for k, pose in enumerate(poses):
+        claimed = set(map(tuple, cells[who == k].tolist()))
+        truth = true_places(faw_ring, room, pose)
+        wrong = {place: room.wall_names[wall] for place, wall in truth.items() if place in claimed}
+        assert not wrong, (k, pose)
+        checked += len(truth)
+    assert checked > 20
+
+
+def test_the_walls_of_the_office_are_never_seen_through():
+    """What the evidence of the whole way claims, at places where some scan sees a true wall: nothing."""
+    office = load_office()
+    heard = simulate(office.ring, office.room, office.poses, stamps=office.stamps)
+    log = heard.as_log(office.ring, office.poses)
+    seen = gather_evidence(office.ring, log, list(local_models(office.ring, log))).seen
+    truth = {place for pose in office.poses for place in true_places(office.ring, office.room, pose)}
+    points, theta = centre_of(sorted(truth))
+    told = seen.look(points, theta)
+    assert len(truth) > 50
+    assert np.isneginf(told[:, -1]).all()  # three scans in agreement would remove a wall
+
+
+def test_only_scans_with_a_pose_and_echoes_within_range_speak(faw_ring):
+    """An echo from beyond the maximum range is as good as none; a scan without a pose claims nothing."""
+    far = Log.from_echoes(
+        np.array([0, 1]), np.array([3, 3]), np.array([3, 3]), np.array([2.6, 1.0]),
+        stamp=np.arange(2.0), pose=np.array([[0.0, 0.0, 0.0], [np.nan] * 3]),
+    )  # fmt: skip
+    silent = Log.from_echoes(
+        np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0), stamp=np.zeros(1), pose=np.zeros((1, 3))
+    )
+    came = [gather_evidence(faw_ring, log, list(local_models(faw_ring, log))).seen for log in (far, silent)]
+    assert_same(*came)

@@ -1,0 +1,398 @@
+"""Occupancy grids say what is free, occupied and unknown, whatever the order of scans; shapely knows the truth."""
+
+import ast
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+import shapely
+
+from jaxsonar import Log, Ring, random_pose, random_room, simulate
+from jaxsonar.floor_plans.room import Room, point_to_walls
+from jaxsonar.geometry.se2 import rotation
+from jaxsonar.hardware.errors import SonarError
+from jaxsonar.mapping.build_map import build_map
+from jaxsonar.occupancy.nav2_map import grid_image_path, save_nav2
+from jaxsonar.occupancy.occupancy_grid import FREE, NO_WALLS, OCCUPIED, UNKNOWN, OccupancyGrid, occupancy
+from jaxsonar.occupancy.wall_visibility import HIDDEN, NO_WALL, KnownWalls, beyond_ends
+from jaxsonar.simulation.office import load_office
+
+QUARTER = np.pi / 2
+
+
+@pytest.fixture(scope="module")
+def office():
+    return load_office()
+
+
+@pytest.fixture(scope="module")
+def heard(office):
+    """What the ring hears in the office."""
+    simulation = simulate(office.ring, office.room, office.poses, sigma=0.003, seed=1, stamps=office.stamps)
+    return simulation.as_log(office.ring, office.poses)
+
+
+@pytest.fixture(scope="module")
+def office_grid(office, heard):
+    return occupancy(office.ring, heard, walls=office.room.walls)
+
+
+def listen(ring, walls, poses, *, poles=(), **errors):
+    """A log of what a ring hears at the given poses."""
+    room = Room(np.array(walls).reshape(-1, 2, 2), (), np.array(poles).reshape(-1, 2))
+    return simulate(ring, room, poses, **errors).as_log(ring, poses)
+
+
+def silent(poses):
+    """A log in which nothing was heard."""
+    nothing = np.zeros(0, int)
+    return Log.from_echoes(nothing, nothing, nothing, np.zeros(0), stamp=np.arange(len(poses)) / 10, pose=poses)
+
+
+def centres(grid):
+    """Centre (x, y) of each pixel of the image."""
+    rows, columns = grid.free.shape
+    x = grid.origin[0] + (np.arange(columns) + 0.5) * grid.resolution
+    y = grid.origin[1] + (np.arange(rows) + 0.5) * grid.resolution
+    return np.stack(np.meshgrid(x, y[::-1]), axis=-1)
+
+
+def truly_free(room, points):
+    """Inside the outermost walls and outside the boxes that stand within, by shapely."""
+    found = shapely.polygonize([shapely.LineString(wall) for wall in room.walls]).geoms
+    faces = [face for face in found if isinstance(face, shapely.Polygon)]
+    outline = max((shapely.Polygon(face.exterior) for face in faces), key=lambda face: face.area)
+    free = shapely.contains_xy(outline, points[..., 0], points[..., 1])
+    for face in faces:
+        if face.area < 0.5:  # boxes are 0.3 to 0.6 m wide, rooms 3 m and more
+            free &= ~shapely.contains_xy(face, points[..., 0], points[..., 1])
+    return free
+
+
+def way(rng, room, *, step=0.1, clearance=0.35):
+    """Poses along straight lines between places with space, those too near to something left out."""
+    stops = [random_pose(rng, room) for _ in range(4)]
+    legs = []
+    for start, end in pairwise(stops):
+        count = 2 + int(np.linalg.norm((end - start)[:2]) / step)
+        legs.append(start + np.linspace(0, 1, count)[:, None] * (end - start))
+    poses = np.concatenate(legs)
+    clear = point_to_walls(poses[:, :2], room.walls).min(axis=1) > clearance
+    for pole in room.poles:
+        clear &= np.linalg.norm(poses[:, :2] - pole, axis=-1) > clearance
+    return poses[clear]
+
+
+def circle(centre, radius, count):
+    """Poses on a circle, looking along it."""
+    angle = 2 * np.pi * np.arange(count) / count
+    return np.stack([centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle), angle + QUARTER], axis=-1)
+
+
+def shuffled(log, order):
+    """The scans of a log in another order."""
+    parts = [log[i].as_log() for i in order]
+    scan = np.repeat(np.arange(len(parts)), [len(part.tx) for part in parts])
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("tx", "rx", "range")}
+    numbers = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("stamp", "pose", "scan")}
+    return Log.from_echoes(scan, **columns, **numbers)
+
+
+def test_halves_add_up_to_the_whole_in_any_order(office, heard, office_grid, rng):
+    walls = office.room.walls
+    first, second = (occupancy(office.ring, part, walls=walls) for part in (heard[:6], heard[6:]))
+    assert first + second == office_grid
+    assert second + first == office_grid
+    assert first != office_grid
+    assert occupancy(office.ring, shuffled(heard, rng.permutation(len(heard))), walls=walls) == office_grid
+    assert OccupancyGrid.empty() + office_grid == office_grid
+
+
+def test_scan_by_scan_is_the_same_as_at_once(office, heard, office_grid):
+    grid = OccupancyGrid.empty()
+    for scan in heard:
+        grid = grid.add(office.ring, scan, walls=office.room.walls)
+    assert grid == office_grid
+    assert grid.scans == len(heard)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_world_turned_by_a_quarter_gives_the_grid_turned_by_a_quarter(office, heard, known):
+    walls = office.room.walls if known else NO_WALLS
+    turned_pose = np.concatenate([heard.pose[:, :2] @ rotation(QUARTER).T, heard.pose[:, 2:] + QUARTER], axis=1)
+    turned = Log.from_echoes(
+        heard.echo_scan, heard.tx, heard.rx, heard.range, stamp=heard.stamp, pose=turned_pose, scan=heard.scan
+    )
+    straight = occupancy(office.ring, heard, walls=walls).classify()
+    image = occupancy(office.ring, turned, walls=walls @ rotation(QUARTER).T).classify()
+    assert image.shape == straight.shape[::-1]
+    # Numbers on the border of a cell, as the first pose is, may round to either side.
+    assert np.mean(image == np.rot90(straight)) > 0.99
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("errors", [{}, {"clutter": 0.2, "dropout": 0.3}], ids=["clean", "clutter and loss"])
+def test_free_is_free_and_near_the_robot_most_is_known(faw_ring, seed, errors):
+    rng = np.random.default_rng(seed)
+    room = random_room(rng)
+    poses = way(rng, room)
+    log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed, **errors).as_log(faw_ring, poses)
+    grid = occupancy(faw_ring, log, walls=room.walls)
+    image, points = grid.classify(), centres(grid)
+    inside = truly_free(room, points)
+    free = image == FREE
+    assert inside[free].mean() >= 0.99
+    assert not free[~inside].any()  # behind walls that are known nothing is free
+    clear = point_to_walls(points.reshape(-1, 2), room.walls).min(axis=1).reshape(inside.shape) > 0.1
+    for pole in room.poles:
+        clear &= np.linalg.norm(points - pole, axis=-1) > 0.3
+    near = np.linalg.norm(points[:, :, None] - poses[:, :2], axis=-1).min(axis=2) < 1.0
+    assert free[inside & clear & near].mean() > 0.95
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_walls_that_nobody_told_are_not_driven_through(faw_ring, seed):
+    rng = np.random.default_rng(seed)
+    room = random_room(rng, recess=0.0, box=0.0, segment=0.0, pole=0.0)
+    poses = way(rng, room, step=0.05)
+    log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed).as_log(faw_ring, poses)
+    grid = occupancy(faw_ring, log)
+    image, points = grid.classify(), centres(grid)
+    assert truly_free(room, points)[image == FREE].mean() > 0.85
+    gap = point_to_walls(points.reshape(-1, 2), room.walls).min(axis=1).reshape(image.shape)
+    assert np.mean(gap[image == OCCUPIED] < 0.15) > 0.6
+
+
+def test_the_office_is_free_inside_and_nothing_is_known_outside(office, office_grid):
+    image, points = office_grid.classify(), centres(office_grid)
+    shell = office.room.walls[[name != "chair back-rest" for name in office.room.wall_names]]
+    inside = shapely.contains_xy(shapely.Polygon(shell[:, 0]), points[..., 0], points[..., 1])
+    assert inside[image == FREE].all()
+    assert np.mean(image[inside] == FREE) > 0.85
+    for pose in office.poses:  # the robot itself stood there
+        assert image[np.linalg.norm(points - pose[:2], axis=-1) < 0.2].min() == FREE
+
+
+def test_walls_are_drawn_without_gaps(office, office_grid):
+    image = office_grid.classify()
+    share = np.linspace(0, 1, 500)[:, None]
+    for wall in office.room.walls:
+        points = wall[0] + share * (wall[1] - wall[0])
+        reached = np.linalg.norm(points[:, None] - office.poses[:, :2], axis=-1).min(axis=1) < 2.2
+        column, row = np.floor((points[reached] - office_grid.origin) / office_grid.resolution).astype(int).T
+        assert np.mean(image[::-1][row, column] == OCCUPIED) > 0.97  # a clipped corner of a cell may be left out
+
+
+def test_no_echo_is_free_space_and_never_a_wall(faw_ring):
+    poses = circle((0.4, -0.3), 0.5, 12)
+    grid = occupancy(faw_ring, silent(poses))
+    image = grid.classify()
+    assert not (image == OCCUPIED).any()
+    reach = np.linalg.norm(centres(grid)[:, :, None] - poses[:, :2], axis=-1).min(axis=2)
+    assert (image[reach < 2.0] == FREE).mean() > 0.99
+    assert (image[reach > 2.28 + 0.05] == UNKNOWN).all()
+    at_max = Log.from_echoes(
+        np.zeros(1, int), np.zeros(1, int), np.zeros(1, int), np.array([2.0]), stamp=np.zeros(12), pose=poses
+    )
+    assert occupancy(faw_ring, at_max) == grid
+
+
+def test_a_pole_that_no_map_knows_becomes_an_obstacle_at_its_place(faw_ring):
+    pole = np.array([0.33, 0.21])
+    poses = circle(pole, 0.9, 24)
+    grid = occupancy(faw_ring, listen(faw_ring, [], poses, poles=pole))
+    image, points = grid.classify(), centres(grid)
+    gap = np.linalg.norm(points - pole, axis=-1)
+    assert (image[gap < 0.04] == OCCUPIED).all()
+    assert gap[image == OCCUPIED].max() < 0.2
+    assert (image[(gap > 0.2) & (gap < 1.0)] == FREE).mean() > 0.55  # the pole hides much of it from each side
+
+
+def test_a_robot_that_stands_still_does_not_make_a_wall_of_an_arc(faw_ring):
+    poses = np.tile([0.1, 0.1, 0.3], (50, 1))
+    grid = occupancy(faw_ring, listen(faw_ring, [], poses, poles=[1.0, 0.4]))
+    image, points = grid.classify(), centres(grid)
+    assert not (image == OCCUPIED).any()
+    assert not (image[np.linalg.norm(points - [1.0, 0.4], axis=-1) < 0.05] == FREE).any()
+
+
+def test_an_obstacle_stays_beside_a_sensor_that_sees_past_it(faw_ring):
+    wall = [[-3.0, 1.5], [3.0, 1.5]]
+    poses = np.stack([np.linspace(-1, 1, 21), np.zeros(21), np.zeros(21)], axis=-1)
+    grid = occupancy(faw_ring, listen(faw_ring, [wall], poses, poles=[0.1, 0.9]), walls=np.array([wall]))
+    image, points = grid.classify(), centres(grid)
+    assert (image[np.linalg.norm(points - [0.1, 0.9], axis=-1) < 0.04] == OCCUPIED).all()
+    assert not (image[points[..., 1] > 1.5] == FREE).any()
+
+
+def test_a_wall_hides_what_a_sensor_that_misses_it_obliquely_looks_at(faw_ring):
+    wall = np.array([[[-3.0, 0.8], [3.0, 0.8]]])
+    poses = np.stack([np.linspace(-1, 1, 21), np.zeros(21), np.zeros(21)], axis=-1)
+    log = listen(faw_ring, wall, poses)
+    behind = {}
+    for known in (True, False):
+        grid = occupancy(faw_ring, log, walls=wall if known else NO_WALLS)
+        behind[known] = centres(grid)[grid.classify() == FREE]
+        behind[known] = behind[known][behind[known][:, 1] > 0.8]
+    assert not len(behind[True])
+    # By agreement: beside the robot's path there are always sensors that look straight at it and hear it.
+    assert np.abs(behind[False][:, 0]).min() > 1.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_walls_of_a_map_that_end_too_early_let_nothing_out(faw_ring, seed):
+    rng = np.random.default_rng(1000 + seed)
+    room = random_room(rng)
+    poses = np.stack([random_pose(rng, room) for _ in range(40)])
+    log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed).as_log(faw_ring, poses)
+    grid = occupancy(faw_ring, log, walls=build_map(faw_ring, log).segments)
+    image, points = grid.classify(), centres(grid)
+    inside = truly_free(room, points)
+    assert inside[image == FREE].mean() >= 0.98
+    clear = point_to_walls(points.reshape(-1, 2), room.walls).min(axis=1).reshape(inside.shape) > 0.1
+    near = np.linalg.norm(points[:, :, None] - poses[:, :2], axis=-1).min(axis=2) < 1.0
+    assert (image == FREE)[inside & clear & near].mean() > 0.9
+
+
+def test_the_office_with_walls_of_its_map_is_free_inside_only(office, heard):
+    grid = occupancy(office.ring, heard, walls=build_map(office.ring, heard).segments)
+    image, points = grid.classify(), centres(grid)
+    inside = truly_free(office.room, points)
+    assert inside[image == FREE].mean() >= 0.98
+    assert np.mean(image[inside] == FREE) > 0.85
+
+
+def test_an_open_door_stays_open_for_who_looks_squarely_through_it(faw_ring):
+    walls = np.array([[[-3.0, 1.0], [-0.4, 1.0]], [[0.4, 1.0], [3.0, 1.0]]])
+    past = np.stack([np.linspace(-1, 1, 21), np.zeros(21), np.zeros(21)], axis=-1)
+    grid = occupancy(faw_ring, listen(faw_ring, walls, past), walls=walls)
+    points = centres(grid)
+    x, y = np.abs(points[..., 0]), points[..., 1]
+    assert (grid.classify()[(x < 0.3) & (y > 0.9) & (y < 1.6)] == FREE).all()
+    assert not (grid.classify()[(x > 0.6) & (y > 1.05)] == FREE).any()
+    # Those who only pass obliquely cannot know whether the wall goes on.
+    aside = past[past[:, 0] < -0.65]
+    grid = occupancy(faw_ring, listen(faw_ring, walls, aside), walls=walls)
+    assert not (grid.classify()[centres(grid)[..., 1] > 1.05] == FREE).any()
+
+
+def test_a_wall_goes_on_until_somebody_would_have_heard_it_or_it_meets_another():
+    walls = KnownWalls.of(np.array([[[0.0, 1.0], [2.0, 1.0]], [[2.0, 1.02], [2.0, -1.0]]]), 0.05)
+    position, sure = np.array([[-0.5, 0.0], [-0.8, 0.0]]), np.full(2, 0.2)
+    far, up = np.full(2, 2.0), np.full(2, QUARTER)
+
+    def beyond(heading=up, silent=far):
+        return beyond_ends(position, heading, sure, silent, walls)
+
+    np.testing.assert_allclose(beyond()[0], [0.5 - NO_WALL, 0.0])  # the nearer foot counts
+    np.testing.assert_allclose(beyond(heading=up + np.array([0.3, 0.1]))[0], [0.8 - NO_WALL, 0.0])
+    for unheard in (beyond(heading=-up), beyond(silent=far / 2)):
+        np.testing.assert_allclose(unheard, [[HIDDEN, 0.0], [0.0, HIDDEN]])
+
+
+def test_free_cells_are_those_that_can_be_reached_from_where_the_robot_drove(rng):
+    counts = np.zeros((5, 40, 50), np.int32)
+    counts[0] = 4 * (rng.random((40, 50)) < 0.6)
+    counts[4, [0, 20, 21], [0, 25, 25]] = 1
+    grid = OccupancyGrid(0.05, (0, 0), counts, np.zeros((40, 50), np.uint16), 1)
+    reached, more = grid.driven > 0, True
+    while more:
+        wide = np.pad(reached, 1)
+        wide = wide[:-2, 1:-1] | wide[2:, 1:-1] | wide[1:-1, :-2] | wide[1:-1, 2:]
+        more = (wide & (grid.free > 0) & ~reached).any()
+        reached = reached | wide & (grid.free > 0)
+    np.testing.assert_array_equal(grid.classify()[::-1] == FREE, reached)
+    assert 3 < reached.sum() < (grid.free > 0).sum()
+
+
+def test_the_part_of_the_ring_that_did_not_fire_says_nothing(faw_ring):
+    poses = circle((0.0, 0.0), 0.5, 12)
+    fired = np.zeros((12, 24), bool)
+    grid = occupancy(faw_ring, silent(poses), fired=fired)
+    points = centres(grid)
+    gap = np.linalg.norm(points[:, :, None] - poses[:, :2], axis=-1).min(axis=2)
+    assert gap[grid.classify() == FREE].max() < 0.28  # only the robot's own body
+
+
+def test_a_ring_of_few_sensors_has_no_body_and_a_bumper_none_either():
+    for position in ([(0.2, 0.0)], [(0.2, -0.2), (0.2, 0.0), (0.2, 0.2)]):
+        ring = Ring(position, np.zeros(len(position)), beam=0.5, neighbors=0, max_range=1.0)
+        grid = occupancy(ring, silent(np.zeros((3, 3))))
+        points = centres(grid)
+        assert points[grid.classify() == FREE][:, 0].min() > 0.2
+        assert points[grid.classify() == FREE][:, 0].max() == pytest.approx(1.175)
+
+
+def test_a_saved_map_is_what_map_server_reads(tmp_path, office, heard, office_grid):
+    path = tmp_path / 'a "b": #c.yaml'
+    save_nav2(office_grid, path)
+    header = dict(line.split(": ", 1) for line in path.read_text().splitlines())
+    assert list(header) == ["image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"]
+    image = cv2.imread(str(tmp_path / ast.literal_eval(header["image"])), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    np.testing.assert_array_equal(image, office_grid.classify())
+    # map_server's trinary rule: 205 must stay between the thresholds.
+    occupied = 1 - image / 255
+    read = np.where(occupied > float(header["occupied_thresh"]), 100, -1)
+    read[occupied < float(header["free_thresh"])] = 0
+    for grey, value in ((OCCUPIED, 100), (UNKNOWN, -1), (FREE, 0)):
+        np.testing.assert_array_equal(read == value, image == grey)
+        assert (image == grey).any()
+    x, y, yaw = ast.literal_eval(header["origin"])
+    assert (x, y) == pytest.approx(office_grid.origin)
+    assert (yaw, float(header["resolution"]), header["mode"], header["negate"]) == (0, 0.05, "trinary", "0")
+    # The first pose is in a free cell where the file says it is.
+    column, row = np.floor((office.poses[0, :2] - (x, y)) / 0.05).astype(int)
+    assert image[len(image) - 1 - row, column] == FREE
+
+
+def test_a_wall_at_large_y_is_in_the_upper_rows(faw_ring, tmp_path):
+    wall = np.array([[[-1.0, 1.0], [0.5, 1.0]]])
+    poses = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
+    save_nav2(occupancy(faw_ring, listen(faw_ring, wall, poses), walls=wall), tmp_path / "map.yml")
+    image = cv2.imread(str(tmp_path / "map.pgm"), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    row, column = np.nonzero(image == OCCUPIED)
+    assert row.max() < len(image) / 2
+    assert column.mean() < image.shape[1] / 2
+
+
+def test_logs_without_scans_or_poses(faw_ring, tmp_path):
+    empty = occupancy(faw_ring, silent(np.zeros((0, 3))))
+    lost = occupancy(faw_ring, silent(np.full((4, 3), np.nan)))
+    assert (empty.scans, empty.skipped, lost.scans, lost.skipped) == (0, 0, 0, 4)
+    assert lost.classify().size == 0
+    for grid, why in ((empty, "no scan"), (lost, "4 scans without a pose")):
+        with pytest.raises(SonarError, match=why):
+            save_nav2(grid, tmp_path / "map.yaml")
+    assert not list(tmp_path.iterdir())
+    poses = np.array([[0.0, 0.0, 0.0], [np.nan] * 3])
+    both = occupancy(faw_ring, silent(poses))
+    assert (both.scans, both.skipped) == (1, 1)
+    assert lost + both == both + lost
+    assert (lost + both).skipped == 5
+
+
+@pytest.mark.parametrize("name", ["map", "map.pgm", "map.yaml.png"])
+def test_another_suffix_is_refused_before_anything_is_written(tmp_path, office_grid, name):
+    with pytest.raises(SonarError, match=r"allowed for a grid is \.yaml or \.yml"):
+        save_nav2(office_grid, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+    assert grid_image_path("a/map.YAML").name == "map.pgm"
+
+
+def test_what_no_grid_can_hold_is_refused_in_one_line(faw_ring):
+    far = np.array([[0.0, 0.0, 0.0], [1e7, 1e7, 0.0]])
+    here = silent(np.zeros((1, 3)))
+    for call, words in (
+        (lambda: occupancy(faw_ring, silent(far)), "cells at most"),
+        (lambda: occupancy(faw_ring, here, resolution=0.0), "allowed is 0.001 to 10 m"),
+        (lambda: occupancy(faw_ring, here, resolution=0.002), "allowed is at most 400 cells far"),
+        (lambda: occupancy(faw_ring, here, walls=np.full((1, 2, 2), np.nan)), "wall 0"),
+        (lambda: occupancy(faw_ring, here) + occupancy(faw_ring, here, resolution=0.1), "resolutions 0.05 and 0.1 m"),
+        (lambda: occupancy(faw_ring, here) + occupancy(faw_ring, silent(far[1:])), "cells"),
+    ):
+        with pytest.raises(SonarError, match=words) as caught:
+            call()
+        assert "\n" not in str(caught.value)

@@ -1,0 +1,17 @@
+"""The example of a loss of one's own runs, and finds what was simulated."""
+
+import re
+import runpy
+from pathlib import Path
+
+EXAMPLE = Path(__file__).parents[2] / "docs" / "temperature_per_scan.py"
+
+
+def test_the_temperature_of_every_scan_is_found(capsys):
+    runpy.run_path(str(EXAMPLE))
+    out = capsys.readouterr().out
+    found = [float(number) for number in re.findall(r"(-?[\d.]+) deg C", out)]
+    assert len(found) == 5
+    assert found == sorted(found)  # the air warms up
+    (rms,) = re.findall(r"RMS error ([\d.]+) K", out)
+    assert float(rms) < 1.5  # the air changes by 8 K; unknown to within 2.5 K before

@@ -1,0 +1,510 @@
+"""Windows of the path: gathered echoes, what is kept of a log, whole and scan by scan, against loops and matrices."""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import oracles
+
+from jaxsonar import HoughSettings, Log, Ring, SonarError, kernels, local_models
+from jaxsonar.detection.extract import arcs_of
+from jaxsonar.geometry.se2 import relative, to_world, wrap_angle
+from jaxsonar.scans.echo_batches import FlatEchoes
+from jaxsonar.scans.scan_log import Scan
+from jaxsonar.scans.sliding_windows import LEAST_GAP, SAME_HEADING, SAME_PLACE, Stretch, gather, moved, renewed
+
+RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # no point on a cell's border
+FOUR = Ring.circular(count=4, beam=1.0, neighbors=0)
+SETTINGS = HoughSettings()
+ROOM = 256
+extent = jax.jit(kernels.extent)
+lines_of_scan = jax.jit(kernels.lines_of_scan, static_argnames="settings")
+turns = st.floats(-3, 3)
+metres = st.floats(-1, 1)
+
+
+def packed(echoes, *, poses=True, gathered=None):
+    """(1, ROOM) echoes from a list of (pose, path, range); the poses left out if asked for."""
+    path, reported = np.zeros((1, ROOM), np.int32), np.full((1, ROOM), np.nan, np.float32)
+    pose = np.zeros((1, ROOM, 3), np.float32)
+    for k, (stood, row, reach) in enumerate(echoes):
+        path[0, k], reported[0, k], pose[0, k] = row, reach, stood
+    gathered = None if gathered is None else jnp.full(1, gathered, jnp.float32)
+    return kernels.Echoes(jnp.asarray(path), jnp.asarray(reported), jnp.asarray(pose) if poses else None, gathered)
+
+
+def one_scan(echoes):
+    return jax.tree.map(lambda leaf: leaf[0], echoes)
+
+
+def mixed_echoes(rng, ring=RING, poses=((0, 0, 0),)):
+    """A wall and as many false echoes."""
+    true = [echo for pose in poses for echo in oracles.plane_echoes(ring, np.array(pose), 1.2, 0.3)]
+    false = [(pose, int(rng.integers(len(ring.paths))), rng.uniform(0.4, 1.9)) for pose, _, _ in true]
+    return (true + false)[:ROOM]
+
+
+def composed(world_from_a, a_from_b):
+    """world_from_b."""
+    world = oracles.matrix(world_from_a) @ oracles.matrix(a_from_b)
+    return np.array([world[0, 2], world[1, 2], math.atan2(world[1, 0], world[0, 0])])
+
+
+# gathered echoes
+
+
+def test_echoes_that_all_carry_the_identity_are_those_of_one_scan(rng):
+    echoes = mixed_echoes(rng)
+    arcs = arcs_of(RING, SETTINGS)
+    plain = lines_of_scan(arcs, one_scan(packed(echoes, poses=False)), settings=SETTINGS)
+    posed = lines_of_scan(arcs, one_scan(packed(echoes)), settings=SETTINGS)
+    jax.tree.map(np.testing.assert_array_equal, posed, plain)
+
+
+@settings(max_examples=15)
+@given(metres, metres, turns, st.integers(0, 1000))
+def test_a_motion_of_all_poses_moves_the_lines(x, y, turn, seed):
+    rng = np.random.default_rng(seed)
+    poses = rng.uniform(-0.3, 0.3, (3, 3))
+    echoes = mixed_echoes(rng, poses=poses)
+    motion = np.array([x, y, turn])
+    arcs = arcs_of(RING, SETTINGS)
+    turned = [(composed(motion, pose), path, reach) for pose, path, reach in echoes]
+    both = [one_scan(packed(seen)) for seen in (echoes, turned)]
+    here, there = (lines_of_scan(arcs, seen, settings=SETTINGS) for seen in both)
+    spin = oracles.matrix(motion)[:2, :2]
+    count = len(echoes)
+    normals = np.stack([here.normal_x, here.normal_y], axis=-1)[:count] @ spin.T
+    np.testing.assert_allclose(np.stack([there.normal_x, there.normal_y], -1)[:count], normals, atol=2e-6)
+    counts = np.asarray(arcs.arcs.counts)[[path for _, path, _ in echoes]]
+    np.testing.assert_allclose(
+        np.asarray(there.rho)[:count][counts], (np.asarray(here.rho)[:count] + normals @ [x, y])[counts], atol=5e-6
+    )
+
+
+@settings(max_examples=10)
+@given(metres, metres, turns, st.floats(-3, 3), st.integers(0, 1000))
+def test_a_motion_of_line_and_sensors_moves_the_segment(x, y, turn, theta, seed):
+    sensors = np.random.default_rng(seed).uniform(-1, 1, (9, 2)).astype(np.float32)
+    motion, involved = np.array([x, y, turn]), np.arange(9) % 3 > 0
+    here = extent(jnp.float32(2), jnp.float32(theta), sensors, involved)
+    rho = 2 + x * math.cos(theta + turn) + y * math.sin(theta + turn)
+    moved_sensors = to_world(motion, sensors.astype(float)).astype(np.float32)
+    there = extent(jnp.float32(rho), jnp.float32(theta + turn), moved_sensors, involved)
+    np.testing.assert_allclose(there, to_world(motion, np.asarray(here, float)), atol=1e-5)
+
+
+def test_turning_the_frame_by_whole_cells_turns_the_cells(rng):
+    arcs = arcs_of(RING, SETTINGS)
+    echoes = mixed_echoes(rng, poses=rng.uniform(-0.3, 0.3, (2, 3)))
+    results = []
+    for step in (0, 7, 50):
+        motion = np.array([0, 0, step * SETTINGS.theta_cell])
+        turned = packed([(composed(motion, pose), path, reach) for pose, path, reach in echoes], gathered=2.0)
+        cells = np.asarray(kernels.vote(arcs, turned, settings=SETTINGS).occupied)
+        results.append(np.roll(cells[0], -step, axis=0))
+    assert results[0].any()
+    # A point on the border of two cells may round into the other one in single precision.
+    assert max((other != results[0]).sum() for other in results[1:]) <= 2
+
+
+def test_scans_of_a_moving_robot_vote_for_the_wall_in_the_frame_of_the_last_pose(rng):
+    poses = [np.array([0.15 * k - 0.2, 0.1 * math.sin(k), 0.25 * k - 2.9]) for k in range(5)]
+    last = poses[-1]
+    rho, theta = 1.4, 2.1
+    echoes = [echo for pose in poses for echo in oracles.plane_echoes(RING, pose, rho, theta)][::7]
+    assert len(echoes) > 20
+    wanted = oracles.accumulate(
+        [oracles.cell(r, t, SETTINGS) for r, t in oracles.gathered_lines(RING, echoes, last, SETTINGS.point_pitch)],
+        SETTINGS,
+    )
+    gathered = packed([(relative(last, pose), path, reach) for pose, path, reach in echoes], gathered=5.0)
+    votes, _ = kernels.accumulators(arcs_of(RING, SETTINGS), gathered, settings=SETTINGS)
+    votes = np.asarray(votes[0])
+    assert votes.sum() == wanted.sum()
+    assert np.abs(votes - wanted).sum() <= 0.01 * wanted.sum()  # points on the border of two cells
+    best = np.unravel_index(votes.argmax(), votes.shape)
+    seen = oracles.cell(rho - last[0] * math.cos(theta) - last[1] * math.sin(theta), theta - last[2], SETTINGS)
+    assert seen is not None
+    assert max(abs(best[0] - seen[0]), abs(best[1] - seen[1])) <= 1
+
+
+@pytest.mark.parametrize("times", [1, 2, 4])
+def test_the_same_echoes_several_times_over_and_gathered_so_often_are_the_same_cells(rng, times):
+    echoes = [*mixed_echoes(rng)][: ROOM // 4]
+    arcs = arcs_of(RING, SETTINGS)
+    once = kernels.vote(arcs, packed(echoes, gathered=1.0), settings=SETTINGS).occupied
+    often = kernels.vote(arcs, packed(echoes * times, gathered=float(times)), settings=SETTINGS).occupied
+    assert once.any()
+    np.testing.assert_array_equal(often, once)
+
+
+@pytest.mark.parametrize("gathered", [0.5, 1.0, 3.25])
+def test_gathered_is_a_factor_of_the_threshold(rng, gathered):
+    echoes, arcs = mixed_echoes(rng), arcs_of(RING, SETTINGS)
+    _, smooth = kernels.accumulators(arcs, packed(echoes, gathered=gathered), settings=SETTINGS)
+    came = kernels.vote(arcs, packed(echoes, gathered=gathered), settings=SETTINGS).occupied
+    np.testing.assert_array_equal(came, np.asarray(smooth) > np.float32(arcs.level) * np.float32(gathered))
+
+
+# poses and logs
+
+
+@given(*[st.tuples(metres, metres, turns)] * 2)
+def test_relative_poses_are_those_of_matrices(a, b):
+    a, b = np.array(a), np.array(b)
+    came = relative(a, b)
+    wanted = oracles.relative(a, b)
+    np.testing.assert_allclose(came[:2], wanted[:2], atol=1e-12)
+    assert abs(oracles.wrap(came[2] - wanted[2])) < 1e-12
+    assert -np.pi <= came[2] < np.pi
+    np.testing.assert_array_equal(relative(np.stack([a, b]), np.stack([b, a]))[0], came)
+    np.testing.assert_allclose(relative(a, a), 0, atol=1e-15)
+
+
+def a_log(seed, *, ring=FOUR, scans=40, missing=0.05, strangers=True):
+    """A path with stops, turns in place and scans without pose; readings that are repeated, lost and come again."""
+    rng = np.random.default_rng(seed)
+    pose, poses, readings, before = np.zeros(3), [], [], []
+    for _ in range(scans):
+        way = rng.choice(["stop", "creep", "drive", "turn"], p=[0.2, 0.2, 0.5, 0.1])
+        turn = {"stop": 0.0, "creep": rng.normal(0, 0.005)}.get(way, rng.normal(0, 0.3))
+        ahead = {"creep": rng.uniform(0, 0.02), "drive": rng.uniform(0, 0.4)}.get(way, 0.0)
+        pose = np.array([pose[0] + ahead * np.cos(pose[2]), pose[1] + ahead * np.sin(pose[2]), pose[2] + turn])
+        poses.append(np.full(3, np.nan) if rng.random() < missing else pose)
+        kept = [reading for reading in before if rng.random() < 0.7]
+        new = [(*rng.integers(0, ring.count, 2).tolist(), rng.integers(30, 60) / 50) for _ in range(rng.integers(0, 3))]
+        new = [reading for reading in new if strangers or ring.path_index[int(reading[0]), int(reading[1])] >= 0]
+        before = list(dict.fromkeys(kept + new))
+        rng.shuffle(before)
+        readings.append(before)
+    return log_of(readings, poses, scan=rng.permutation(scans) * 3 + 5)
+
+
+def log_of(readings, poses, scan=None):
+    """A log from the readings (tx, rx, range) of every scan."""
+    flat = np.array([reading for scan in readings for reading in scan]).reshape(-1, 3)
+    return Log.from_echoes(
+        np.repeat(np.arange(len(readings)), [len(scan) for scan in readings]),
+        flat[:, 0].astype(int),
+        flat[:, 1].astype(int),
+        flat[:, 2],
+        stamp=np.arange(len(readings)) * 0.1,
+        pose=np.array(poses, float).reshape(-1, 3),
+        scan=scan,
+    )
+
+
+def heard(ring, log):
+    """Per scan the (path, range) that the ring listens to."""
+    return [
+        [
+            (int(ring.path_index[tx, rx]), float(reach))
+            for tx, rx, reach in zip(scan.tx, scan.rx, scan.range, strict=True)
+            if ring.path_index[tx, rx] >= 0
+        ]
+        for scan in log
+    ]
+
+
+def straight(steps, heading=0.0):
+    """Poses along x."""
+    return np.array([(x, 0.0, heading) for x in np.append(0.0, np.cumsum(steps))])
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10_000))
+def test_a_log_of_its_own_scans_is_the_log(seed):
+    log = a_log(seed, missing=0.3)
+    assert Log.from_scans(list(log)) == log
+    assert log[3].as_log() == log[3:4]
+
+
+def test_a_log_of_no_scans():
+    assert Log.from_scans([]) == log_of([], [])
+
+
+# what a window keeps
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10_000), st.sampled_from([0.3, 1.0, 2.5, 50.0]), st.sampled_from([0.0, 0.05, 0.4]))
+def test_windows_hold_the_new_echoes_of_their_stretch_in_the_frame_of_its_end(seed, length, missing):
+    log = a_log(seed, missing=missing)
+    windows, left_out = gather(FOUR, log, length=length)
+    scans = heard(FOUR, log)
+    assert left_out == len(log.tx) - sum(len(scan) for scan in scans)
+    waits = oracles.moved(log.pose, SAME_PLACE, SAME_HEADING)
+    fresh = [[new and here for new in scan] for scan, here in zip(oracles.renewed(scans), waits, strict=True)]
+    spans = oracles.windows(log.pose, length)
+    np.testing.assert_array_equal(windows.last, [last for _, last in spans])
+    assert windows.gap == max(LEAST_GAP, length / 4)
+    flat = windows.echoes
+    assert flat.scans == len(spans)
+    assert flat.pose is not None
+    assert flat.gathered is not None
+    for k, span in enumerate(spans):
+        wanted = oracles.window_echoes(scans, log.pose, span, fresh)
+        mine = slice(flat.start[k], flat.start[k + 1])
+        assert windows.scan[mine].tolist() == [scan for scan, _, _, _ in wanted]
+        assert flat.path[mine].tolist() == [path for _, path, _, _ in wanted]
+        assert flat.reported[mine].tolist() == [reach for _, _, reach, _ in wanted]
+        poses = np.array([pose for _, _, _, pose in wanted]).reshape(-1, 3)
+        np.testing.assert_allclose(flat.pose[mine, :2], poses[:, :2], atol=1e-12)
+        np.testing.assert_allclose(wrap_angle(flat.pose[mine, 2] - poses[:, 2]), 0, atol=1e-12)
+        shares = [sum(fresh[scan]) / max(len(scans[scan]), 1) for scan in range(span[0], span[1] + 1)]
+        assert flat.gathered[k] == pytest.approx(max(sum(shares), 1))
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10_000), st.sampled_from([0.3, 1.0, 2.5]))
+def test_windows_cover_the_path_reach_back_by_their_length_and_across_no_gap(seed, length):
+    log = a_log(seed, missing=0.1)
+    windows, _ = gather(FOUR, log, length=length)
+    known = np.array([bool(np.isfinite(pose).all()) for pose in log.pose])
+    covered = np.zeros(len(log), bool)
+    assert (np.diff(windows.last) > 0).all()
+    for first, last in oracles.windows(log.pose, length):
+        way = np.hypot(*np.diff(log.pose[first : last + 1, :2], axis=0).T)
+        assert known[first : last + 1].all()
+        assert way.sum() <= length + 1e-9
+        if first > 0 and known[first - 1]:  # one scan more would be too long
+            assert way.sum() + np.hypot(*(log.pose[first] - log.pose[first - 1])[:2]) > length - 1e-9
+        covered[first : last + 1] = True
+    assert not covered[~known].any()
+    steps = np.hypot(*np.diff(log.pose[:, :2], axis=0).T)
+    if np.nanmax(steps) < length / 2:  # else the robot leaps
+        assert covered[known].all()
+
+
+def test_every_echo_is_in_two_windows_of_an_even_path():
+    log = log_of([[(0, 0, 1 + k / 100)] for k in range(65)], straight([0.0625] * 64))
+    windows, _ = gather(FOUR, log, length=1.0)
+    assert windows.last.tolist() == [8, 16, 24, 32, 40, 48, 56, 64]
+    times = np.bincount(windows.scan, minlength=65)
+    assert (times[1:56] >= 2).all()
+    assert times.max() == 3  # at the ends of windows
+
+
+@pytest.mark.parametrize("step", [0.1, 0.05, 0.025])
+def test_scan_by_scan_windows_of_decimal_steps_end_where_those_of_the_log_do(step):
+    """A pose may come to lie just on the end of a window; both ways must round alike."""
+    log = log_of([[(0, 0, 1 + k / 100)] for k in range(120)], np.arange(120)[:, None] * [step, 0.0, 0.0])
+    for length in (0.2, 0.3, 0.4, 0.6, 1.0, 1.4):
+        whole, _ = gather(FOUR, log, length=length)
+        assert [windows.last[0] for windows in scan_by_scan(FOUR, log, length)] == whole.last.tolist(), length
+
+
+def test_a_short_window_on_a_long_path_is_as_many_windows_as_scans():
+    log = log_of([[(0, 0, 1.0)], [(0, 0, 1.1)], [(0, 0, 1.2)]], straight([10.0, 10.0]))
+    windows, _ = gather(FOUR, log, length=0.01)
+    assert windows.last.tolist() == [1, 2]
+
+
+# readings that are repeated, robots that wait
+
+
+def kept_of(readings, poses=None, ring=FOUR):
+    """(scan, path, range) of the readings that ``renewed`` keeps."""
+    poses = straight([0.1] * (len(readings) - 1)) if poses is None else poses
+    flat, _ = FlatEchoes.from_log(ring, log_of(readings, poses))
+    fresh = renewed(flat)
+    return list(zip(flat.scan[fresh].tolist(), flat.path[fresh].tolist(), flat.reported[fresh].tolist(), strict=True))
+
+
+@given(st.integers(1, 12), st.integers(1, 12))
+def test_of_a_repeated_reading_every_second_one_is_new_and_a_gap_starts_anew(times, again):
+    here, other = (0, 0, 1.0), (1, 1, 1.0)
+    assert len(kept_of([[here]] * times)) == math.ceil(times / 2)
+    gap = [[here]] * times + [[]] + [[here]] * again
+    assert len(kept_of(gap)) == math.ceil(times / 2) + math.ceil(again / 2)
+    mixed = [[here, other] if k < again else [here] for k in range(times)]
+    assert len(kept_of(mixed)) == math.ceil(times / 2) + math.ceil(min(again, times) / 2)
+    assert kept_of([[here]] * times)[0][0] == 0
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10_000))
+def test_new_readings_are_those_of_the_slow_oracle(seed):
+    log = a_log(seed, strangers=False)
+    flat, _ = FlatEchoes.from_log(FOUR, log)
+    wanted = [new for scan in oracles.renewed(heard(FOUR, log)) for new in scan]
+    assert renewed(flat).tolist() == wanted
+
+
+@pytest.mark.parametrize("times", [1, 2, 5])
+def test_a_reading_that_comes_twice_in_a_scan_is_renewed_as_one_that_comes_once(times):
+    """A device that rounds may report two echoes of a path at one range."""
+    twice = kept_of([[(0, 0, 1.0), (0, 0, 1.0)]] * times)
+    assert sorted({scan for scan, _, _ in twice}) == [scan for scan, _, _ in kept_of([[(0, 0, 1.0)]] * times)]
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 0.3, 1.0]))
+def test_places_are_those_of_the_slow_oracle(seed, missing):
+    log = a_log(seed, missing=missing)
+    assert moved(log.pose).tolist() == oracles.moved(log.pose, SAME_PLACE, SAME_HEADING)
+
+
+def test_a_waiting_robot_counts_once_and_one_that_turns_in_place_goes_on():
+    waiting = np.tile([[1.0, 2.0, 0.5]], (6, 1))
+    assert moved(waiting).tolist() == [True] + [False] * 5
+    turning = np.column_stack([np.ones((6, 2)), np.radians([170, 175, 180, -175, -170, -165])])
+    assert moved(turning).all()
+    slow = straight([SAME_PLACE / 4] * 40)
+    assert moved(slow).sum() == pytest.approx(11, abs=1)
+
+
+@pytest.mark.parametrize(
+    "poses", [np.zeros((0, 3)), np.full((4, 3), np.nan), np.full((1, 3), np.nan), np.zeros((1, 3))]
+)
+def test_places_of_hardly_any_scans(poses):
+    assert moved(poses).tolist() == np.isfinite(poses).all(axis=1).tolist()
+
+
+def test_a_waiting_robot_adds_one_scan_to_its_window():
+    readings = [[(0, 0, 1 + k / 50)] for k in range(12)]
+    poses = straight([0.2] * 3 + [0.0] * 5 + [0.2] * 3)
+    windows, _ = gather(FOUR, log_of(readings, poses), length=2.0)
+    assert sorted(set(windows.scan.tolist()) & set(range(9))) == [0, 1, 2, 3]
+
+
+# logs with hardly anything in them
+
+
+@pytest.mark.parametrize(
+    ("readings", "poses", "last"),
+    [
+        ([], np.zeros((0, 3)), []),
+        ([[]] * 5, straight([0.5] * 4), [1, 2, 3, 4]),
+        ([[(0, 0, 1.0)]], straight([]), [0]),
+        ([[(0, 0, 1.0)]] * 4, np.full((4, 3), np.nan), []),
+        ([[(0, 0, 1.0)], [], [(0, 0, 1.0)]], [[0, 0, 0], [np.nan] * 3, [0, 0, 0]], [0, 2]),
+    ],
+)
+def test_hardly_anything_to_gather(readings, poses, last):
+    log = log_of(readings, poses)
+    windows, left_out = gather(FOUR, log, length=1.0)
+    assert windows.last.tolist() == last
+    assert left_out == 0
+
+
+@pytest.mark.parametrize("length", [0.0, -1.0, math.nan, math.inf, -math.inf])
+def test_windows_that_are_no_length_are_refused(length):
+    log = a_log(1)
+    with pytest.raises(SonarError, match=r"window = .* m; allowed is 0.01 to 100 m"):
+        gather(FOUR, log, length=length)
+    with pytest.raises(SonarError, match=r"window = .* m; allowed is 0.01 to 100 m"):
+        local_models(FOUR, log, window=length)
+
+
+@pytest.mark.parametrize("length", [1e4, 1e300])
+def test_windows_too_long_for_an_accumulator_are_refused_like_every_value(length):
+    with pytest.raises(SonarError, match="allowed"):
+        local_models(FOUR, a_log(1), window=length)
+
+
+def test_sensors_that_the_ring_does_not_have_are_refused():
+    log = log_of([[(0, 0, 1.0)], [(1, 7, 1.0)]], straight([0.5]))
+    message = "tx 1, rx 7; allowed are 0 to 3"
+    with pytest.raises(SonarError, match=message):
+        gather(FOUR, log, length=1.0)
+    stretch = Stretch()
+    for scan in log:
+        stretch, _ = stretch.including(scan, length=1.0)
+    with pytest.raises(SonarError, match=message):
+        stretch.window(FOUR, length=1.0)
+
+
+def test_pairs_that_the_ring_does_not_listen_to_are_counted_and_left_out():
+    log = log_of([[(0, 0, 1.0), (0, 1, 1.0)], [(2, 3, 1.0), (1, 1, 0.7)]], straight([0.5]))
+    windows, left_out = gather(FOUR, log, length=5.0)
+    assert left_out == 2
+    assert windows.echoes.path.tolist() == [0, 1]
+    told = []
+    local_models(FOUR, log, window=5.0, on_left_out=told.append)
+    assert told == [2]
+
+
+def test_scan_numbers_name_scans_and_do_not_order_them():
+    readings = [[(k % 4, k % 4, 1 + k / 50)] for k in range(20)]
+    poses = straight([0.1] * 19)
+    plain, shuffled = log_of(readings, poses), log_of(readings, poses, scan=np.arange(20)[::-1] * 7 + 100)
+    one, other = (gather(FOUR, log, length=1.0)[0] for log in (plain, shuffled))
+    np.testing.assert_array_equal(one.last, other.last)
+    np.testing.assert_array_equal(one.scan, other.scan)
+    np.testing.assert_array_equal(one.echoes.pose, other.echoes.pose)
+
+
+# scan by scan
+
+
+def scan_by_scan(ring, log, length):
+    """Windows of a log as a robot gathers them, with rows as in the log."""
+    stretch, ended, row, found = Stretch(), True, {int(number): k for k, number in enumerate(log.scan)}, []
+
+    def close(stretch):
+        part, windows = stretch.window(ring, length=length)
+        rows = np.array([row[int(number)] for number in part.scan])
+        found.append(type(windows)(rows[windows.last], windows.echoes, rows[windows.scan], windows.gap))
+
+    for scan in log:
+        following, ends = stretch.including(scan, length=length)
+        if not np.isfinite(scan.pose).all() and not ended:
+            close(stretch)
+        stretch, ended = following, ends or not np.isfinite(scan.pose).all()
+        if ends:
+            close(stretch)
+    if not ended:
+        close(stretch)
+    return found
+
+
+def assert_same_windows(ring, log, length):
+    whole, _ = gather(ring, log, length=length)
+    single = scan_by_scan(ring, log, length)
+    assert [int(windows.last[0]) for windows in single] == whole.last.tolist()
+    flat = whole.echoes
+    assert flat.pose is not None
+    assert flat.gathered is not None
+    for k, windows in enumerate(single):
+        mine, one = slice(flat.start[k], flat.start[k + 1]), windows.echoes
+        np.testing.assert_array_equal(windows.scan, whole.scan[mine])
+        np.testing.assert_array_equal(one.path, flat.path[mine])
+        np.testing.assert_array_equal(one.reported, flat.reported[mine])
+        np.testing.assert_array_equal(one.pose, flat.pose[mine])
+        np.testing.assert_allclose(one.gathered, flat.gathered[k : k + 1], rtol=1e-12)
+        assert windows.gap == whole.gap
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 10_000), st.sampled_from([0.25, 0.7, 2.0, 50.0]), st.sampled_from([0.0, 0.05, 0.5]))
+def test_windows_gathered_scan_by_scan_are_those_of_the_whole_log(seed, length, missing):
+    assert_same_windows(FOUR, a_log(seed, missing=missing), length)
+
+
+def test_a_reading_that_comes_twice_in_a_scan_is_the_same_scan_by_scan():
+    log = log_of([[(0, 0, 1.0), (0, 0, 1.0)]] * 4, straight([0.25] * 3))
+    assert_same_windows(FOUR, log, 0.5)
+
+
+def test_the_stretch_given_is_left_as_it_was():
+    log = a_log(5, missing=0.0)
+    stretch, _ = Stretch().including(log[0], length=1.0)
+    before = (stretch.scans, stretch.way, stretch.new, dict(stretch.runs), stretch.place)
+    stretch.including(log[1], length=1.0)
+    assert (stretch.scans, stretch.way, stretch.new, dict(stretch.runs), stretch.place) == before
+
+
+def test_a_stretch_forgets_what_lies_farther_back_than_a_window():
+    nobody = np.zeros(0, int)
+    stretch, step = Stretch(), partial(Scan, stamp=0.0, tx=nobody, rx=nobody, range=np.zeros(0), amplitude=np.zeros(0))
+    for k in range(200):
+        stretch, _ = stretch.including(step(scan=k, pose=np.array([k / 8, 0.0, 0.0])), length=1.0)
+        assert len(stretch.scans) <= 9
+    assert [scan.scan for scan in stretch.scans] == list(range(191, 200))

@@ -1,0 +1,156 @@
+"""Section 3 of the paper: counts, order, detection ranges, virtual sensors, firing groups, for any arrangement."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import oracles
+
+from jaxsonar import Ring, SonarError
+
+BUMPER = {
+    "position": [(0.2, -0.27), (0.22, -0.09), (0.22, 0.09), (0.2, 0.27)],
+    "heading": np.radians([-20.0, -5.0, 5.0, 20.0]),
+}
+
+
+def test_the_papers_ring_has_24_direct_and_144_cross_paths(faw_ring):
+    paths = faw_ring.paths
+    assert paths.shape == (168, 2)
+    assert (paths[:, 0] == paths[:, 1]).sum() == 24
+    assert len({tuple(p) for p in paths}) == 168
+
+
+@pytest.mark.parametrize(("count", "neighbors"), [(24, 3), (32, 3), (24, 7), (5, 2), (9, 0), (1, 0)])
+def test_paths_come_in_the_documented_order(count, neighbors):
+    ring = Ring.circular(count=count, neighbors=neighbors)
+    assert [tuple(p) for p in ring.paths] == oracles.paths(count, neighbors)
+    assert len(ring.paths) == count * (2 * neighbors + 1)
+
+
+@given(st.integers(1, 12).flatmap(lambda n: st.tuples(st.just(n), st.integers(0, n - 1))))
+def test_no_path_is_listed_twice_and_the_index_inverts_the_list(shape):
+    ring = Ring.circular(count=shape[0], neighbors=shape[1])
+    paths = ring.paths
+    assert len(np.unique(paths, axis=0)) == len(paths)
+    assert (ring.path_index[paths[:, 0], paths[:, 1]] == np.arange(len(paths))).all()
+    assert (ring.path_index >= 0).sum() == len(paths)
+
+
+@pytest.mark.parametrize(("beam", "neighbors", "widths"), [(60, 3, [60, 45, 30, 15]), (120, 7, range(120, 14, -15))])
+def test_detection_ranges_of_section_3(beam, neighbors, widths):
+    ring = Ring.circular(beam=np.radians(beam), neighbors=neighbors)
+    first, last = np.asarray(ring.detection_ranges).T
+    apart = (ring.paths[:, 1] - ring.paths[:, 0] + 12) % 24 - 12
+    for distance, width in enumerate(widths):
+        np.testing.assert_allclose(np.degrees(last - first)[np.abs(apart) == distance], width, atol=1e-3)
+    centre = ring.heading[ring.paths[:, 0]] + np.radians(15) * apart / 2  # between the two headings
+    np.testing.assert_allclose(np.cos((first + last) / 2 - centre), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "ring",
+    [
+        Ring(**BUMPER, beam=np.radians([40.0, 120.0, 60.0, 90.0]), neighbors=3, max_range=3.0),
+        Ring.circular(count=10, beam=np.radians(150), neighbors=4),
+        Ring(
+            np.zeros((3, 2)),
+            np.radians([170.0, -170.0, 20.0]),
+            beam=np.radians([50, 180, 30.0]),
+            neighbors=1,
+            max_range=1.0,
+        ),
+    ],
+)
+def test_a_path_hears_a_direction_that_lies_in_both_cones_and_no_other(ring):
+    first, last = np.asarray(ring.detection_ranges, dtype=np.float64).T
+    for direction in np.radians(np.arange(-179.75, 180, 0.5)):
+        for k, (tx, rx) in enumerate(ring.paths):
+            edges = [abs(abs(oracles.wrap(direction - ring.heading[s])) - ring.beam[s] / 2) for s in (tx, rx)]
+            if min(edges) < 1e-4:
+                continue  # on the edge of a cone
+            both = all(oracles.hears(ring.heading[s], ring.beam[s], direction) for s in (tx, rx))
+            assert both == ((direction - first[k]) % (2 * np.pi) < last[k] - first[k])
+
+
+def test_virtual_sensors_lie_midway(faw_ring):
+    middle = faw_ring.position[faw_ring.paths].mean(axis=1)
+    np.testing.assert_allclose(faw_ring.virtual_sensors, middle, atol=1e-7)
+
+
+def test_every_eighth_sensor_fires_at_once(faw_ring):
+    groups = faw_ring.firing_groups
+    assert [list(g) for g in groups] == [[k, k + 8, k + 16] for k in range(8)]
+
+
+@given(st.integers(1, 50).flatmap(lambda n: st.tuples(st.just(n), st.integers(0, n - 1))))
+def test_firing_groups_do_not_interfere(shape):
+    count, neighbors = shape
+    ring = Ring.circular(count=count, neighbors=neighbors)
+    groups = ring.firing_groups
+    assert sorted(np.concatenate(groups)) == list(range(count))
+    for group in groups:
+        for a in group:
+            for b in group:
+                apart = min((a - b) % count, (b - a) % count)
+                assert a == b or apart >= 2 * neighbors + 2
+        audible = [(group[:, None] + np.arange(-neighbors, neighbors + 1)).ravel() % count]
+        if len(group) > 1:
+            assert len(np.unique(audible)) == len(np.ravel(audible))  # every receiver listens to one transmitter
+            gaps = np.diff(np.append(group, group[0] + count))
+            between = (group + gaps // 2)[gaps == 2 * neighbors + 2] % count
+            assert not np.isin(between, audible).any()  # the one in the middle hears nothing
+
+
+def test_the_fewest_groups_that_the_spacing_allows():
+    assert [len(Ring.circular(count=n, neighbors=3).firing_groups) for n in (24, 32, 25, 7, 16)] == [8, 8, 9, 7, 8]
+
+
+def test_reported_ranges_are_corrected_by_offsets_then_speed():
+    ring = Ring(**BUMPER, beam=1.0, neighbors=1, max_range=3.0, range_offset=[0.1, 0.2, 0.4, 0.0], speed_of_sound=350.0)
+    corrected = ring.corrected(np.array([1.0, 2.0]), np.array([0, 2]), np.array([0, 1]))
+    np.testing.assert_allclose(corrected, [(1.0 - 0.1) * 350 / 343.2, (2.0 - 0.3) * 350 / 343.2])
+
+
+def test_a_ring_with_one_thing_replaced_keeps_the_others():
+    ring = Ring(**BUMPER, beam=1.0, neighbors=1, max_range=3.0, range_offset=[0.1, 0.2, 0.4, 0.0], speed_of_sound=350.0)
+    other = dataclasses.replace(ring, neighbors=2)
+    assert other.neighbors == 2
+    for ours, theirs in zip(jax.tree.leaves(ring), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert (other.max_range, other.name) == (ring.max_range, ring.name)
+    with pytest.raises(SonarError, match="0 to 3"):
+        dataclasses.replace(ring, neighbors=4)
+
+
+def test_a_ring_is_a_pytree_of_what_can_be_calibrated(faw_ring):
+    leaves, tree = jax.tree.flatten(faw_ring)
+    assert [leaf.shape for leaf in leaves] == [(24, 2), (24,), (24,), (24,), ()]
+    assert jax.tree.unflatten(tree, leaves).paths.shape == (168, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "allowed"),
+    [
+        ({"count": 0}, "1 or more"),
+        ({"radius": -0.1}, "0 or more"),
+        ({"radius": float("nan")}, "0 or more"),
+        ({"beam": 0.0}, "more than 0 and at most 180 deg"),
+        ({"beam": 3.5}, "more than 0 and at most 180 deg"),
+        ({"neighbors": 24}, "0 to 23"),
+        ({"neighbors": -1}, "0 to 23"),
+        ({"max_range": 0.0}, "more than 0"),
+        ({"max_range": float("inf")}, "more than 0"),
+        ({"speed_of_sound": -1.0}, "more than 0"),
+        ({"radius": 1e300}, "at most 100 m"),
+        ({"max_range": 410.0}, "at most 100 m"),
+        ({"first_heading": 1e6}, "at most 720 deg"),
+    ],
+)
+def test_a_value_that_no_ring_can_have_is_refused_with_what_is_allowed(change, allowed):
+    with pytest.raises(SonarError, match=allowed) as caught:
+        Ring.circular(**change)
+    assert "\n" not in str(caught.value)

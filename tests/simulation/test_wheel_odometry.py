@@ -1,0 +1,97 @@
+"""Simulated odometry: exact without errors, a random walk with them, whatever the steps."""
+
+import numpy as np
+import pytest
+
+from jaxsonar import SonarError
+from jaxsonar.geometry.se2 import composed, relative, wrap_angle
+from jaxsonar.simulation.wheel_odometry import ACROSS, drifted, step_sd
+
+
+def straight(metres, steps):
+    return np.column_stack([np.linspace(0, metres, steps + 1), np.zeros((steps + 1, 2))])
+
+
+def round_trip(rng):
+    heading = np.cumsum(rng.normal(0, 0.4, 80))
+    place = np.cumsum(rng.uniform(-0.1, 0.3, (80, 1)) * np.stack([np.cos(heading), np.sin(heading)], axis=-1), axis=0)
+    return np.column_stack([place + np.array([3.0, -2.0]), wrap_angle(heading)])
+
+
+def test_without_errors_it_is_the_truth(rng):
+    poses = round_trip(rng)
+    got = drifted(poses, distance=0.0, turn=0.0)
+    np.testing.assert_allclose(got, poses, atol=1e-12)
+    for few in (poses[:0], poses[:1]):
+        np.testing.assert_array_equal(drifted(few, distance=0.1, turn=0.1), few)
+
+
+def test_it_begins_at_the_truth_and_is_the_same_again(rng):
+    poses = round_trip(rng)
+    got = drifted(poses, distance=0.02, turn=0.02, seed=3)
+    np.testing.assert_array_equal(got[0], poses[0])
+    np.testing.assert_array_equal(got, drifted(poses, distance=0.02, turn=0.02, seed=3))
+    assert not np.array_equal(got, drifted(poses, distance=0.02, turn=0.02, seed=4))
+    assert (np.abs(got[:, 2]) <= np.pi).all()
+
+
+def test_it_does_not_hang_on_the_frame(rng):
+    poses, motion = round_trip(rng), np.array([1.0, 2.0, 3.0])
+    moved = drifted(composed(motion, poses), distance=0.02, turn=0.02)
+    there = composed(motion, drifted(poses, distance=0.02, turn=0.02))
+    np.testing.assert_allclose(relative(there, moved), 0, atol=1e-9)
+
+
+def errors_of_parts(poses, length, **errors):
+    """Of every so many steps by themselves: they are independent."""
+    told = drifted(poses, **errors)[::length]
+    true = poses[::length]
+    return relative(relative(true[:-1], true[1:]), relative(told[:-1], told[1:]))
+
+
+@pytest.mark.parametrize("steps", [9, 90])
+def test_the_walk_grows_with_the_root_of_the_way(steps):
+    """After 9 m three times as much as after one, in few steps as in many."""
+    parts = 2000
+    poses = straight(9.0 * parts, steps * parts)
+    off = errors_of_parts(poses, steps, distance=0.02, turn=0.0)
+    np.testing.assert_allclose(off.std(axis=0), [0.06, 0.06 * ACROSS, 0], rtol=0.08)
+    np.testing.assert_allclose(off.mean(axis=0), 0, atol=0.006)
+    off = errors_of_parts(poses, steps, distance=0.0, turn=0.01)
+    np.testing.assert_allclose(off[:, 2].std(), 0.03, rtol=0.08)
+    # A heading that wanders moves the end sideways: integral of the walk, turn * sqrt(way^3 / 3), for many steps.
+    assert 0.8 < off[:, 1].std() / (0.01 * np.sqrt(9.0**3 / 3)) < 1.1
+
+
+def test_turning_on_the_spot_costs_heading_alone():
+    parts = 2000
+    poses = np.column_stack([np.ones((8 * parts + 1, 2)), wrap_angle(np.pi / 4 * np.arange(8 * parts + 1))])
+    off = errors_of_parts(poses, 8, distance=0.02, turn=0.5)
+    np.testing.assert_array_equal(off[:, :2], 0)
+    np.testing.assert_allclose(off[:, 2].std(), 0.02 * np.sqrt(2 * np.pi), rtol=0.08)
+
+
+def test_what_is_wrong_for_good(rng):
+    poses = round_trip(rng)
+    long = drifted(poses, distance=0.0, turn=0.0, scale=0.03)
+    np.testing.assert_allclose(long[:, :2] - poses[0, :2], 1.03 * (poses[:, :2] - poses[0, :2]), atol=1e-12)
+    far = drifted(poses, distance=0.0, turn=0.0, turn_scale=0.5)
+    steps, told = relative(poses[:-1], poses[1:]), relative(far[:-1], far[1:])
+    np.testing.assert_allclose(wrap_angle(told[:, 2] - 1.5 * steps[:, 2]), 0, atol=1e-9)
+
+
+def test_standard_deviations_are_those_of_the_steps(rng):
+    poses = np.concatenate([straight(0.25, 1), [[0.25, 0.0, 0.4]]])
+    sd = step_sd(poses, distance=0.02, turn=0.1)
+    np.testing.assert_allclose(sd, [[0.01, 0.01 * ACROSS, 0.05], [0, 0, 0.02 * np.sqrt(0.4)]])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [({"distance": -0.1}, "distance -0.1"), ({"turn": np.nan}, "turn nan"), ({"scale": -1.0}, "scale -1")],
+)
+def test_values_out_of_range_are_named(wrong, said):
+    with pytest.raises(SonarError, match=f"odometry: {said}; allowed"):
+        drifted(straight(1.0, 2), **{"distance": 0.1, "turn": 0.1} | wrong)
+    with pytest.raises(SonarError, match="pose 1"):
+        drifted(np.array([[0.0, 0, 0], [np.nan, 0, 0]]), distance=0.1, turn=0.1)
