@@ -17,7 +17,8 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.kernels.array_geometry import Sensors
 from jaxsonar.kernels.autofocus import ring_sharpness
 from jaxsonar.kernels.hough_accumulator import HoughSettings
-from jaxsonar.scans.echo_batches import FlatEchoes, room_for
+from jaxsonar.kernels.shape_buckets import bucket_size
+from jaxsonar.scans.echo_batches import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import SPEED_SD
@@ -59,7 +60,7 @@ def focus(ring: Ring, log: Log, *, poses: bool, speed: bool, scans: int = 40) ->
     echoes, reach = _chosen(ring, log, poses, scans)
     # Curves of a far wall run steeply through the world, up to metres a radian; in the robot frame never so.
     fine = HoughSettings(theta_cells=720 if poses else 120, point_pitch=float(np.radians(0.5 if poses else 1.0)))
-    columns = room_for(int(np.ceil((reach + _BEYOND * ring.max_range) / _CELL)), least=64)
+    columns = bucket_size(int(np.ceil((reach + _BEYOND * ring.max_range) / _CELL)), least=64)
     settings = dataclasses.replace(fine, rho_cell=_CELL, rho_cells=min(columns, 1_000_000 // fine.theta_cells))
     points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
     whole = ring.sensors
@@ -101,12 +102,12 @@ def _chosen(ring: Ring, log: Log, poses: bool, most: int) -> tuple[kernels.Echoe
         centre = at[:, :2].mean(axis=0)
         at = np.column_stack([at[:, :2] - centre, at[:, 2]])
         row, column = np.zeros_like(row), np.arange(len(echo))
-        shape = (1, room_for(len(echo), least=512))
+        shape = (1, bucket_size(len(echo), least=512))
         size += float(np.hypot(*at[:, :2].T).max())
         pose = np.zeros((*shape, 3), np.float32)
         pose[row, column] = at
     else:
-        pose, shape = None, (room_for(len(index), least=8), room_for(int(column.max()) + 1, least=64))
+        pose, shape = None, (bucket_size(len(index), least=8), bucket_size(int(column.max()) + 1, least=64))
     path, reported = np.zeros(shape, np.int32), np.full(shape, np.nan, np.float32)
     path[row, column] = flat.path[echo]
     reported[row, column] = flat.reported[echo]

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxsonar import kernels
 from jaxsonar.estimation.robust_adjustment import Data, Settled
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.scans.echo_batches import room_for
+from jaxsonar.kernels.shape_buckets import bucket_size, pad_rows
 from jaxsonar.sensors.ring import Ring
 
 _SOFT, _LIKELY = 0.1, 2.0  # rad, log odds; to begin with
@@ -45,10 +45,10 @@ def beam_centres(ring: Ring, data: Data, found: Settled) -> tuple[Ring, Float[np
     open_[scan, data.path[scan, echo]] = True
     sure &= ~open_[:, None] | heard
     _, _, sensor = np.nonzero(sure)
-    room = room_for(len(sensor), least=1024)
+    room = bucket_size(len(sensor), least=1024)
 
     def padded(values: np.ndarray) -> jax.Array:
-        return jnp.asarray(np.pad(values, (0, room - len(values))))
+        return jnp.asarray(pad_rows(values, room))
 
     sightings = (padded(sensor), padded(angle[sure]), padded(heard[sure]), padded(np.ones(len(sensor), bool)))
     half = float(np.median(ring.beam)) / 2

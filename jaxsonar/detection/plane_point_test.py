@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.detection.hough_detector import Candidate, Extracted, arcs_of
-from jaxsonar.scans.echo_batches import room_for
+from jaxsonar.kernels.shape_buckets import bucket_size
 from jaxsonar.sensors.ring import Ring
 
 TOLERANCE = 0.03
@@ -38,7 +38,7 @@ def verified(ring: Ring, extracted: Extracted, settings: kernels.HoughSettings, 
     """
     step, lines = extracted.step, extracted.lines
     rows, columns = lines.rho.shape
-    candidates = np.full((2, len(step.path), room_for(columns, least=16)), np.nan, np.float32)
+    candidates = np.full((2, len(step.path), bucket_size(columns, least=16)), np.nan, np.float32)
     candidates[:, :rows, :columns] = lines.rho, lines.theta
     rho, theta = (jnp.asarray(values) for values in candidates)
     fits = kernels.fit_candidates(arcs_of(ring, settings), step.packed, rho, theta, tolerance=TOLERANCE)

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar import kernels
 from jaxsonar.detection.extract import LocalModel, local_models
 from jaxsonar.geometry.se2 import unit
+from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
 from jaxsonar.mapping.build_map import assemble, build_map, gather_evidence
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.point_landmarks import cluster, condense
-from jaxsonar.scans.echo_batches import power_of_two
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -86,7 +86,7 @@ class Surroundings(NamedTuple):
         heard &= np.asarray(reflection.kind) >= 0
         if self.heard_by is not None:
             heard &= self.heard_by[:, np.asarray(reflection.first)]
-        room = min(power_of_two(int(heard.sum(axis=1).max(initial=1)), least=_ROOM), heard.shape[1])
+        room = min(next_power_of_two(int(heard.sum(axis=1).max(initial=1)), least=_ROOM), heard.shape[1])
         order = np.argsort(~heard, axis=1, kind="stable")[:, :room]
         return np.where(np.take_along_axis(heard, order, axis=1), order, -1).astype(np.int32)
 
@@ -147,21 +147,16 @@ def _padded(
 ) -> Surroundings:
     """With room for a power of two of reflectors, and of candidates, so that few shapes are compiled."""
     count = len(world)
-    room = power_of_two(count, least=_ROOM)
-    more = room - count
-
-    def pad(array: np.ndarray, filler: float | int = 0) -> np.ndarray:
-        return np.pad(array, [(0, more)] + [(0, 0)] * (array.ndim - 1), constant_values=filler)
-
+    room = next_power_of_two(count, least=_ROOM)
     scene = kernels.Scene(
-        kind=pad(np.asarray(scene.kind, np.int32), -1),
-        parameters=pad(np.asarray(scene.parameters, np.float64)),
-        anchor=pad(np.asarray(scene.anchor, np.float64)),
-        ends=pad(np.asarray(scene.ends, np.float64)),
+        kind=pad_rows(np.asarray(scene.kind, np.int32), room, fill=-1),
+        parameters=pad_rows(np.asarray(scene.parameters, np.float64), room),
+        anchor=pad_rows(np.asarray(scene.anchor, np.float64), room),
+        ends=pad_rows(np.asarray(scene.ends, np.float64), room),
     )
     first, second, of_world = np.array(meetings, dtype=np.int32).reshape(-1, 3).T
     pairs = len(first)
-    size = power_of_two(count + 2 * pairs, least=_ROOM)
+    size = next_power_of_two(count + 2 * pairs, least=_ROOM)
     rest = size - count - 2 * pairs
     alone = np.arange(count, dtype=np.int32)
     candidates = kernels.Candidates(
@@ -177,4 +172,4 @@ def _padded(
             [alone, count + np.tile(np.arange(pairs), 2), np.full(rest, -1)], dtype=np.int32, casting="unsafe"
         ),
     )
-    return Surroundings(scene, pad(world.astype(np.int32), -1), candidates)
+    return Surroundings(scene, pad_rows(world.astype(np.int32), room, fill=-1), candidates)

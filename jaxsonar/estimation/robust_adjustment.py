@@ -20,7 +20,8 @@ from jaxsonar.estimation.landmark_map import Surroundings
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.sparse_lm import adjust as sparsely
 from jaxsonar.geometry.se2 import relative
-from jaxsonar.scans.echo_batches import FlatEchoes, power_of_two
+from jaxsonar.kernels.shape_buckets import next_power_of_two
+from jaxsonar.scans.echo_batches import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import renewed
 from jaxsonar.sensors.ring import Ring
@@ -106,7 +107,7 @@ class Data:
             counts.append(count[rows])
         begin = np.cumsum([0, *(len(rows) for rows in used)])
         most = max((int(count.max(initial=1)) for count in counts), default=1)
-        scans, columns = power_of_two(int(begin[-1]), least=8), power_of_two(most, least=16)
+        scans, columns = next_power_of_two(int(begin[-1]), least=8), next_power_of_two(most, least=16)
         data = cls(
             path=np.zeros((scans, columns), np.int32),
             reported=np.full((scans, columns), np.nan),

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from jaxsonar import kernels
 from jaxsonar.estimation.block_cholesky import Plan
 from jaxsonar.geometry.se2 import wrap_angle
-from jaxsonar.scans.echo_batches import power_of_two
+from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
 
 _DAMPING = (1e-6, 1e-12, 1e8)  # relative to the diagonal: first, least, most
 _ENOUGH = 1e-9  # relative decrease of the cost at which it ends
@@ -121,7 +121,8 @@ class _Equations:
         steps = np.flatnonzero((self.linked > 0).any(axis=1))
         # Poses that nothing hangs on stay where they are: they are padding.
         self.poses = max(int(scan.max(initial=-1)) + 1, int(steps.max(initial=-2)) + 2) if poses_free else 0
-        self.scan, self.echo = _padded(scan), _padded(echo)
+        size = next_power_of_two(len(scan), least=_ROOM)  # few shapes, few compilations
+        self.scan, self.echo = (pad_rows(rows.astype(np.int32), size) for rows in (scan, echo))
         reflection = problem.heard.reflection
         first, second = (np.asarray(leaf)[scan, echo] for leaf in (reflection.first, reflection.second))
         twice = np.flatnonzero(np.asarray(reflection.kind)[scan, echo] == kernels.SECOND)
@@ -217,10 +218,3 @@ def _common(one: _Part, other: _Part) -> tuple[Int[np.ndarray, " terms"], Int[np
     """Terms that two parts share, and the blocks of both."""
     term, i, k = np.intersect1d(one.term, other.term, assume_unique=True, return_indices=True)
     return term, np.stack([one.block[i], other.block[k]], axis=1)
-
-
-def _padded(rows: Int[np.ndarray, " terms"]) -> Int[np.ndarray, " room"]:
-    """With room for a power of two, so that few shapes are compiled."""
-    out = np.zeros(power_of_two(len(rows), least=_ROOM), dtype=np.int32)
-    out[: len(rows)] = rows
-    return out

@@ -16,10 +16,11 @@ from jaxsonar import kernels
 from jaxsonar.detection.extract import LocalModel
 from jaxsonar.estimation.motion_model import moved, step_variance
 from jaxsonar.estimation.odometry_noise import Slip
-from jaxsonar.geometry.se2 import relative, to_world, unit
+from jaxsonar.geometry.se2 import relative, transform_points, unit
 from jaxsonar.graph_slam.joint_compatibility import Features, Known, features_of, match
+from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
 from jaxsonar.loop_closure.submap import Submap
-from jaxsonar.scans.echo_batches import echoes_of, exact_paths, power_of_two
+from jaxsonar.scans.echo_batches import echoes_of, exact_paths
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -236,7 +237,7 @@ def _silent(ring: Ring, known: Known, scan: Scan, path_pose: Float[np.ndarray, "
     That a scan knows nothing of what it sees is no proof that the robot is elsewhere: around a corner all is new, and
     few of the walls that are known are faced.
     """
-    room = power_of_two(len(known), least=_ROOM)
+    room = next_power_of_two(len(known), least=_ROOM)
     direct = np.flatnonzero(ring.paths[:, 0] == ring.paths[:, 1])
     paths = jax.tree.map(lambda leaf: leaf[direct], exact_paths(ring))
     if path_pose is not None:
@@ -270,20 +271,20 @@ class _Echoes:
     @classmethod
     def of(cls, ring: Ring, scan: Scan, path_pose: Float[np.ndarray, "paths 3"] | None) -> "_Echoes":
         row, reach = echoes_of(ring, scan)
-        room = power_of_two(len(row), least=_ECHOES)
+        room = next_power_of_two(len(row), least=_ECHOES)
         paths = exact_paths(ring)
-        padded = _pad(row, room)
+        padded = pad_rows(row, room)
         own = jax.tree.map(lambda leaf: leaf[padded], paths)
         if path_pose is not None:
-            own = _moved(own, _pad(path_pose[row], room))
-        return cls(own, _pad(reach, room), len(row))
+            own = _moved(own, pad_rows(path_pose[row], room))
+        return cls(own, pad_rows(reach, room), len(row))
 
     def claimed(self, seen: Features, noise: float) -> Int[np.ndarray, " echoes"]:
         """Feature of the echoes that the scan's own features explain; -1 for all others."""
         count = len(seen.kind)
         if not count or not self.count:
             return np.full(self.count, -1)
-        room = power_of_two(count, least=_SEEN)
+        room = next_power_of_two(count, least=_SEEN)
         scene = _in_room(scene_of(seen, np.zeros(3)), room)
         expected = np.asarray(kernels.expected_ranges(np.zeros(3), scene, self.path))[:count, : self.count]
         off = np.abs(expected - self.ranges[: self.count])
@@ -293,7 +294,7 @@ class _Echoes:
 
     def tracked(self, known: Known, row: np.ndarray, noise: float) -> kernels.Tracked:
         """The belief after echoes of these reflectors."""
-        room = power_of_two(len(known), least=_ROOM)
+        room = next_power_of_two(len(known), least=_ROOM)
         size, used = 3 + 2 * room, len(known.covariance)
         covariance = np.zeros((size, size))
         covariance[:used, :used] = known.covariance
@@ -302,7 +303,7 @@ class _Echoes:
             _in_room(known.scene, room),
             covariance,
         )
-        rows = _pad(row.astype(np.int32), len(self.ranges), -1)
+        rows = pad_rows(row.astype(np.int32), len(self.ranges), fill=-1)
         return kernels.track(belief, self.path, self.ranges, rows, np.float64(noise**2))
 
     def explained(self, found: kernels.Tracked, claimed: np.ndarray, noise: float) -> np.ndarray:
@@ -339,7 +340,7 @@ def _moved(paths: kernels.EchoPaths, pose: Float[np.ndarray, "echoes 3"]) -> ker
 
 def scene_of(seen: Features, pose: Float[np.ndarray, "3"]) -> kernels.Scene:
     """What a scan sees as reflectors of the frame that its pose is of; walls are anchored in their middle."""
-    segment = to_world(pose, seen.segment)
+    segment = transform_points(pose, seen.segment)
     middle, half = segment.mean(axis=1), np.linalg.norm(segment[:, 1] - segment[:, 0], axis=-1) / 2
     theta = seen.place[:, 1] + pose[2]
     normal = unit(theta)
@@ -348,15 +349,15 @@ def scene_of(seen: Features, pose: Float[np.ndarray, "3"]) -> kernels.Scene:
     return kernels.Scene(
         kind=seen.kind,
         parameters=np.where(wall, np.stack([distance, theta], -1), 0.0),
-        anchor=np.where(wall, middle, to_world(pose, seen.place)),
+        anchor=np.where(wall, middle, transform_points(pose, seen.place)),
         ends=np.where(wall, half[:, None] * [-1.0, 1.0], 0.0),
     )
 
 
 def _in_room(scene: kernels.Scene, room: int) -> kernels.Scene:
     """With room for so many reflectors."""
-    rest = (_pad(np.asarray(leaf), room) for leaf in (scene.parameters, scene.anchor, scene.ends))
-    return kernels.Scene(_pad(np.asarray(scene.kind), room, -1), *rest)
+    rest = (pad_rows(np.asarray(leaf), room) for leaf in (scene.parameters, scene.anchor, scene.ends))
+    return kernels.Scene(pad_rows(np.asarray(scene.kind), room, fill=-1), *rest)
 
 
 def _with_new(known: Known, new: Features, pose: Float[np.ndarray, "3"]) -> Known:
@@ -387,7 +388,7 @@ def _seen_farther(known: Known, seen: Features, reflector: Int[np.ndarray, " fea
     for feature in np.flatnonzero((reflector >= 0) & (seen.kind == kernels.PLANE)):
         wall = reflector[feature]
         tangent = unit(known.parameters[wall, 1] + np.pi / 2)
-        along = (to_world(known.pose, seen.segment[feature]) - known.anchor[wall]) @ tangent
+        along = (transform_points(known.pose, seen.segment[feature]) - known.anchor[wall]) @ tangent
         ends[wall] = min(ends[wall, 0], along.min()), max(ends[wall, 1], along.max())
     return replace(known, ends=ends, scans=known.scans + explains)
 
@@ -395,10 +396,3 @@ def _seen_farther(known: Known, seen: Features, reflector: Int[np.ndarray, " fea
 def _of(reflector: Int[np.ndarray, " features"], feature: Int[np.ndarray, " echoes"]) -> Int[np.ndarray, " echoes"]:
     """Reflector of each echo by the feature that claims it; -1 for none."""
     return np.append(reflector, -1)[feature]
-
-
-def _pad(array: np.ndarray, room: int, filler: float | int = 0) -> np.ndarray:
-    """With rows up to ``room``; np.pad takes ten times as long."""
-    out = np.full((room, *array.shape[1:]), filler, dtype=array.dtype)
-    out[: len(array)] = array
-    return out

@@ -29,7 +29,7 @@ STILL = 1e-4
 DEGREE = 0.1
 """Kelvin; a change of the air's temperature that is worth a new speed of sound."""
 _WARM = {"ml": (1,), "hough": (1, FEW, AT_ONCE)}  # numbers of scans that are taken together
-_ECHOES = (60, 90, 120)  # of a scan, each in a room of its own (``echoes.room_for``)
+_ECHOES = (60, 90, 120)  # of a scan, each in a room of its own (``kernels.shape_buckets.bucket_size``)
 
 
 @dataclass(frozen=True, eq=False)

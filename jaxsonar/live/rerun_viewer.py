@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsonar.geometry.se2 import to_world
+from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.kernels.shape_buckets import bucket_size, pad_rows
 from jaxsonar.live.live_map import LiveScan
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.reports.plot_scan import arc_points
-from jaxsonar.scans.echo_batches import room_for
 from jaxsonar.sensors.ring import Ring
 
 HOST = "127.0.0.1"
@@ -94,7 +94,7 @@ class View:
         self._stream.set_time("scan", sequence=scan.scan)
         if np.isfinite(scan.stamp):
             self._stream.set_time("device", duration=scan.stamp)
-        self._points("ring", to_world(pose, np.asarray(ring.position)), _RING, 0.015)
+        self._points("ring", transform_points(pose, np.asarray(ring.position)), _RING, 0.015)
         path = ring.path_index[scan.tx, scan.rx]
         reach = np.asarray(ring.corrected(scan.range, scan.tx, scan.rx))
         heard = (path >= 0) & (reach < ring.max_range)
@@ -102,11 +102,11 @@ class View:
             ("direct", heard & (scan.tx == scan.rx), _DIRECT),
             ("cross", heard & (scan.tx != scan.rx), _CROSS),
         ):
-            self._strips(f"arcs/{name}", to_world(pose, self._arcs(path[own], reach[own])), colour, 0.003)
+            self._strips(f"arcs/{name}", transform_points(pose, self._arcs(path[own], reach[own])), colour, 0.003)
         lines = np.array([line.segment for line in model.lines]).reshape(-1, 2, 2)
-        self._strips("lines", to_world(pose, lines), _LINE, 0.012)
+        self._strips("lines", transform_points(pose, lines), _LINE, 0.012)
         corners = np.array([[point.x, point.y] for point in model.points]).reshape(-1, 2)
-        self._points("points", to_world(pose, corners), _LINE, 0.03)
+        self._points("points", transform_points(pose, corners), _LINE, 0.03)
         if known:
             self._way = [*self._way[-9999:], pose[:2].tolist()]
             self._strips("way", np.array([self._way]), _RING, 0.005)
@@ -135,10 +135,8 @@ class View:
         raise SonarError("--view: the viewer does not start; allowed is a machine on which 'python -m rerun' does")
 
     def _arcs(self, path: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        room = room_for(len(path), least=64)  # few different shapes
-        padded, far = np.zeros(room, np.int64), np.ones(room)
-        padded[: len(path)], far[: len(path)] = path, reach
-        return arc_points(self._ring, padded, far)[: len(path)]
+        room = bucket_size(len(path), least=64)  # few different shapes
+        return arc_points(self._ring, pad_rows(path, room), pad_rows(reach, room, fill=1.0))[: len(path)]
 
     def _strips(self, name: str, strips: Float[np.ndarray, "strips points 2"], colour: Any, radius: float) -> None:
         # Rerun's y points down in a plane: seen from above, the robot's left is up.

@@ -13,8 +13,8 @@ from scipy.spatial import Delaunay
 from jaxsonar import kernels
 from jaxsonar.detection.connected_components import label_components
 from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.kernels.shape_buckets import bucket_size
 from jaxsonar.mapping.wall_segments import Pieces, add_up, outermost, overwrite
-from jaxsonar.scans.echo_batches import room_for
 
 RHO_CELL = 0.10
 """Metres; the paper's cell for merging, with 0.0628 rad in theta."""
@@ -40,13 +40,13 @@ def merge_as_paper(pieces: Pieces, *, cut: float) -> Pieces:
     rho = (pieces.normal * (pieces.centre - origin[cluster])).sum(-1)
     part, line = np.zeros(len(pieces), dtype=np.int64), np.stack([rho, pieces.theta], axis=-1)
     for settings, rows, column, row in _batches(cluster, size, rho):
-        shape = room_for(int(row[-1]) + 1, least=2), room_for(int(column.max()) + 1, least=16)
+        shape = bucket_size(int(row[-1]) + 1, least=2), bucket_size(int(column.max()) + 1, least=16)
         lines = np.full((2, *shape), np.nan, np.float32)
         lines[:, row, column] = rho[rows], pieces.theta[rows]
         # Hough transform the infinite lines; low pass, threshold, components, centres of gravity.
         packed = tuple(jnp.asarray(values) for values in lines)
         labels, counts = label_components(np.asarray(kernels.occupied_by_lines(*packed, settings=settings)))
-        found = room_for(int(counts.max()), least=16)
+        found = bucket_size(int(counts.max()), least=16)
         merged = kernels.merged_lines(*packed, jnp.asarray(labels), settings=settings, size=found)
         merged_rho, merged_theta, component = (np.asarray(values) for values in merged)
         part[rows] = component[row, column]
@@ -100,9 +100,9 @@ def _batches(
     np.maximum.at(farthest, cluster, np.abs(rho))
     # Clusters of a kilometre get coarser cells.
     coarse = 2 ** np.maximum(np.ceil(np.log2((farthest + 1) / (_MOST_CELLS * RHO_CELL))), 0).astype(np.int64)
-    cells = np.array([room_for(int(n) + 2, least=100) for n in farthest / (coarse * RHO_CELL)])
+    cells = np.array([bucket_size(int(n) + 2, least=100) for n in farthest / (coarse * RHO_CELL)])
     cells = np.minimum(cells, _MOST_CELLS)
-    lines = np.array([room_for(int(n), least=16) for n in size])
+    lines = np.array([bucket_size(int(n), least=16) for n in size])
     shapes = np.stack([cells, lines, coarse])
     order = np.argsort(cluster, kind="stable")
     start = np.cumsum(size) - size

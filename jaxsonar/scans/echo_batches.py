@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.kernels.shape_buckets import bucket_size, next_power_of_two
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -25,19 +26,6 @@ _FEW_CELLS = 50_000  # accumulators larger than this are not stacked by the hund
 _WORTH_A_SHAPE = 256  # scans
 _SLACK = 1.1
 _FULL = 0.75  # of a step's scans; another call costs more than some padding
-
-
-def room_for(count: int, *, least: int) -> int:
-    """Room for count things in few different shapes, so few compilations: ``least``, 1.5 or 2 times that, and so on."""
-    room = least
-    while room < count:
-        room = room * 3 // 2 if room & (room - 1) == 0 else room * 4 // 3  # powers of two, and halfway between
-    return room
-
-
-def power_of_two(count: int, *, least: int) -> int:
-    """Room for count things in even fewer shapes: ``least``, a power of two, or the first such that holds them."""
-    return max(least, 1 << max(count - 1, 0).bit_length())
 
 
 class Step(NamedTuple):
@@ -192,7 +180,7 @@ class FlatEchoes:
         the others. Else groups too small to be worth a shape join the next larger one: votes are whole numbers.
         """
         least = 64 if self.pose is None else 256
-        fit, floor, worth = (power_of_two, least, 0) if dear else (room_for, least // 2, _WORTH_A_SHAPE)
+        fit, floor, worth = (next_power_of_two, least, 0) if dear else (bucket_size, least // 2, _WORTH_A_SHAPE)
         if len(block) == 1:
             yield block, fit(int(need[0]), least=least)
             return
