@@ -1,8 +1,7 @@
-"""The commands ``slam`` and ``localize``: what they can be told, and what they do."""
+"""``jaxsonar slam``: trajectory and map together, from echoes with or without odometry."""
 
 import argparse
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -10,24 +9,60 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import numpy as np
 
-    from jaxsonar.estimation.odometry_noise import Slip
     from jaxsonar.estimation.trajectory import Trajectory, TrajectoryErrors
     from jaxsonar.graph_slam.slam import Slam
-    from jaxsonar.mapping.global_map import GlobalMap
     from jaxsonar.scans.scan_log import Log
 
+from jaxsonar.cli.arguments import add_slam_arguments, figure_filename, filename, finite, odometry_noise_of
+from jaxsonar.cli.console import count, plain_name, print_left_out, print_status, stage_status
 
-def slam(options: argparse.Namespace) -> None:
+SUMMARY = "Poses and map together, from echoes and odometry, or from echoes alone."
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``jaxsonar slam``."""
+    parser.add_argument(
+        "log", type=filename, metavar="LOG", help="scan log, .csv or .parquet; its poses are odometry, or empty"
+    )
+    add_slam_arguments(parser)
+    parser.add_argument(
+        "-o", "--output", type=filename, metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout"
+    )
+    parser.add_argument("--trajectory", type=filename, metavar="TRAJ", help="the poses, TUM format; - = stdout")
+    parser.add_argument(
+        "--figure", type=figure_filename, metavar="FIG", help="poses, odometry, walls: .svg, .png or .pdf"
+    )
+    parser.add_argument(
+        "--truth", type=filename, metavar="TRAJ", help="true poses (TUM) to tell the errors against, and to draw"
+    )
+    parser.add_argument(
+        "--json", type=filename, metavar="FILE", help="closures, errors, noise, scales as JSON; - = stdout"
+    )
+    parser.add_argument(
+        "--window",
+        type=finite(0.01, 100),
+        metavar="METRES",
+        help="gather so much path into a local model (default: 1.5 for rings of few sensors, else none)",
+    )
+    parser.add_argument("--speed", action="store_true", help="estimate the speed of sound, too")
+    parser.add_argument("--scale", action="store_true", help="estimate the scales of the odometry, too")
+    parser.add_argument(
+        "--smoothing",
+        action=argparse.BooleanOptionalAction,
+        help="adjust all poses and reflectors in the end (default: up to 2000 scans; a minute for a thousand)",
+    )
+
+
+def run(options: argparse.Namespace) -> None:
     """``jaxsonar slam``."""
     import numpy as np
 
-    from jaxsonar.cli.console import _count, _plain, _say_left_out, _stages
     from jaxsonar.estimation.trajectory import errors, load_trajectory, save_trajectory
     from jaxsonar.fileio.atomic_files import check_outputs, open_output, shown
-    from jaxsonar.graph_slam.slam import slam as run
+    from jaxsonar.graph_slam.slam import slam as run_slam
     from jaxsonar.hardware.errors import SonarError
     from jaxsonar.mapping.map_geojson import save_map
-    from jaxsonar.scans.echo_batches import FlatEchoes
+    from jaxsonar.scans.flat_echoes import FlatEchoes
     from jaxsonar.scans.log_file import load_log
     from jaxsonar.sensors.ring_toml import load_ring
 
@@ -41,13 +76,13 @@ def slam(options: argparse.Namespace) -> None:
         _check_truth(truth, log, str(options.truth), options.log)
     try:
         _, left_out = FlatEchoes.from_log(ring, log)
-        with _stages() as progress:
-            found = run(
+        with stage_status() as progress:
+            found = run_slam(
                 ring,
                 log,
                 sigma=options.sigma,
                 window=options.window,
-                slip=slip_of(options.odometry),
+                slip=odometry_noise_of(options.odometry),
                 smooth=options.smoothing,
                 speed=options.speed,
                 scale=options.scale,
@@ -60,7 +95,7 @@ def slam(options: argparse.Namespace) -> None:
 
     # Everything is made before anything is written.
     trajectory = found.trajectory
-    against = None if truth is None else _errors(errors, trajectory, truth, found, str(options.truth))
+    against = None if truth is None else _trajectory_errors(errors, trajectory, truth, found, str(options.truth))
     figure = None
     if options.figure:
         from jaxsonar.reports import plot_slam as figures_slam
@@ -71,10 +106,10 @@ def slam(options: argparse.Namespace) -> None:
             found.world,
             trajectory,
             odometry=found.odometry if np.isfinite(found.odometry).any() else None,
-            truth=None if truth is None else _laid_on(trajectory, truth),
-            closures=_rows(counted, found),
-            withdrawn=_rows(withdrawn, found),
-            title=f"{_count(len(trajectory), 'pose')}, {_count(len(found.world), 'wall')} from {_plain(options.log)}",
+            truth=None if truth is None else _truth_in_estimate_frame(trajectory, truth),
+            closures=_closure_rows(counted, found),
+            withdrawn=_closure_rows(withdrawn, found),
+            title=f"{count(len(trajectory), 'pose')}, {count(len(found.world), 'wall')} from {plain_name(options.log)}",
         )
     said = json.dumps(_as_json(found, against), allow_nan=False, indent=1) + "\n"
     save_map(found.world, options.output)
@@ -88,183 +123,12 @@ def slam(options: argparse.Namespace) -> None:
         with open_output(options.json) as file:
             file.write(said)
     if left_out:
-        _say_left_out(ring.name, left_out)
-    for line in _told(found, against):
-        _say(line)
+        print_left_out(ring.name, left_out)
+    for line in _summary_lines(found, against):
+        print_status(line)
 
 
-def localize(options: argparse.Namespace) -> int:
-    """``jaxsonar localize``; 1 if the place is not certain."""
-    from jaxsonar.cli.console import _count, _plain, _stages
-    from jaxsonar.estimation.trajectory import save_trajectory
-    from jaxsonar.fileio.atomic_files import check_outputs, shown
-    from jaxsonar.hardware.errors import SonarError
-    from jaxsonar.localization.localize import localize as run
-    from jaxsonar.scans.log_file import load_log
-    from jaxsonar.sensors.ring_toml import load_ring
-
-    check_outputs(
-        {"--trajectory": options.trajectory, "--figure": options.figure}, [options.log, options.ring, options.map]
-    )
-    ring, log, world = load_ring(options.ring), load_log(options.log), _known_map(options.map)
-    try:
-        with _stages() as progress:
-            found = run(
-                ring,
-                world,
-                log,
-                start=options.start,
-                sigma=options.sigma,
-                slip=slip_of(options.odometry),
-                progress=progress,
-            )
-    except SonarError as error:
-        raise SonarError(f"{shown(options.log)}: {error}") from None
-    if not found.certain:
-        _say(found.why)
-        return 1
-    trajectory = found.trajectory
-    figure = None
-    if options.figure:
-        from jaxsonar.reports import plot_slam as figures_slam
-
-        figure = figures_slam.slam_figure(
-            world,
-            trajectory,
-            title=f"{_count(len(trajectory), 'pose')} in {_plain(options.map)}",
-        )
-    save_trajectory(trajectory, options.trajectory)
-    if figure is not None:
-        from jaxsonar.reports import plot_style as figures
-
-        figures.save(figure, options.figure)
-    _say(found.why)
-    if len(trajectory) < len(log):
-        _say(f"{len(log) - len(trajectory)} of {_count(len(log), 'scan')} could not be laid on the others: no pose")
-    return 0
-
-
-def _known_map(path: str) -> "GlobalMap":
-    """A map, or a floor plan as one; what is neither is refused as a map."""
-    from jaxsonar.fileio.atomic_files import shown
-    from jaxsonar.floor_plans.room_geojson import load_room
-    from jaxsonar.hardware.errors import SonarError
-    from jaxsonar.mapping.global_map import map_of
-    from jaxsonar.mapping.map_geojson import load_map
-
-    try:
-        world = load_map(path)
-    except SonarError as no_map:
-        try:
-            world = map_of(load_room(path))
-        except SonarError:
-            raise no_map from None
-    if not len(world):
-        raise SonarError(f"{shown(path)}: no wall; allowed is a map with walls")
-    return world
-
-
-def add_commands(
-    command: Callable[[str, str], argparse.ArgumentParser],
-    *,
-    number: Callable[..., Callable[[str], Any]],
-    file: Callable[[str], str],
-    figure: Callable[[str], str],
-    odometry: Callable[[str], Any],
-    texts: dict[str, str],
-) -> None:
-    """Tell the command line of them.
-
-    Args:
-        command: makes one from its name and summary.
-        number: parser of numbers within limits.
-        file: parser of file names.
-        figure: parser of names of figures.
-        odometry: parser of PERCENT,DEG.
-        texts: help that several commands share.
-    """
-
-    def common(one: argparse.ArgumentParser) -> None:
-        one.add_argument("--ring", type=file, required=True, help=texts["ring"])
-        one.add_argument(
-            "--sigma", type=number(1e-4, 1), metavar="METRES", help="noise of the ranges (default: found out)"
-        )
-        one.add_argument(
-            "--odometry",
-            type=odometry,
-            metavar="PERCENT,DEG",
-            help=texts["odometry"],
-        )
-
-    run = command("slam", "Poses and map together, from echoes and odometry, or from echoes alone.")
-    run.add_argument(
-        "log", type=file, metavar="LOG", help="scan log, .csv or .parquet; its poses are odometry, or empty"
-    )
-    common(run)
-    run.add_argument(
-        "-o", "--output", type=file, metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout"
-    )
-    run.add_argument("--trajectory", type=file, metavar="TRAJ", help="the poses, TUM format; - = stdout")
-    run.add_argument("--figure", type=figure, metavar="FIG", help="poses, odometry, walls: .svg, .png or .pdf")
-    run.add_argument(
-        "--truth", type=file, metavar="TRAJ", help="true poses (TUM) to tell the errors against, and to draw"
-    )
-    run.add_argument("--json", type=file, metavar="FILE", help="closures, errors, noise, scales as JSON; - = stdout")
-    run.add_argument(
-        "--window",
-        type=number(0.01, 100),
-        metavar="METRES",
-        help="gather so much path into a local model (default: 1.5 for rings of few sensors, else none)",
-    )
-    run.add_argument("--speed", action="store_true", help="estimate the speed of sound, too")
-    run.add_argument("--scale", action="store_true", help="estimate the scales of the odometry, too")
-    run.add_argument(
-        "--smoothing",
-        action=argparse.BooleanOptionalAction,
-        help="adjust all poses and reflectors in the end (default: up to 2000 scans; a minute for a thousand)",
-    )
-
-    where = command("localize", "Where the robot is in a known map.")
-    where.add_argument("log", type=file, metavar="LOG", help="scan log of a short path, .csv or .parquet")
-    where.add_argument("--map", type=file, required=True, metavar="MAP", help="the known map, or a floor plan: GeoJSON")
-    common(where)
-    where.add_argument(
-        "--start",
-        type=_pose,
-        metavar="X,Y,DEG",
-        help="about where the first scan was taken (m, m, deg): within 0.5 m and 20 deg (default: anywhere)",
-    )
-    where.add_argument("--trajectory", type=file, required=True, metavar="TRAJ", help="poses, TUM format; - = stdout")
-    where.add_argument("--figure", type=figure, metavar="FIG", help="poses and map: .svg, .png or .pdf")
-
-
-def _pose(text: str) -> tuple[float, float, float]:
-    """Three numbers: metres, metres, degrees."""
-    import math
-
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 3 or not all(abs(value) < 1e8 for value in numbers):  # False for NaN
-        raise argparse.ArgumentTypeError(f"{text!r} came; allowed are three numbers X,Y,DEG, such as 1.5,-0.2,90")
-    x, y, degrees = numbers
-    return x, y, math.radians(degrees)
-
-
-def slip_of(given: tuple[float, float] | None) -> "Slip":
-    """From per cent of the way and degrees, after one metre."""
-    import math
-
-    from jaxsonar.estimation.odometry_noise import Slip
-
-    if given is None:
-        return Slip()
-    place, heading = max(given[0] / 100, 1e-4), max(math.radians(given[1]), 1e-4)
-    return Slip(place=place, heading=heading, turn=max(place, heading))
-
-
-def _errors(
+def _trajectory_errors(
     errors: "Callable[..., TrajectoryErrors]", estimate: "Trajectory", truth: "Trajectory", found: "Slam", name: str
 ) -> "dict[str, TrajectoryErrors | None]":
     """Against the truth: the estimate as it is, best aligned (as evo has it), and odometry."""
@@ -302,16 +166,16 @@ def _check_truth(truth: "Trajectory", log: "Log", name: str, source: str) -> Non
         raise SonarError(f"--truth {shown(name)}: stamps {one}, the log's are {other}; allowed are common ones")
 
 
-def _laid_on(estimate: "Trajectory", truth: "Trajectory") -> "np.ndarray":
+def _truth_in_estimate_frame(estimate: "Trajectory", truth: "Trajectory") -> "np.ndarray":
     """The truth in the frame of the estimate: their first common poses are one."""
     from jaxsonar.estimation.trajectory import associated
-    from jaxsonar.geometry.se2 import composed, inverse
+    from jaxsonar.geometry.se2 import compose, inverse
 
     mine, theirs = associated(estimate.stamp, truth.stamp, tolerance=0.01)
-    return composed(composed(estimate.poses[mine[0]], inverse(truth.poses[theirs[0]])), truth.poses)
+    return compose(compose(estimate.poses[mine[0]], inverse(truth.poses[theirs[0]])), truth.poses)
 
 
-def _rows(ties: list, found: "Slam") -> "np.ndarray":
+def _closure_rows(ties: list, found: "Slam") -> "np.ndarray":
     """Rows of the trajectory of closures whose scans have poses."""
     import numpy as np
 
@@ -357,17 +221,15 @@ def _plain_numbers(table: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _told(found: "Slam", against: "dict[str, TrajectoryErrors | None] | None") -> list[str]:
+def _summary_lines(found: "Slam", against: "dict[str, TrajectoryErrors | None] | None") -> list[str]:
     """What is said in the end."""
     import numpy as np
 
-    from jaxsonar.cli.console import _count
-
     states = {state: sum(tie.state == state for tie in found.closures) for state in ("counted", "withdrawn")}
     lines = [
-        f"{_count(len(found.poses), 'scan')}, {len(found.trajectory)} of them placed, "
-        f"{_count(len(found.world), 'wall')}, {_count(len(found.world.points), 'corner')} or edges; "
-        f"{_count(states['counted'], 'loop closure')}, {states['withdrawn']} withdrawn"
+        f"{count(len(found.poses), 'scan')}, {len(found.trajectory)} of them placed, "
+        f"{count(len(found.world), 'wall')}, {count(len(found.world.points), 'corner')} or edges; "
+        f"{count(states['counted'], 'loop closure')}, {states['withdrawn']} withdrawn"
     ]
     smoothed = found.smoothed
     if smoothed is not None:
@@ -390,11 +252,11 @@ def _told(found: "Slam", against: "dict[str, TrajectoryErrors | None] | None") -
         )
     for name, one in (against or {}).items():
         if one is not None:
-            lines.append(f"{_NAMES[name]}: {_error(one)}")
+            lines.append(f"{_ERROR_LABELS[name]}: {_error_text(one)}")
     return lines
 
 
-def _error(one: "TrajectoryErrors") -> str:
+def _error_text(one: "TrajectoryErrors") -> str:
     import math
 
     nees = f"; squared error over variance {one.nees:.2f}" if math.isfinite(one.nees) else ""
@@ -404,12 +266,8 @@ def _error(one: "TrajectoryErrors") -> str:
     )
 
 
-_NAMES = {
+_ERROR_LABELS = {
     "estimate": "error, first pose on the truth",
     "aligned": "error, best alignment",
     "odometry": "odometry's error, first pose on the truth",
 }
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

@@ -28,7 +28,7 @@ from jaxsonar import (
 )
 from jaxsonar.cli.app import main
 from jaxsonar.detection.hough_detector import arcs_of, settings_for
-from jaxsonar.geometry.se2 import to_world
+from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.hardware.device_emulator import emulate
 from jaxsonar.hardware.fault_injection import Faults
 from jaxsonar.hardware.messages import ECHO
@@ -257,7 +257,7 @@ def test_errors_come_after_everything_was_written(office, log, tmp_path, monkeyp
     from jaxsonar.hardware.transport_base import Source
 
     broken = ValueError("the driver broke")
-    monkeypatch.setattr("jaxsonar.playing.LogPlayer.close", lambda self: None)
+    monkeypatch.setattr("jaxsonar.live.replay.LogPlayer.close", lambda self: None)
     real, calls = Source, iter(range(100))
 
     def read(self, timeout):
@@ -334,7 +334,11 @@ def test_moved_paths_are_those_of_moved_sensors():
     poses = np.broadcast_to(pose, (len(RING.paths), 3)).astype(np.float32)
     moved = kernels.moved_arcs(arcs_of(RING, settings), jax.numpy.asarray(poses), settings=settings)
     there = Ring(
-        to_world(pose, np.asarray(RING.position)), RING.heading + pose[2], beam=RING.beam, neighbors=3, max_range=2.0
+        transform_points(pose, np.asarray(RING.position)),
+        RING.heading + pose[2],
+        beam=RING.beam,
+        neighbors=3,
+        max_range=2.0,
     )
     other = arcs_of(there, settings)
     for one, two in zip(jax.tree.leaves(moved.paths), jax.tree.leaves(other.paths), strict=True):

@@ -1,0 +1,103 @@
+"""Argument types and options that several commands share. Nothing heavy is imported, so that help is fast."""
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jaxsonar.fileio.atomic_files import FIGURE_FORMATS
+
+if TYPE_CHECKING:
+    from jaxsonar.estimation.odometry_noise import Slip
+
+
+RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
+
+SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for each scan)"
+
+SETTINGS_HELP = "accumulator and low pass, for hough also threshold, instead of the paper's"
+
+ODOMETRY_HELP = "how wrong the odometry is after 1 m: %% of the way and deg (default: 3,1.5)"
+
+
+def number(kind: type, least: float | int, most: float | int):
+    """A number from ``least`` to ``most``, or a message that says so."""
+
+    def parse(text: str):
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not least <= value <= most:
+            name = "a whole number" if kind is int else "a number"
+            upper = "" if most == float("inf") else f" to {most:g}"
+            raise argparse.ArgumentTypeError(f"{text!r} came; allowed is {name} from {least:g}{upper or ' on'}")
+        return value
+
+    return parse
+
+
+def finite(least: float | int, most: float | int = 1e9):
+    """A type for argparse: a finite number within limits."""
+    return number(float, least, most)
+
+
+def filename(text: str) -> str:
+    """A type for argparse: the name of a file, which is not checked to exist."""
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(f"{text!r} came; allowed is the name of a file")
+    return text
+
+
+def filename_ending_in(*suffixes: str):
+    """A name with one of these suffixes: a wrong one is refused before the work, not after it."""
+
+    def parse(text: str) -> str:
+        if Path(text).suffix.lower() not in suffixes:
+            raise argparse.ArgumentTypeError(f"{text!r} came; allowed is a file name ending in {', '.join(suffixes)}")
+        return text
+
+    return parse
+
+
+figure_filename = filename_ending_in(*FIGURE_FORMATS)
+
+
+def odometry_error(text: str) -> tuple[float, float]:
+    """Two numbers, per cent of the way and degrees."""
+    try:
+        percent, degrees = map(finite(0, 100), text.split(","))
+    except (ValueError, argparse.ArgumentTypeError):
+        allowed = "two numbers from 0 to 100, PERCENT,DEG, such as 2,1"
+        raise argparse.ArgumentTypeError(f"{text!r} came; allowed is {allowed}") from None
+    return percent, degrees
+
+
+def add_method(command: argparse.ArgumentParser) -> None:
+    """Add ``--method`` and ``--sigma``."""
+    command.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
+    command.add_argument(
+        "--sigma",
+        type=finite(1e-4, 1),
+        metavar="METRES",
+        help=SIGMA_HELP,
+    )
+
+
+def add_slam_arguments(command: argparse.ArgumentParser) -> None:
+    """Add ``--ring``, ``--sigma`` and ``--odometry`` as ``slam`` and ``localize`` have them."""
+    command.add_argument("--ring", type=filename, required=True, help=RING_HELP)
+    command.add_argument(
+        "--sigma", type=finite(1e-4, 1), metavar="METRES", help="noise of the ranges (default: found out)"
+    )
+    command.add_argument("--odometry", type=odometry_error, metavar="PERCENT,DEG", help=ODOMETRY_HELP)
+
+
+def odometry_noise_of(given: tuple[float, float] | None) -> "Slip":
+    """From per cent of the way and degrees, after one metre."""
+    from jaxsonar.estimation.odometry_noise import Slip
+
+    if given is None:
+        return Slip()
+    place, heading = max(given[0] / 100, 1e-4), max(math.radians(given[1]), 1e-4)
+    return Slip(place=place, heading=heading, turn=max(place, heading))

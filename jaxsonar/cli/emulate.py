@@ -1,0 +1,92 @@
+"""``jaxsonar emulate``: a log or a floor plan, sent as a device would send it."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jaxsonar.hardware.errors import SonarError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from jaxsonar.hardware.messages import Message
+    from jaxsonar.sensors.ring import Ring
+
+from jaxsonar.cli.arguments import RING_HELP, finite, number
+from jaxsonar.cli.console import print_status, stopped_by_signals
+
+SUMMARY = "A log, or a room and a way through it, as a device."
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``jaxsonar emulate``."""
+    parser.add_argument("log", metavar="LOG", help="scan log or record (.csv, .parquet, .mcap), or room (.geojson)")
+    parser.add_argument("--ring", required=True, help=RING_HELP)
+    parser.add_argument(
+        "--listen",
+        required=True,
+        metavar="URL",
+        help="tcp://HOST:PORT, udp://HOST:PORT (PORT 0: any), pty: or pty:PATH; without HOST this machine only",
+    )
+    parser.add_argument("--speed", type=finite(0, 1e6), default=1.0, metavar="FACTOR", help="0 = as fast as it goes")
+    parser.add_argument("--corrupt", type=finite(0, 1), default=0.0, metavar="P", help="share of frames to damage")
+    parser.add_argument("--drop", type=finite(0, 1), default=0.0, metavar="P", help="share of frames to lose")
+    parser.add_argument("--reorder", type=finite(0, 1), default=0.0, metavar="P", help="share of frames to send late")
+    parser.add_argument("--stall", metavar="S[@EVERY]", help="say nothing for S seconds, every EVERY seconds")
+    parser.add_argument(
+        "--seed", type=number(int, 0, 2**32 - 1), default=0, help="of the faults, and of a room's noise"
+    )
+    parser.add_argument("--path", metavar="CSV", help="the way through a room: columns x, y (m), theta (rad), [stamp]")
+    parser.add_argument(
+        "--sigma", type=finite(0, 1), default=0.0, metavar="M", help="range noise in a room (default: 0)"
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """``jaxsonar emulate``."""
+    from jaxsonar.hardware.device_emulator import emulate as emulate_device
+    from jaxsonar.hardware.fault_injection import Faults, parse_stall
+    from jaxsonar.hardware.transport_servers import listen
+    from jaxsonar.sensors.ring_toml import load_ring
+
+    stall, every = parse_stall(options.stall) if options.stall else (0.0, 10.0)
+    faults = Faults(
+        corrupt=options.corrupt,
+        drop=options.drop,
+        reorder=options.reorder,
+        stall=stall,
+        every=every,
+        seed=options.seed,
+    )
+    messages = _messages(options, load_ring(options.ring))
+    with listen(options.listen) as sink, stopped_by_signals() as stop:
+        print(f"listening on {sink.url}", flush=True)
+        done = emulate_device(messages, sink, speed=options.speed, faults=faults, stop=stop)
+    damage = "".join(
+        f", {count} {what}"
+        for count, what in (
+            (done.damaged, "damaged"),
+            (done.dropped, "dropped"),
+            (done.swapped, "swapped"),
+            (done.stalls, "stalls"),
+        )
+        if count
+    )
+    print_status(f"{done.messages} messages, {done.frames} frames, {done.sent_bytes} bytes{damage}")
+
+
+def _messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
+    if Path(options.log).suffix.lower() not in (".geojson", ".json"):
+        if options.path or options.sigma:
+            raise SonarError("--path or --sigma came with a log; allowed are they with a room (.geojson)")
+        from jaxsonar.live.replay import messages_of
+
+        return messages_of(options.log, ring)
+    if not options.path:
+        raise SonarError("a room came without --path; needed is the way through it, --path CSV")
+    from jaxsonar.floor_plans.room_geojson import load_room
+    from jaxsonar.simulation.device_messages import room_messages
+    from jaxsonar.simulation.poses_csv import load_path
+
+    poses, stamps = load_path(options.path)
+    return room_messages(ring, load_room(options.log), poses, stamps, sigma=options.sigma, seed=options.seed)

@@ -1,0 +1,195 @@
+"""``jaxsonar map``: a global line map from scans with known poses."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jaxsonar.kernels import HoughSettings
+
+from jaxsonar.cli.arguments import (
+    RING_HELP,
+    SETTINGS_HELP,
+    add_method,
+    figure_filename,
+    filename,
+    filename_ending_in,
+    finite,
+)
+from jaxsonar.cli.console import (
+    check_sigma_is_used,
+    count,
+    laser_files,
+    plain_name,
+    print_left_out,
+    print_status,
+    settings_beside,
+    with_progress,
+)
+
+SUMMARY = "The walls of the world, from a log of scans with poses."
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``jaxsonar map``."""
+    parser.add_argument("log", type=filename, metavar="LOG", help="scan log with poses, .csv or .parquet")
+    parser.add_argument("--ring", type=filename, required=True, help=RING_HELP)
+    add_method(parser)
+    parser.add_argument(
+        "--settings",
+        type=filename,
+        metavar="TOML",
+        help=SETTINGS_HELP,
+    )
+    parser.add_argument(
+        "--window",
+        type=finite(0.01, 100),
+        metavar="METRES",
+        help="gather the echoes of this much path into one local model, for rings of few sensors (try 1.5)",
+    )
+    parser.add_argument(
+        "--merging", choices=("fused", "paper"), default="fused", help="how segments become walls (default: fused)"
+    )
+    parser.add_argument(
+        "-o", "--output", type=filename, metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout"
+    )
+    parser.add_argument("--figure", type=figure_filename, metavar="FIG", help="draw the map, .svg, .png or .pdf")
+    parser.add_argument(
+        "--grid",
+        type=filename_ending_in(".yaml", ".yml"),
+        metavar="YAML",
+        help="occupancy grid for Nav2, with a .pgm beside",
+    )
+    parser.add_argument("--dxf", type=filename_ending_in(".dxf"), metavar="DXF", help="the walls for CAD (extra cad)")
+    parser.add_argument(
+        "--laser", type=filename, metavar="RECORDING", help="draw the laser points of a corridor8 recording below"
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """``jaxsonar map``."""
+    import numpy as np
+
+    from jaxsonar.detection.extract import local_models
+    from jaxsonar.detection.hough_detector import settings_for
+    from jaxsonar.detection.settings_toml import load_settings
+    from jaxsonar.fileio.atomic_files import check_outputs, shown, write_toml
+    from jaxsonar.hardware.errors import SonarError
+    from jaxsonar.mapping.build_map import CONFIRMED, assemble, check_poses, gather_evidence
+    from jaxsonar.mapping.map_geojson import save_map
+    from jaxsonar.scans.log_file import load_log
+    from jaxsonar.scans.sliding_windows import check_window
+    from jaxsonar.sensors.ring_toml import load_ring
+
+    beside = settings_beside(options.output)
+    if beside is not None and options.settings is not None and Path(options.settings).resolve() == beside.resolve():
+        beside = None  # the settings that were given are there already
+    check_outputs(
+        {
+            "-o": options.output,
+            "settings beside the map:": beside,
+            "--figure": options.figure,
+            "--grid": options.grid,
+            "--grid's image": options.grid and Path(options.grid).with_suffix(".pgm"),
+            "--dxf": options.dxf,
+        },
+        [options.log, options.ring, options.settings, *laser_files(options.laser)],
+    )
+    if options.laser is not None and not options.figure:
+        raise SonarError("--laser came alone; allowed is --laser with --figure, to which it belongs")
+    if options.dxf:
+        from jaxsonar.mapping.map_dxf import load_ezdxf
+
+        load_ezdxf(options.dxf)
+    check_window(options.window)
+    check_sigma_is_used(options.sigma, options.method, options.window)
+    ring, log = load_ring(options.ring), load_log(options.log)
+    given = None if options.settings is None else load_settings(options.settings)
+    settings = settings_for(ring, given, window=options.window)
+    left_out: list[int] = []
+    try:
+        check_poses(log)
+        models = local_models(
+            ring,
+            log,
+            method=options.method,
+            settings=settings,
+            sigma=options.sigma,
+            window=options.window,
+            on_left_out=left_out.append,
+        )
+    except SonarError as error:
+        raise SonarError(f"{shown(options.log)}: {error}") from None
+    points = None if options.laser is None else _laser_points(options.laser)
+    models = list(with_progress(models, len(log) if options.window is None else None, "local models"))
+    evidence = gather_evidence(ring, log, models)
+    world = assemble(evidence, merging=options.merging, confirmed=1 if options.window else CONFIRMED)
+
+    # Everything is made before anything is written.
+    grid = figure = None
+    if options.grid:
+        from jaxsonar.occupancy.nav2_map import check_grid
+        from jaxsonar.occupancy.occupancy_grid import occupancy
+
+        try:
+            grid = occupancy(ring, log, walls=world.segments)
+            check_grid(grid)
+        except SonarError as error:
+            raise SonarError(f"--grid {shown(options.grid)}: {error}") from None
+    if options.figure:
+        from jaxsonar.reports import plot_map as figures_map
+
+        placed = log.pose[np.all(np.isfinite(log.pose), axis=1)]
+        figure = figures_map.map_figure(
+            world,
+            aggregated=evidence.pieces.segments,
+            poses=placed,
+            laser_points=points,
+            title=f"{count(len(world), 'wall')} from {plain_name(options.log)}",
+        )
+    save_map(world, options.output)
+    if beside is not None:
+        write_toml(
+            _run_settings(
+                settings, method=options.method, sigma=options.sigma, window=options.window, merging=options.merging
+            ),
+            beside,
+        )
+    if grid is not None:
+        from jaxsonar.occupancy.nav2_map import save_nav2
+
+        save_nav2(grid, options.grid)
+    if options.dxf:
+        from jaxsonar.mapping.map_dxf import save_dxf
+
+        save_dxf(world, options.dxf)
+    if figure is not None:
+        from jaxsonar.reports import plot_style as figures
+
+        figures.save(figure, options.figure)
+    if left_out:
+        print_left_out(ring.name, left_out[0])
+    homeless = int((~np.all(np.isfinite(log.pose), axis=1)).sum())
+    without = f"; {count(homeless, 'scan')} without a pose left out" if homeless else ""
+    print_status(
+        f"{count(len(log), 'scan')}, {count(len(models), 'local model')}, "
+        f"{count(len(evidence.pieces), 'segment')}, {count(len(world), 'wall')}, {world.length.sum():.1f} m{without}"
+    )
+
+
+def _laser_points(recording: str) -> "np.ndarray":
+    from jaxsonar.evaluation.laser_map import laser_points
+    from jaxsonar.hardware.laser_datasets import read_corridor8_laser
+
+    return laser_points(read_corridor8_laser(recording), reach=5.0, every=4)
+
+
+def _run_settings(settings: "HoughSettings", **choices: object) -> dict[str, object]:
+    """Settings and what else a result was made with, as a table for TOML."""
+    from dataclasses import asdict
+
+    said: dict[str, object] = asdict(settings)
+    said["command"] = {key: value for key, value in choices.items() if value is not None}
+    return said

@@ -1,0 +1,99 @@
+"""``jaxsonar simulate``: the echoes of a ring along a trajectory through a floor plan."""
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+
+from jaxsonar.cli.arguments import RING_HELP, filename, finite, number, odometry_error
+from jaxsonar.cli.console import print_status, progress_bar, settings_beside
+
+SUMMARY = "The echoes that a ring hears along a path through a room."
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``jaxsonar simulate``."""
+    parser.add_argument("room", metavar="ROOM", help="room GeoJSON: walls, polygons, points of kind pole; metres")
+    parser.add_argument("--ring", required=True, help=RING_HELP)
+    parser.add_argument("--path", required=True, metavar="CSV", help="poses: columns x, y (m), theta (rad), [stamp]")
+    parser.add_argument("-o", "--output", metavar="LOG", required=True, help=".csv or .parquet; - = CSV on stdout")
+    parser.add_argument("--sigma", type=finite(0), default=0.0, metavar="M", help="range noise, metres (default: 0)")
+    parser.add_argument("--drift", type=finite(0), default=0.0, metavar="M", help="slow drift, metres (default: 0)")
+    parser.add_argument("--dropout", type=finite(0, 1), default=0.0, metavar="P", help="echoes lost (default: 0)")
+    parser.add_argument("--clutter", type=finite(0, 100), default=0.0, metavar="P", help="false echoes per real one")
+    parser.add_argument("--seed", type=number(int, 0, 2**32 - 1), default=0, help="of the noise (default: 0)")
+    parser.add_argument("--max-echoes", type=number(int, 1, 64), default=3, metavar="N", help="a path (default: 3)")
+    logged = parser.add_mutually_exclusive_group()
+    logged.add_argument(
+        "--odometry",
+        type=odometry_error,
+        metavar="PERCENT,DEG",
+        help="poses of the log drift as from wheels: %% of the way and deg after 1 m, growing with its root (try 2,1)",
+    )
+    logged.add_argument("--no-odometry", action="store_true", help="no poses in the log")
+    parser.add_argument("--truth", type=filename, metavar="TRAJ", help="the true poses, for evo: TUM; - = stdout")
+
+
+def run(options: argparse.Namespace) -> None:
+    """``jaxsonar simulate``."""
+    from jaxsonar.estimation.trajectory import Trajectory, save_trajectory
+    from jaxsonar.fileio.atomic_files import check_outputs, write_toml
+    from jaxsonar.floor_plans.room_geojson import load_room
+    from jaxsonar.hardware.errors import SonarError
+    from jaxsonar.scans.csv_log import csv_lines
+    from jaxsonar.scans.log_file import save_log
+    from jaxsonar.scans.scan_log import log_format
+    from jaxsonar.sensors.ring_toml import load_ring
+    from jaxsonar.simulation.poses_csv import load_path
+    from jaxsonar.simulation.simulator import simulate as simulate_scans
+
+    beside = settings_beside(options.output)
+    outputs = {"-o": options.output, "settings beside the log:": beside, "--truth": options.truth}
+    check_outputs(outputs, [options.room, options.ring, options.path])
+    if options.output == "-" and options.truth == "-":
+        raise SonarError("--truth -: the log goes to standard output, too; allowed are different places")
+    if options.output != "-":
+        log_format(options.output)  # complain before the work, not after it
+    ring, room = load_ring(options.ring), load_room(options.room)
+    poses, stamps = load_path(options.path)
+    with progress_bar("scans", len(poses)) as show:
+        simulation = simulate_scans(
+            ring,
+            room,
+            poses,
+            sigma=options.sigma,
+            drift=options.drift,
+            dropout=options.dropout,
+            clutter=options.clutter,
+            seed=options.seed,
+            max_echoes=options.max_echoes,
+            stamps=stamps,
+            progress=lambda done, _: show(done),
+        )
+    log = simulation.as_log(ring, _logged_poses(poses, options))
+    if options.output == "-":
+        sys.stdout.writelines(csv_lines(log))
+    else:
+        save_log(log, options.output)
+    if options.truth:
+        save_trajectory(Trajectory(stamps, poses), options.truth)
+    if beside:
+        said = {key: value for key, value in vars(options).items() if key not in ("command", "output", "truth")}
+        write_toml({key: value for key, value in said.items() if value is not None and value is not False}, beside)
+    print_status(f"{len(log)} scans, {len(log.range)} echoes")
+
+
+def _logged_poses(poses: "np.ndarray", options: argparse.Namespace) -> "np.ndarray":
+    """The poses that a simulated log has in it: the true ones, none, or those of odometry."""
+    import numpy as np
+
+    from jaxsonar.simulation.wheel_odometry import drifted
+
+    if options.no_odometry:
+        return np.full_like(poses, np.nan)
+    if options.odometry is None:
+        return poses
+    percent, degrees = options.odometry
+    return drifted(poses, distance=percent / 100, turn=float(np.radians(degrees)), seed=options.seed)
