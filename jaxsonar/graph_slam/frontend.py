@@ -13,14 +13,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.extract import LocalModel
-from jaxsonar.estimation.motion_model import moved, step_variance
-from jaxsonar.estimation.odometry_noise import Slip
-from jaxsonar.geometry.se2 import relative, transform_points, unit
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
+from jaxsonar.geometry.se2 import propagate, relative, transform_points, unit
 from jaxsonar.graph_slam.joint_compatibility import Features, Known, features_of, match
 from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
 from jaxsonar.loop_closure.submap import Submap
-from jaxsonar.scans.echo_batches import echoes_of, exact_paths
+from jaxsonar.scans.flat_echoes import corrected_echoes
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -115,27 +114,27 @@ def _nothing_known() -> Known:
     return Known(np.zeros(3), np.zeros(0, np.int32), none, none, none, np.zeros((3, 3)), np.zeros(0, np.int64))
 
 
-def advance(track: Track, odometry: Float[np.ndarray, "3"], slip: Slip) -> Track:
+def advance(track: Track, odometry: Float[np.ndarray, "3"], odometry_noise: OdometryNoise) -> Track:
     """The belief after the robot's motion from where the pose is; without odometry it is somewhere near."""
     here = np.isfinite(odometry).all()
     unknown = np.full(3, np.nan)
     step = relative(track.odometry, odometry) if here and track.odometry is not None else unknown
     first = track.odometry is None and not track.rows and not len(track.known)
-    variance = np.zeros(3) if first else step_variance(slip, step)
+    variance = np.zeros(3) if first else step_variance(odometry_noise, step)
     if not here:
         variance = variance * (1 + track.bridged)
-    pose, covariance = moved(track.known.pose, track.known.covariance, np.nan_to_num(step), variance)
+    pose, covariance = propagate(track.known.pose, track.known.covariance, np.nan_to_num(step), np.diag(variance))
     known = replace(track.known, pose=pose, covariance=covariance)
     return replace(track, known=known, odometry=odometry if here else None, bridged=0)
 
 
-def aside(ring: Ring, track: Track, scan: Scan, model: LocalModel, slip: Slip, *, row: int, **given: Any) -> Track:
+def aside(ring: Ring, track: Track, scan: Scan, model: LocalModel, odometry_noise: OdometryNoise, *, row: int, **given: Any) -> Track:
     """Look at a scan that has no odometry, between others that do: its pose is told, nothing else hangs on it.
 
     What the odometry of the next scan leads on from is the pose before; if this scan moved it, its motion would count
     twice. Arguments as for ``advance`` and ``update``.
     """
-    seen = update(ring, advance(track, np.full(3, np.nan), slip), scan, model, row=row, grow=False, **given)
+    seen = update(ring, advance(track, np.full(3, np.nan), odometry_noise), scan, model, row=row, grow=False, **given)
     return replace(track, rows=seen.rows, poses=seen.poses, covs=seen.covs, bridged=track.bridged + 1)
 
 
@@ -167,7 +166,7 @@ def update(
     noise = track.sigma if sigma is None else sigma
     echoes = _Echoes.of(ring, scan, path_pose)
     seen = features_of(model)
-    full = float(np.asarray(exact_paths(ring).width).sum() / (2 * np.pi))
+    full = float(np.asarray(ring.exact_paths.width).sum() / (2 * np.pi))
     with jax.enable_x64(True):
         # Where the robot is by what it knows again; then, with that, what is new and what else was heard.
         first = match(track.known, seen, full=full)
@@ -239,7 +238,7 @@ def _silent(ring: Ring, known: Known, scan: Scan, path_pose: Float[np.ndarray, "
     """
     room = next_power_of_two(len(known), least=_ROOM)
     direct = np.flatnonzero(ring.paths[:, 0] == ring.paths[:, 1])
-    paths = jax.tree.map(lambda leaf: leaf[direct], exact_paths(ring))
+    paths = jax.tree.map(lambda leaf: leaf[direct], ring.exact_paths)
     if path_pose is not None:
         paths = _moved(paths, path_pose[direct])
     first = np.full(len(ring.paths), np.inf)
@@ -270,9 +269,9 @@ class _Echoes:
 
     @classmethod
     def of(cls, ring: Ring, scan: Scan, path_pose: Float[np.ndarray, "paths 3"] | None) -> "_Echoes":
-        row, reach = echoes_of(ring, scan)
+        row, reach = corrected_echoes(ring, scan)
         room = next_power_of_two(len(row), least=_ECHOES)
-        paths = exact_paths(ring)
+        paths = ring.exact_paths
         padded = pad_rows(row, room)
         own = jax.tree.map(lambda leaf: leaf[padded], paths)
         if path_pose is not None:
@@ -334,11 +333,11 @@ class _Echoes:
 
 
 def _moved(paths: kernels.EchoPaths, pose: Float[np.ndarray, "echoes 3"]) -> kernels.EchoPaths:
-    moved_paths = jax.vmap(kernels.moved_path)(paths, jnp.asarray(pose))
+    moved_paths = jax.vmap(kernels.transform_path)(paths, jnp.asarray(pose))
     return jax.tree.map(np.asarray, moved_paths)
 
 
-def scene_of(seen: Features, pose: Float[np.ndarray, "3"]) -> kernels.Scene:
+def scene_of(seen: Features, pose: Float[np.ndarray, "3"]) -> kernels.Landmarks:
     """What a scan sees as reflectors of the frame that its pose is of; walls are anchored in their middle."""
     segment = transform_points(pose, seen.segment)
     middle, half = segment.mean(axis=1), np.linalg.norm(segment[:, 1] - segment[:, 0], axis=-1) / 2
@@ -346,18 +345,18 @@ def scene_of(seen: Features, pose: Float[np.ndarray, "3"]) -> kernels.Scene:
     normal = unit(theta)
     distance = seen.place[:, 0] + normal @ pose[:2] - (normal * middle).sum(-1)
     wall = (seen.kind == kernels.PLANE)[:, None]
-    return kernels.Scene(
+    return kernels.Landmarks(
         kind=seen.kind,
         parameters=np.where(wall, np.stack([distance, theta], -1), 0.0),
         anchor=np.where(wall, middle, transform_points(pose, seen.place)),
-        ends=np.where(wall, half[:, None] * [-1.0, 1.0], 0.0),
+        extent=np.where(wall, half[:, None] * [-1.0, 1.0], 0.0),
     )
 
 
-def _in_room(scene: kernels.Scene, room: int) -> kernels.Scene:
+def _in_room(scene: kernels.Landmarks, room: int) -> kernels.Landmarks:
     """With room for so many reflectors."""
-    rest = (pad_rows(np.asarray(leaf), room) for leaf in (scene.parameters, scene.anchor, scene.ends))
-    return kernels.Scene(pad_rows(np.asarray(scene.kind), room, fill=-1), *rest)
+    rest = (pad_rows(np.asarray(leaf), room) for leaf in (scene.parameters, scene.anchor, scene.extent))
+    return kernels.Landmarks(pad_rows(np.asarray(scene.kind), room, fill=-1), *rest)
 
 
 def _with_new(known: Known, new: Features, pose: Float[np.ndarray, "3"]) -> Known:
@@ -376,7 +375,7 @@ def _with_new(known: Known, new: Features, pose: Float[np.ndarray, "3"]) -> Know
         kind=np.concatenate([known.kind, scene.kind]).astype(np.int32),
         parameters=np.concatenate([known.parameters, scene.parameters]),
         anchor=np.concatenate([known.anchor, scene.anchor]),
-        ends=np.concatenate([known.ends, scene.ends]),
+        ends=np.concatenate([known.ends, scene.extent]),
         covariance=covariance,
         scans=np.concatenate([known.scans, np.zeros(count, np.int64)]),
     )

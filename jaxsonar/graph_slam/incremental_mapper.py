@@ -8,21 +8,20 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar import kernels
-from jaxsonar.detection.extract import LocalModel, check_method, local_model, models_of
-from jaxsonar.detection.hough_detector import settings_for
-from jaxsonar.detection.ml_detector import check_sigma
-from jaxsonar.estimation.odometry_noise import Slip
-from jaxsonar.geometry.se2 import to_world
+from jaxsonar.detection.extract import local_model
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_map_builder import hough_models
+from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
+from jaxsonar.estimation.odometry_noise import OdometryNoise
+from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.graph_slam.slam import Tracker
 from jaxsonar.graph_slam.submap_evidence import Journey
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.mapping import point_landmarks as points
-from jaxsonar.mapping import wall_segments as pieces
-from jaxsonar.mapping.build_map import CONFIRMED, Evidence, assemble, check_merging, gather_evidence
-from jaxsonar.mapping.free_space import SeenThrough
+from jaxsonar.mapping.build_map import assemble_map, check_merging, required_scans
 from jaxsonar.mapping.global_map import GlobalMap
+from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
 from jaxsonar.scans.scan_log import Log, Scan
-from jaxsonar.scans.sliding_windows import Stretch, check_window
+from jaxsonar.scans.sliding_windows import WindowBuffer, check_window
 from jaxsonar.sensors.ring import Ring
 
 
@@ -30,9 +29,9 @@ from jaxsonar.sensors.ring import Ring
 class MapState:
     """What a robot remembers between two scans; grows with the walls and the floor, not with the scans."""
 
-    evidence: Evidence
+    evidence: MapEvidence
     """What all scans so far say of the walls."""
-    stretch: Stretch
+    window_buffer: WindowBuffer
     """The path of the window that is being gathered; empty without windows."""
     waiting: tuple[Scan, ...]
     """Scans of that window that are not in the evidence yet."""
@@ -79,7 +78,7 @@ class Mapper:
     window: float | None = None
     """Metres of path gathered into one local model; None: every scan is one."""
     merging: str = "fused"
-    slip: Slip | None = None
+    odometry_noise: OdometryNoise | None = None
     """How wrong the poses of the scans are, as odometry; None: they are right."""
 
     def __post_init__(self):
@@ -87,16 +86,14 @@ class Mapper:
         check_sigma(self.sigma)
         check_merging(self.merging)
         check_window(self.window)
-        if self.slip is not None and (self.window is not None or self.merging == "paper"):
+        if self.odometry_noise is not None and (self.window is not None or self.merging == "paper"):
             raise SonarError("mapper: slip came with a window or the paper's merging; allowed is either")
-        object.__setattr__(self, "settings", settings_for(self.ring, self.settings, window=self.window))
+        object.__setattr__(self, "settings", hough_settings(self.ring, self.settings, window=self.window))
 
     def start(self) -> MapState:
         """A state that knows nothing."""
-        nowhere = np.zeros((0, 3))
-        walls, corners = pieces.aggregate([], nowhere), points.aggregate([], nowhere)
-        nothing = Evidence(walls, corners, SeenThrough(), np.zeros((0, 2), np.int64), 0)
-        return MapState(nothing, Stretch(), (), None if self._tracker is None else Journey(self._tracker.start()))
+        nothing = MapEvidence.empty()
+        return MapState(nothing, WindowBuffer(), (), None if self._tracker is None else Journey(self._tracker.start()))
 
     def step(
         self,
@@ -119,7 +116,7 @@ class Mapper:
         """
         if state.journey is not None and self._tracker is not None:
             journey, step = state.journey.after(self._tracker, scan, model=model, path_pose=path_pose)
-            segments = [to_world(step.pose, line.segment) for line in step.model.lines]
+            segments = [transform_points(step.pose, line.segment) for line in step.model.lines]
             info = StepInfo(step.model, np.array(segments).reshape(-1, 2, 2), "", step.pose, step.covariance)
             return replace(state, journey=journey), info
         if self.window is None:
@@ -131,10 +128,10 @@ class Mapper:
             return self._with(state, model, Log.from_scans([scan]))
         if not np.isfinite(scan.pose).all():
             state, info = self._closed(state)
-            stretch, _ = state.stretch.including(scan, length=self.window)
-            return replace(state, stretch=stretch), replace(info, ignored="no pose")
-        stretch, ends = state.stretch.including(scan, length=self.window)
-        state = replace(state, stretch=stretch, waiting=(*state.waiting, scan))
+            window_buffer, _ = state.window_buffer.add(scan, length=self.window)
+            return replace(state, window_buffer=window_buffer), replace(info, ignored="no pose")
+        window_buffer, ends = state.window_buffer.add(scan, length=self.window)
+        state = replace(state, window_buffer=window_buffer, waiting=(*state.waiting, scan))
         return self._closed(state) if ends else (state, _nothing(""))
 
     def including(self, state: MapState, scans: Sequence[Scan], models: Sequence[LocalModel]) -> MapState:
@@ -161,7 +158,7 @@ class Mapper:
     def map(self, state: MapState) -> GlobalMap:
         """The map so far."""
         evidence = state.evidence if state.journey is None else state.journey.evidence(self.ring) or state.evidence
-        return assemble(evidence, merging=self.merging, confirmed=1 if self.window else CONFIRMED)
+        return assemble_map(evidence, merging=self.merging, min_scans=required_scans(self.window))
 
     def trajectory(self, state: MapState) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:
         """Where poses are estimated: those of all scans so far, and their covariances with respect to the first one."""
@@ -171,25 +168,31 @@ class Mapper:
 
     @cached_property
     def _tracker(self) -> Tracker | None:
-        if self.slip is None:
+        if self.odometry_noise is None:
             return None
-        return Tracker(ring=self.ring, method=self.method, settings=self.settings, sigma=self.sigma, slip=self.slip)
+        return Tracker(
+            ring=self.ring,
+            method=self.method,
+            settings=self.settings,
+            sigma=self.sigma,
+            odometry_noise=self.odometry_noise,
+        )
 
     def _closed(self, state: MapState) -> tuple[MapState, StepInfo]:
         """The window ends here."""
         if self.window is None or not state.waiting:
             return state, _nothing("")
         assert self.settings is not None
-        log, windows = state.stretch.window(self.ring, length=self.window)
-        model = next(models_of(self.ring, log, windows, self.settings))
+        log, windows = state.window_buffer.window(self.ring, length=self.window)
+        model = next(hough_models(self.ring, log, windows, self.settings))
         return self._with(replace(state, waiting=()), model, Log.from_scans(state.waiting))
 
     def _with(self, state: MapState, model: LocalModel, log: Log) -> tuple[MapState, StepInfo]:
         new = gather_evidence(self.ring, log, [model])
-        return self._joined(state, new), StepInfo(model, new.pieces.segments, "")
+        return self._joined(state, new), StepInfo(model, new.segments.endpoints, "")
 
-    def _joined(self, state: MapState, new: Evidence) -> MapState:
-        evidence = state.evidence.joined(new)
+    def _joined(self, state: MapState, new: MapEvidence) -> MapState:
+        evidence = state.evidence.union(new)
         if self.merging != "paper":
             evidence = evidence.condensed()
         return replace(state, evidence=evidence)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 from jaxsonar import kernels
-from jaxsonar.detection.extract import LocalModel
+from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.geometry.se2 import unit, wrap_angle
 
 NO_COV = np.diag([0.01, np.radians(3.0)]) ** 2
@@ -83,9 +83,9 @@ class Known:
         return len(self.kind)
 
     @property
-    def scene(self) -> kernels.Scene:
+    def scene(self) -> kernels.Landmarks:
         """The reflectors alone."""
-        return kernels.Scene(self.kind, self.parameters, self.anchor, self.ends)
+        return kernels.Landmarks(self.kind, self.parameters, self.anchor, self.ends)
 
 
 class Matches(NamedTuple):

@@ -14,21 +14,21 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar import kernels
-from jaxsonar.detection.extract import LocalModel, check_method, local_model, local_models
-from jaxsonar.detection.hough_detector import settings_for
-from jaxsonar.detection.ml_detector import check_sigma
-from jaxsonar.estimation.motion_model import placed
-from jaxsonar.estimation.odometry_noise import Slip
+from jaxsonar.detection.extract import local_model, local_models
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
+from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.trajectory import Trajectory, stamps_of
-from jaxsonar.geometry.se2 import composed, relative, rotation, wrap_angle
+from jaxsonar.geometry.se2 import compose, compose_with_covariance, relative, rotate_covariance, wrap_angle
 from jaxsonar.graph_slam.frontend import BRIDGED, LOST, Track, advance, aside, begin, finished, update
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.loop_closure.submap_graph import SubmapGraph
 from jaxsonar.loop_closure.verification import ACCEPTED, Decision
-from jaxsonar.mapping.build_map import assemble, build_map, gather_evidence
+from jaxsonar.mapping.build_map import assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.registration.agglomerative import place_ranges
-from jaxsonar.registration.sequential import place_parts
+from jaxsonar.mapping.map_evidence import gather_evidence
+from jaxsonar.registration.agglomerative import register_by_ranges
+from jaxsonar.registration.sequential import register_scans
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.scans.sliding_windows import check_window
 from jaxsonar.sensors.ring import Ring
@@ -90,13 +90,13 @@ class Tracker:
     settings: kernels.HoughSettings | None = None
     sigma: float | None = None
     """Standard deviation of the ranges, metres; None: learned on the way."""
-    slip: Slip = field(default_factory=Slip)
+    odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
     """How wrong the odometry is."""
 
     def __post_init__(self):
         check_method(self.method)
         check_sigma(self.sigma)
-        object.__setattr__(self, "settings", settings_for(self.ring, self.settings))
+        object.__setattr__(self, "settings", hough_settings(self.ring, self.settings))
 
     def start(self) -> TrackerState:
         """A state that knows nothing."""
@@ -129,9 +129,9 @@ class Tracker:
         track, graph, decisions = state.track, state.graph, ()
         gap = track.odometry is not None and track.bridged < BRIDGED and not np.isfinite(scan.pose).all()
         if gap:
-            track = aside(self.ring, track, scan, model, self.slip, row=row, **given)
+            track = aside(self.ring, track, scan, model, self.odometry_noise, row=row, **given)
         else:
-            track = update(self.ring, advance(track, scan.pose, self.slip), scan, model, row=row, **given)
+            track = update(self.ring, advance(track, scan.pose, self.odometry_noise), scan, model, row=row, **given)
         lost = not gap and track.strange >= LOST
         if (track.ends and not gap) or lost:
             graph = graph.copy()
@@ -164,13 +164,17 @@ class Tracker:
         parts.append((np.array(track.rows, dtype=np.int64), np.array(track.poses), np.array(track.covs)))
         for number, (rows, own, own_cov) in enumerate(parts):
             for k, row in enumerate(rows.tolist()):
-                pose[row], cov[row] = placed(state.graph.poses[number], base_cov[number], own[k], own_cov[k])
+                pose[row], cov[row] = compose_with_covariance(
+                    state.graph.poses[number], base_cov[number], own[k], own_cov[k]
+                )
         return _from_start(state.start, pose, cov)
 
     def _here(self, state: TrackerState) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
         number = len(state.graph.submaps)
         base_cov = state.graph.last_covariance
-        pose, cov = placed(state.graph.poses[number], base_cov, state.track.poses[-1], state.track.covs[-1])
+        pose, cov = compose_with_covariance(
+            state.graph.poses[number], base_cov, state.track.poses[-1], state.track.covs[-1]
+        )
         return _from_start(state.start, pose, cov)
 
 
@@ -178,9 +182,7 @@ def _from_start(
     start: Float[np.ndarray, "3"], pose: Float[np.ndarray, "*scans 3"], cov: Float[np.ndarray, "*scans 3 3"]
 ) -> tuple[Float[np.ndarray, "*scans 3"], Float[np.ndarray, "*scans 3 3"]]:
     """Poses of the first scan's frame and their covariances in the world."""
-    turn = np.eye(3)
-    turn[:2, :2] = rotation(start[2])
-    return composed(start, pose), turn @ cov @ turn.T
+    return compose(start, pose), rotate_covariance(start[2], cov)
 
 
 class Tie(NamedTuple):
@@ -237,7 +239,7 @@ def slam(
     *,
     sigma: float | None = None,
     window: float | None = None,
-    slip: Slip | None = None,
+    odometry_noise: OdometryNoise | None = None,
     smooth: bool | None = None,
     speed: bool = False,
     scale: bool = False,
@@ -271,7 +273,7 @@ def slam(
     check_sigma(sigma)
     check_window(window)
     say = progress or (lambda text, done, total: None)
-    slip = slip or Slip()
+    odometry_noise = odometry_noise or OdometryNoise()
     if not len(log):
         raise SonarError("slam: no scan in the log; allowed is a log with one or more")
     here = np.asarray(np.isfinite(log.pose).all(axis=1))
@@ -298,7 +300,7 @@ def slam(
             )
         start, covariance = odometry, np.full((len(log), 3, 3), np.nan)
     elif measured:
-        start, covariance, ties, took, models, passages = _tracked(ring, log, sigma, slip, live, say)
+        start, covariance, ties, took, models, passages = _tracked(ring, log, sigma, odometry_noise, live, say)
     else:
         models = _models(ring, log, sigma, say)
         start, covariance = _without_odometry(ring, log, models, sigma, say)
@@ -312,7 +314,14 @@ def slam(
             # Nothing leads to scans without odometry: they are laid on the map of the others, or left out.
             led = here | (np.arange(len(log)) == 0)  # all others are seen from the first one
             start = np.where(led[:, None], start, np.nan)
-        choices = {"odometry": given, "sigma": sigma, "window": window, "speed": speed, "scale": scale, "slip": slip}
+        choices = {
+            "odometry": given,
+            "sigma": sigma,
+            "window": window,
+            "speed": speed,
+            "scale": scale,
+            "slip": odometry_noise,
+        }
         found = smoothing(
             ring, log, start, **choices, models=models, passages=passages, progress=lambda text: say(text, 0, 0)
         )
@@ -324,7 +333,7 @@ def slam(
         return Slam(found.poses, found.pose_cov, stamps_of(log), found.world, log.pose, ties, took, found)
     say("building the map", 0, 0)
     at = replace(log, pose=start)
-    world = build_map(ring, at, window=window) if models is None else assemble(gather_evidence(ring, at, models))
+    world = build_map(ring, at, window=window) if models is None else assemble_map(gather_evidence(ring, at, models))
     return Slam(start, covariance, stamps_of(log), world, log.pose, ties, took, None)
 
 
@@ -337,9 +346,9 @@ def _without_odometry(
         say("placing", done, total)
 
     if len(log) <= MOST_PLACED:
-        part = place_ranges(ring, log, models, sigma=sigma, progress=told)[0]
-        return part.poses, part.pose_cov
-    return place_parts(models, None, blur=BLUR, progress=told)[0], np.full((len(log), 3, 3), np.nan)
+        part = register_by_ranges(ring, log, models, sigma=sigma, progress=told)[0]
+        return part.poses, part.pose_covariance
+    return register_scans(models, None, noise_scale=BLUR, progress=told)[0], np.full((len(log), 3, 3), np.nan)
 
 
 def _models(ring: Ring, log: Log, sigma: float | None, say: Callable[[str, int, int], None]) -> list[LocalModel]:
@@ -352,7 +361,12 @@ def _models(ring: Ring, log: Log, sigma: float | None, say: Callable[[str, int, 
 
 
 def _tracked(
-    ring: Ring, log: Log, sigma: float | None, slip: Slip, live: bool, say: Callable[[str, int, int], None]
+    ring: Ring,
+    log: Log,
+    sigma: float | None,
+    odometry_noise: OdometryNoise,
+    live: bool,
+    say: Callable[[str, int, int], None],
 ) -> tuple[
     Float[np.ndarray, "scans 3"],
     Float[np.ndarray, "scans 3 3"],
@@ -362,7 +376,7 @@ def _tracked(
     Passages | None,
 ]:
     """Poses, covariances, closures, milliseconds of each step, the local models, and what is known to each other."""
-    tracker = Tracker(ring=ring, sigma=sigma, slip=slip)
+    tracker = Tracker(ring=ring, sigma=sigma, odometry_noise=odometry_noise)
     state, took = tracker.start(), np.zeros(len(log))
     models = [] if live else _models(ring, log, sigma, say)
     for row in range(len(log)):
@@ -385,7 +399,7 @@ def passages_of(state: TrackerState) -> Passages | None:
     for number, one in enumerate(state.graph.submaps):
         part[one.rows] = number
     part = np.maximum(np.maximum.accumulate(part), 0)
-    return Passages(part, composed(state.start, state.graph.poses[nodes]), state.graph.graph.between(nodes))
+    return Passages(part, compose(state.start, state.graph.poses[nodes]), state.graph.graph.between(nodes))
 
 
 def ties_of(graph: SubmapGraph) -> tuple[Tie, ...]:

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxsonar.detection.extract import LocalModel
-from jaxsonar.geometry.se2 import composed, wrap_angle
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.geometry.se2 import compose, wrap_angle
 from jaxsonar.graph_slam.slam import Step, Tracker, TrackerState
-from jaxsonar.mapping.build_map import Evidence, gather_evidence
+from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -26,7 +26,7 @@ class Journey:
     tracked: TrackerState
     parts: tuple[Part, ...] = ((),)
     """The last one is of the submap that is being made."""
-    seen: dict[int, tuple[Float[np.ndarray, "3"], int, Evidence]] = field(default_factory=dict)
+    seen: dict[int, tuple[Float[np.ndarray, "3"], int, MapEvidence]] = field(default_factory=dict)
     """What submaps amounted to when they were last looked at: their pose and number of scans then; only a memory."""
 
     def after(self, tracker: Tracker, scan: Scan, **given) -> tuple["Journey", Step]:
@@ -37,25 +37,25 @@ class Journey:
             parts = (*parts, ())
         return Journey(tracked, parts, self.seen), step
 
-    def evidence(self, ring: Ring) -> Evidence | None:
+    def evidence(self, ring: Ring) -> MapEvidence | None:
         """What all scans say of the walls, from where they were taken as far as that is known now; None without any."""
         whole = None
         for number, part in enumerate(self.parts):
             if not part:
                 continue
-            base = composed(self.tracked.start, self.tracked.graph.poses[number])
+            base = compose(self.tracked.start, self.tracked.graph.poses[number])
             known = self.seen.get(number)
             if known is None or known[1] != len(part) or _apart(base, known[0]):
                 known = (base, len(part), self._of(ring, number, base))
                 self.seen[number] = known
-            whole = known[2] if whole is None else whole.joined(known[2])
+            whole = known[2] if whole is None else whole.union(known[2])
         return whole
 
-    def _of(self, ring: Ring, number: int, base: Float[np.ndarray, "3"]) -> Evidence:
+    def _of(self, ring: Ring, number: int, base: Float[np.ndarray, "3"]) -> MapEvidence:
         submaps, part = self.tracked.graph.submaps, self.parts[number]
         poses = submaps[number].poses if number < len(submaps) else np.array(self.tracked.track.poses)
         # A submap begins with the scan that the one before ends with.
-        world = composed(base, poses[-len(part) :])
+        world = compose(base, poses[-len(part) :])
         scans = [replace(scan, pose=pose) for (scan, _), pose in zip(part, world, strict=True)]
         return gather_evidence(ring, Log.from_scans(scans), [model for _, model in part])
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from jaxsonar import Ring, Room, kernels, local_model, simulate
-from jaxsonar.estimation.motion_model import moved, placed, step_variance
-from jaxsonar.estimation.odometry_noise import Slip
-from jaxsonar.geometry.se2 import composed, rotation, unit, wrap_angle
+from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
+from jaxsonar.geometry.se2 import rotation, unit, wrap_angle
 from jaxsonar.graph_slam.frontend import Track, begin, finished, update
 from jaxsonar.graph_slam.joint_compatibility import Features, Known, match, seen_from
 from jaxsonar.simulation.office import load_office
@@ -64,7 +63,7 @@ def paths_of(path):
 
 
 def scene_of(parameters, kinds=KINDS, anchors=ANCHORS):
-    return kernels.Scene(kinds, parameters, anchors, np.tile([-1.0, 1.0], (len(kinds), 1)))
+    return kernels.Landmarks(kinds, parameters, anchors, np.tile([-1.0, 1.0], (len(kinds), 1)))
 
 
 @pytest.fixture
@@ -177,7 +176,7 @@ def test_ranges_are_those_that_the_simulator_hears():
     away = (unit(theta) * (middle - pose[:2])).sum(-1) > 0
     theta = wrap_angle(np.where(away, theta, theta + np.pi))
     count = len(middle)
-    scene = kernels.Scene(
+    scene = kernels.Landmarks(
         np.full(count, PLANE, np.int32),
         np.stack([np.zeros(count), theta], -1),
         middle,
@@ -196,42 +195,9 @@ def slopes(function, at):
     return np.stack([(function(at + w) - function(at - w)) / 2e-6 for w in 1e-6 * np.eye(len(at))], -1)
 
 
-def test_motion_spreads_as_its_slopes_say(rng):
-    pose, step, variance = np.array([0.4, -0.2, 0.7]), np.array([0.3, 0.05, 0.2]), np.array([4e-4, 1e-4, 9e-4])
-    root = rng.standard_normal((5, 5))
-    covariance = root @ root.T * 1e-3
-    after, found = moved(pose, covariance, step, variance)
-    np.testing.assert_allclose(after, composed(pose, step), atol=1e-12)
-    by_all = np.eye(5)
-    by_all[:3, :3] = slopes(lambda p: composed(p, step), pose)
-    by_step = slopes(lambda s: composed(pose, s), step)
-    wanted = by_all @ covariance @ by_all.T
-    wanted[:3, :3] += by_step @ np.diag(variance) @ by_step.T
-    np.testing.assert_allclose(found, wanted, atol=1e-9)
-
-
-def test_a_pose_of_a_frame_spreads_as_both(rng):
-    base, pose = np.array([1.0, 2.0, 2.8]), np.array([0.5, -0.4, 1.1])
-    a, b = (root @ root.T * 1e-4 for root in rng.standard_normal((2, 3, 3)))
-    world, found = placed(base, a, pose, b)
-    np.testing.assert_allclose(world, composed(base, pose), atol=1e-12)
-    samples = np.array(
-        [
-            composed(one, other)
-            for one, other in zip(
-                rng.multivariate_normal(base, a, 20_000), rng.multivariate_normal(pose, b, 20_000), strict=True
-            )
-        ]
-    )
-    off = samples - world
-    off[:, 2] = wrap_angle(off[:, 2])
-    sd = np.sqrt(np.diag(found))
-    np.testing.assert_allclose(np.cov(off.T) / np.outer(sd, sd), found / np.outer(sd, sd), atol=0.05)
-
-
 def test_motion_that_nobody_measured_may_be_any():
-    unknown = step_variance(Slip(), np.full(3, np.nan))
-    assert (unknown > 50 * step_variance(Slip(), np.array([0.15, 0.0, 0.1]))).all()
+    unknown = step_variance(OdometryNoise(), np.full(3, np.nan))
+    assert (unknown > 50 * step_variance(OdometryNoise(), np.array([0.15, 0.0, 0.1]))).all()
 
 
 # Who is whom

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from jaxsonar import Log, Ring, Room, SonarError, load_ring, local_model, simulate
-from jaxsonar.geometry.se2 import to_world
+from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.graph_slam.incremental_mapper import Mapper, MapState
-from jaxsonar.mapping.build_map import SCANS_KEPT, build_map
+from jaxsonar.mapping.build_map import build_map
 from jaxsonar.mapping.global_map import GlobalMap
+from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.simulation.office import load_office
 
 RING = Ring.circular()
@@ -75,7 +76,7 @@ def test_scan_by_scan_is_all_at_once(office, order, merging):
     state, infos = driven(mapper, [log[int(row)] for row in rows[order]])
     assert_same_map(mapper.map(state), build_map(RING, log, merging=merging), atol=1e-9 if merging == "fused" else 1e-5)
     assert [info.ignored for info in infos] == [""] * 17
-    assert max(map(len, mapper.map(state).scans)) <= SCANS_KEPT
+    assert max(map(len, mapper.map(state).scans)) <= SETTINGS.evidence.listed_scans
 
 
 def test_every_map_on_the_way_is_that_of_the_scans_so_far(office):
@@ -110,7 +111,7 @@ def test_a_step_tells_what_the_scan_came_to(office):
         assert info.model is not None
         assert [line.rho for line in info.model.lines] == [line.rho for line in wanted.lines]
         assert info.model.scan == scan.scan
-        world = np.array([to_world(scan.pose, line.segment) for line in wanted.lines]).reshape(-1, 2, 2)
+        world = np.array([transform_points(scan.pose, line.segment) for line in wanted.lines]).reshape(-1, 2, 2)
         np.testing.assert_allclose(np.sort(info.segments, axis=1), np.sort(world, axis=1), atol=1e-3)
 
 
@@ -136,7 +137,7 @@ def test_scans_that_heard_nothing_or_everything_at_once_are_taken_in():
     state, info = mapper.step(mapper.start(), silent)
     assert info.ignored == ""
     assert info.segments.shape == (0, 2, 2)
-    assert state.evidence.seen.tiles
+    assert state.evidence.free_space.tiles
     state, info = mapper.step(state, shut_in)
     assert isinstance(mapper.map(state), GlobalMap)
     assert state.evidence.models == 2
@@ -219,13 +220,13 @@ def test_driving_the_same_round_again_needs_no_more_memory():
         for scan in a_round(number):
             state, _ = mapper.step(state, scan)
         sizes[number + 1] = size_of(state)
-        pieces[number + 1] = len(state.evidence.pieces)
-        tiles[number + 1] = len(state.evidence.seen.tiles)
+        pieces[number + 1] = len(state.evidence.segments)
+        tiles[number + 1] = len(state.evidence.free_space.tiles)
     assert tiles[10] == tiles[1]
     assert sizes[10] < 1.5 * sizes[3]
     assert pieces[10] < 2.5 * pieces[3]
-    assert size_of(state) - size_of(state.evidence.seen) < 1_000_000
-    assert np.bincount(state.evidence.pieces.scans[0]).max() <= SCANS_KEPT
+    assert size_of(state) - size_of(state.evidence.free_space) < 1_000_000
+    assert np.bincount(state.evidence.segments.scans[0]).max() <= SETTINGS.evidence.listed_scans
     assert state.evidence.models == 100
     world = mapper.map(state)
     assert isinstance(state, MapState)

@@ -9,7 +9,7 @@ from support.slam_scene import COUNT, RING, ROOM, SIGMA, SLIP, log, truth
 
 from jaxsonar import SonarError, local_models, simulate
 from jaxsonar.estimation.trajectory import Trajectory, errors
-from jaxsonar.geometry.se2 import composed, relative
+from jaxsonar.geometry.se2 import compose, relative
 from jaxsonar.graph_slam.incremental_mapper import Mapper
 from jaxsonar.graph_slam.slam import Slam, Tracker, slam
 from jaxsonar.mapping.build_map import build_map
@@ -23,7 +23,7 @@ def models():
 
 @cache
 def tracked():
-    tracker = Tracker(ring=RING, slip=SLIP)
+    tracker = Tracker(ring=RING, odometry_noise=SLIP)
     state, steps = tracker.start(), []
     for scan, model in zip(log(), models(), strict=True):
         state, step = tracker.step(state, scan, model=model)
@@ -44,7 +44,7 @@ def assert_near(found, *, share):
 def test_scan_by_scan_is_the_log_without_smoothing_and_much_better_than_odometry():
     tracker, state, _ = tracked()
     poses, covariance = tracker.poses(tracker.finish(state))
-    found = slam(RING, log(), slip=SLIP, smooth=False)
+    found = slam(RING, log(), odometry_noise=SLIP, smooth=False)
     np.testing.assert_allclose(found.poses, poses, atol=1e-9)
     np.testing.assert_allclose(found.covariance, covariance, atol=1e-9)
     assert isinstance(found, Slam)
@@ -141,9 +141,9 @@ def test_what_odometry_can_not_do_is_refused_before_the_work(pose, choices, said
 
 def test_a_robot_that_was_carried_begins_anew():
     """Odometry knows nothing of it: another submap, and no pose that is sure of the wrong place."""
-    there = composed(np.array([1.5, 0.6, 2.0]), np.array([relative(truth()[0], one) for one in truth()[:8]]))
+    there = compose(np.array([1.5, 0.6, 2.0]), np.array([relative(truth()[0], one) for one in truth()[:8]]))
     poses = np.concatenate([truth()[:8], there])
-    odometry = np.concatenate([truth()[:8], composed(truth()[7], np.array([relative(there[0], one) for one in there]))])
+    odometry = np.concatenate([truth()[:8], compose(truth()[7], np.array([relative(there[0], one) for one in there]))])
     heard = simulate(RING, ROOM, poses, sigma=SIGMA, seed=3).as_log(RING, odometry)
     tracker = Tracker(ring=RING, sigma=SIGMA)
     state, steps = tracker.start(), []
@@ -158,7 +158,7 @@ def test_a_robot_that_was_carried_begins_anew():
 
 
 def test_a_mapper_estimates_poses_and_draws_its_map_there():
-    mapper = Mapper(ring=RING, slip=SLIP)
+    mapper = Mapper(ring=RING, odometry_noise=SLIP)
     state, infos = mapper.start(), []
     for scan, model in zip(log()[:20], models(), strict=False):
         state, info = mapper.step(state, scan, model=model)
@@ -175,7 +175,7 @@ def test_a_mapper_estimates_poses_and_draws_its_map_there():
     with pytest.raises(SonarError, match="slip"):
         Mapper(ring=RING).trajectory(Mapper(ring=RING).start())
     with pytest.raises(SonarError, match="slip"):
-        Mapper(ring=RING, slip=SLIP, window=1.0)
+        Mapper(ring=RING, odometry_noise=SLIP, window=1.0)
 
 
 def test_bad_calls():
