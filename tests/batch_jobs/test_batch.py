@@ -24,7 +24,7 @@ from jaxsonar.batch_jobs.parquet_tables import TABLES, parquet
 from jaxsonar.batch_jobs.scan_tables import tables
 from jaxsonar.batch_jobs.shards import shards_of
 from jaxsonar.batch_jobs.worker import do, job_of
-from jaxsonar.detection.hough_detector import settings_for
+from jaxsonar.detection.settings import hough_settings
 from jaxsonar.scans.log_chunks import csv_parts, csv_reader, parquet_parts, parquet_reader
 from jaxsonar.simulation.poses_csv import load_path
 
@@ -89,7 +89,7 @@ def manifest(folder):
 
 def found(log, *, method, rows=None):
     rows = np.arange(len(log)) if rows is None else rows
-    settings = settings_for(RING, None)
+    settings = hough_settings(RING, None)
     return tables(RING, log, rows, source="log", method=method, settings=settings, sigma=None)
 
 
@@ -134,6 +134,7 @@ def test_the_numbers_are_those_of_local_models(method):
     assert [row["undecided"] for row in scans] == [len(model.undecided) for model in models]
 
 
+@pytest.mark.slow
 def test_each_table_opens_as_one_data_set_with_units(done):
     for name, columns in TABLES.items():
         seen = dataset.dataset(done / name)
@@ -165,6 +166,7 @@ def test_shards_of_any_size_give_the_same_rows(method, sizes):
             assert [row for part in parts for row in as_rows(name, part[name])] == as_rows(name, whole[name])
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_same_bytes(logs, done, tmp_path):
     told = []
     report = batch([logs], RING, tmp_path, **with_(workers=2), on_planned=told.append, on_done=told.append)
@@ -173,6 +175,7 @@ def test_two_workers_write_the_same_bytes(logs, done, tmp_path):
     assert (report.scans, report.shards, report.before, report.set_aside) == (56, 8, 0, ())
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_writes_the_same_bytes(logs, done, tmp_path):
     pytest.importorskip("distributed")
     names = (*batch_worker.KEPT_MEMORY, *batch_worker.ONE_THREAD)
@@ -182,6 +185,7 @@ def test_a_dask_cluster_writes_the_same_bytes(logs, done, tmp_path):
     assert [os.environ.get(name) for name in names] == before
 
 
+@pytest.mark.slow
 def test_a_folder_in_which_nothing_was_done_is_begun_anew(logs, done, tmp_path):
     pytest.importorskip("distributed")
     with pytest.raises(SonarError, match=r"nonsense.*allowed is an address"):
@@ -192,6 +196,7 @@ def test_a_folder_in_which_nothing_was_done_is_begun_anew(logs, done, tmp_path):
         batch([logs], RING, tmp_path, method="ml")
 
 
+@pytest.mark.slow
 def test_killed_and_taken_up_again_it_is_as_if_nothing_had_been(logs, done, tmp_path):
     code = f"""
 from jaxsonar import batch, load_ring
@@ -217,6 +222,7 @@ batch([{str(logs)!r}], load_ring("faw"), {str(tmp_path)!r}, on_done=wait, **{HOU
     assert contents(tmp_path) == contents(done)
 
 
+@pytest.mark.slow
 def test_what_is_done_stays_done(done, logs, monkeypatch):
     before = contents(done)
     monkeypatch.setattr(engines, "run_local", None)
@@ -224,6 +230,7 @@ def test_what_is_done_stays_done(done, logs, monkeypatch):
     assert contents(done) == before
 
 
+@pytest.mark.slow
 def test_a_log_can_be_added(logs, done, tmp_path):
     shutil.copytree(done, tmp_path / "out")
     for line in (tmp_path / "out").rglob("b.parquet*"):
@@ -234,6 +241,7 @@ def test_a_log_can_be_added(logs, done, tmp_path):
     assert contents(tmp_path / "out") == contents(done)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("always", [False, True])
 def test_a_shard_whose_process_dies_is_tried_once_more(logs, done, tmp_path, monkeypatch, always):
     """The first process, or every one, dies in the third shard of b."""
@@ -271,7 +279,7 @@ def shard(path, *, scans=100, part=0):
     return shards_of(log, copies=Path(path).parent / "copies", sensors=RING.count, scans=scans)[part]
 
 
-JOB = job_of(RING, method="hough", settings=settings_for(RING, None), sigma=None)
+JOB = job_of(RING, method="hough", settings=hough_settings(RING, None), sigma=None)
 
 BAD_ROWS = {
     "5,0.0,0,0,0,24,3,1.0\n": "scan 5: echo of sensors tx 24, rx 3; allowed are 0 to 23, the sensors of 'FAW ring'",
@@ -338,6 +346,7 @@ def test_bad_scans_of_parquet_are_set_aside(tmp_path):
     assert [row | {"source": ""} for row in lines] == [row | {"source": ""} for row in alone]
 
 
+@pytest.mark.slow
 def test_logs_that_cannot_be_read_are_set_aside_and_the_others_done(logs, done, tmp_path):
     folder = tmp_path / "logs"
     shutil.copytree(logs, folder)
@@ -371,6 +380,7 @@ def test_a_log_that_changes_meanwhile_is_set_aside(tmp_path):
 # Going on with something else
 
 
+@pytest.mark.slow
 def test_another_job_is_refused(logs, done):
     before = contents(done)
     other = replace(RING, neighbors=2)
@@ -383,6 +393,7 @@ def test_another_job_is_refused(logs, done):
     assert contents(done) == before
 
 
+@pytest.mark.slow
 def test_another_log_of_the_same_name_is_refused(logs, done, tmp_path):
     save_log(office(36, first=1000), tmp_path / "a.csv")
     with pytest.raises(SonarError, match=r"a.csv: changed since .* was begun; allowed is the log as it was"):
@@ -446,8 +457,8 @@ def test_a_log_without_scans_has_no_shards(tmp_path):
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_planning_holds_no_log(tmp_path, suffix, monkeypatch):
     """Four times the scans, the same memory."""
-    monkeypatch.setattr("jaxsonar.logs_parts.BLOCK", 1 << 16)
-    monkeypatch.setattr("jaxsonar.logs_parts.AT_ONCE", 1 << 10)
+    monkeypatch.setattr("jaxsonar.scans.log_chunks.BLOCK", 1 << 16)
+    monkeypatch.setattr("jaxsonar.scans.log_chunks.AT_ONCE", 1 << 10)
     path, peaks = tmp_path / f"log.{suffix}", []
     for scans in (10_000, 40_000):
         echo = np.arange(scans * 4)
@@ -467,7 +478,7 @@ def test_planning_holds_no_log(tmp_path, suffix, monkeypatch):
 
 
 def test_huge_row_groups_are_made_small_first(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxsonar.batch_shards.LARGEST_GROUP", 8)
+    monkeypatch.setattr("jaxsonar.batch_jobs.shards.LARGEST_GROUP", 8)
     save_log(office(20), tmp_path / "log.parquet")
     parts = shards_of(*find_inputs([tmp_path / "log.parquet"]), copies=tmp_path / "copies", sensors=24, scans=4)
     assert parts[0].path == str(tmp_path / "copies" / "log.parquet.parquet")

@@ -19,8 +19,8 @@ from benchmarks.calibration.accuracy import (
     trial,
 )
 from jaxsonar import random_room, simulate
-from jaxsonar.floor_plans.room import point_to_walls
 from jaxsonar.geometry.se2 import relative, wrap_angle
+from jaxsonar.geometry.segments import point_to_segments
 
 KNOWN, ALONE, ODOMETRY = CONDITIONS[:3]
 
@@ -76,7 +76,7 @@ def test_the_bound_does_not_hang_on_the_frame(office):
 def test_paths_keep_clear_and_steps_are_as_said(rng):
     room = random_room(rng)
     poses = path_in(room, rng, 40)
-    assert (point_to_walls(poses[:, :2], room.walls) >= calibration.CLEARANCE).all()
+    assert (point_to_segments(poses[:, :2], room.walls) >= calibration.CLEARANCE).all()
     way = np.hypot(*relative(poses[:-1], poses[1:])[:, :2].T)
     assert (way >= calibration.STEP[0]).all()
     assert (way <= calibration.STEP[1]).all()

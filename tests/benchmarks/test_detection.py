@@ -206,6 +206,7 @@ def test_rings_of_conditions():
     assert len(set(names)) == len(names)
 
 
+@pytest.mark.slow
 def test_a_tiny_run_makes_every_file(tmp_path):
     methods = {name: way for name, way in accuracy.METHODS.items() if not name.startswith("ml")}
     noise = np.random.default_rng(0)

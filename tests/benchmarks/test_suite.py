@@ -21,8 +21,9 @@ from benchmarks.speed.baselines import FusedPeer, NumpyPeer, PointSetPeer, Raste
 from benchmarks.speed.scan_fixtures import batch, echoes_of, single_scans
 from benchmarks.speed.timing import Contestant
 from jaxsonar import HoughSettings, Ring, extract_lines, kernels
-from jaxsonar.detection.hough_detector import arcs_of, pieces_of
-from jaxsonar.scans.echo_batches import FlatEchoes
+from jaxsonar.detection.arc_tables import arc_tables
+from jaxsonar.scans.echo_batches import pack
+from jaxsonar.scans.flat_echoes import FlatEchoes
 
 SETTINGS = HoughSettings()
 SCANS = 48
@@ -57,14 +58,15 @@ SHAPE = (SETTINGS.theta_cells, SETTINGS.rho_cells)
 
 def of_product(ring, ranges):
     """Votes and occupied cells by the kernels."""
-    arcs, (votes, high) = arcs_of(ring, SETTINGS), np.zeros((2, len(ranges), *SHAPE), np.int64)
-    for step in FlatEchoes.from_dense(ring, ranges).steps(SETTINGS.cells, pieces=pieces_of(ring, SETTINGS)):
+    arcs, (votes, high) = arc_tables(ring, SETTINGS).arcs, np.zeros((2, len(ranges), *SHAPE), np.int64)
+    for step in pack(FlatEchoes.from_dense(ring, ranges), SETTINGS.cells, pieces=arc_tables(ring, SETTINGS).pieces):
         real = slice(0, len(step.scans))
         votes[step.scans] = np.asarray(kernels.accumulators(arcs, step.packed, settings=SETTINGS)[0])[real]
         high[step.scans] = np.asarray(kernels.vote(arcs, step.packed, settings=SETTINGS).occupied)[real]
     return votes, high.astype(bool)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("peer", ["numba", "numpy"])
 def test_peers_vote_and_occupy_as_the_product_does(given, peer):
     ring, ranges = given
@@ -85,6 +87,7 @@ def test_peers_vote_and_occupy_as_the_product_does(given, peer):
     assert (got_high != high).sum() <= 1e-3 * high.sum()
 
 
+@pytest.mark.slow
 def test_the_numba_loop_finds_the_lines_of_the_product(given):
     ring, ranges = given
     lines = extract_lines(ring, ranges, method="hough")
@@ -111,6 +114,7 @@ def test_plain_numpy_finds_the_lines_of_the_product(given):
     assert same > 0.95 * len(ranges)
 
 
+@pytest.mark.slow
 def test_points_are_those_of_the_arcs(given):
     """OpenCV's transform gets a point for every tangent of the product, on the same arc."""
     ring, ranges = given
@@ -119,7 +123,7 @@ def test_points_are_those_of_the_arcs(given):
     points = peer.points(scan)[:, 0]
     votes, _ = of_product(ring, scan[None])
     assert len(points) == votes.sum()
-    arcs, paths = arcs_of(ring, SETTINGS), ring.echo_paths
+    arcs, paths = arc_tables(ring, SETTINGS).arcs, ring.echo_paths
     counts, theta = np.asarray(arcs.arcs.counts), np.asarray(arcs.arcs.theta)
     begin = 0
     for p, s in itertools.islice(zip(path, slot, strict=True), 5):
@@ -245,6 +249,7 @@ def test_targets():
     assert Metric("", float("nan"), "ms", target=3.0).met is None
 
 
+@pytest.mark.slow
 def test_a_page_is_filled_and_stays_so(tmp_path):
     end = "<!-- /benchmarks -->\n"
     text = f"a\n<!-- benchmarks: targets -->\nold\n{end}b\n<!-- benchmarks: device -->\nkept\n{end}"
@@ -267,6 +272,7 @@ def saved(folder):
     return folder / "some.json"
 
 
+@pytest.mark.slow
 def test_figures_and_tables_from_kept_results(tmp_path, capsys):
     command.main(["--from", str(saved(tmp_path)), "-o", str(tmp_path)])
     names = {path.name for path in tmp_path.iterdir()}
@@ -283,6 +289,7 @@ def test_workloads_are_listed(capsys):
     assert all(set(names) <= set(command.WORKLOADS) for names in command.SHORT.values())
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_and_went_on_has_the_tables_of_one_that_was_not(tmp_path):
     whole, killed = million.measure(tmp_path, scans=96, each=48, engines=["local"])
     assert whole["same"]

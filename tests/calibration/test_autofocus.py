@@ -9,7 +9,7 @@ import pytest
 
 from jaxsonar import HoughSettings, Ring, SonarError, kernels, random_pose, random_room, simulate
 from jaxsonar.calibration.autofocus import focus
-from jaxsonar.kernels.autofocus import blurred, ring_sharpness
+from jaxsonar.kernels.autofocus import blurred, ring_focus_measure
 
 RING = Ring.circular(count=8, neighbors=1)
 COARSE = HoughSettings(theta_cells=60, rho_cells=64, rho_cell=0.08, point_pitch=float(np.radians(3.0)))
@@ -40,9 +40,10 @@ def as_floats(sensors, dtype):
 
 
 def score(sensors, echoes, settings=COARSE, width=1.0):
-    return ring_sharpness(sensors, echoes, jnp.asarray(width, echoes.range.dtype), settings=settings, points=POINTS)
+    return ring_focus_measure(sensors, echoes, jnp.asarray(width, echoes.range.dtype), settings=settings, points=POINTS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", [True, False])
 def test_slopes_agree_forward_in_reverse_and_with_finite_differences(rng, world):
     log = scene(RING, rng, 3, sigma=0.002)
@@ -70,6 +71,7 @@ def test_slopes_agree_forward_in_reverse_and_with_finite_differences(rng, world)
             np.testing.assert_allclose(forward, (ahead - behind) / 2e-7, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_single_precision_gives_what_double_gives(rng):
     log = scene(RING, rng, 3, sigma=0.002)
     single = score(as_floats(RING.sensors, np.float32), packed(log))
@@ -79,6 +81,7 @@ def test_single_precision_gives_what_double_gives(rng):
     np.testing.assert_allclose(single, double, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_frame_of_the_world_is_free(rng):
     """Exactly, by turns of whole cells; nearly, by other turns and shifts."""
     log = scene(RING, rng, 10, sigma=0.001)
@@ -90,6 +93,7 @@ def test_the_frame_of_the_world_is_free(rng):
     np.testing.assert_allclose(score(sensors, packed(log, frame=(0.3, -0.2, 0.0)), fine), here, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_order_and_padding_do_not_matter(rng):
     log = scene(RING, rng, 3)
     echoes = packed(log)
@@ -106,6 +110,7 @@ def test_order_and_padding_do_not_matter(rng):
         np.testing.assert_allclose(score(sensors, other), score(sensors, echoes), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_no_echo_and_lines_beyond_the_accumulator_give_finite_slopes():
     sensors = as_floats(RING.sensors, np.float32)
     path, pose = jnp.zeros((1, 2), jnp.int32), jnp.zeros((1, 2, 3))
@@ -118,6 +123,7 @@ def test_no_echo_and_lines_beyond_the_accumulator_give_finite_slopes():
     assert float(value) == 0
 
 
+@pytest.mark.slow
 def test_the_low_pass_keeps_votes_across_both_seams(rng):
     votes = np.zeros((COARSE.theta_cells, COARSE.rho_cells), np.float32)
     votes[[0, 17, -1], [0, 2, 1]] = rng.uniform(1, 2, 3)
@@ -147,6 +153,7 @@ def relative_error(ring, true):
     return error - error.mean()
 
 
+@pytest.mark.slow
 def test_a_single_wrong_offset_and_a_wrong_speed_are_found(recovered):
     given, true, _, found = recovered
     assert np.sqrt(np.mean(relative_error(found, true) ** 2)) < 0.003
@@ -154,6 +161,7 @@ def test_a_single_wrong_offset_and_a_wrong_speed_are_found(recovered):
     assert abs(found.speed_of_sound / true.speed_of_sound - 1) < 0.004
 
 
+@pytest.mark.slow
 def test_the_mean_offset_stays_and_nothing_else_changes(recovered):
     given, _, _, found = recovered
     np.testing.assert_allclose(found.range_offset.mean(), given.range_offset.mean(), atol=1e-12)
@@ -162,6 +170,7 @@ def test_the_mean_offset_stays_and_nothing_else_changes(recovered):
     assert (found.max_range, found.neighbors, found.name) == (given.max_range, given.neighbors, given.name)
 
 
+@pytest.mark.slow
 def test_a_ring_that_is_right_comes_back_as_it_is_and_so_does_one_in_clutter(recovered):
     """No more is gained by moving than chance gives; the shapes are those of the first call."""
     _, true, log, _ = recovered
@@ -171,6 +180,7 @@ def test_a_ring_that_is_right_comes_back_as_it_is_and_so_does_one_in_clutter(rec
     assert np.abs(focus(true, noise, poses=True, speed=True).range_offset - true.range_offset).max() <= 0.05 + 1e-9
 
 
+@pytest.mark.slow
 def test_the_same_log_gives_the_same_ring(recovered):
     given, _, log, found = recovered
     again = focus(given, log, poses=True, speed=True)
@@ -178,6 +188,7 @@ def test_the_same_log_gives_the_same_ring(recovered):
     assert again.speed_of_sound == found.speed_of_sound
 
 
+@pytest.mark.slow
 def test_without_poses_the_speed_is_held_and_a_wrong_sensor_still_found(rng):
     given = Ring.circular()
     offset = np.zeros(given.count)

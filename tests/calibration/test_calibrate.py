@@ -8,7 +8,7 @@ import pytest
 
 from jaxsonar import Log, Ring, SonarError, calibrate, load_ring, save_calibration, simulate
 from jaxsonar.calibration.calibrate import Calibration, speed_of_sound
-from jaxsonar.geometry.se2 import composed, inverse, relative, wrap_angle
+from jaxsonar.geometry.se2 import compose, inverse, relative, wrap_angle
 from jaxsonar.reports.plot_calibration import calibration_figure
 from jaxsonar.sensors.ring_parameters import (
     FREE,
@@ -95,7 +95,7 @@ def odometry(log):
     steps[:, 2:] += 0.02 * (np.abs(steps[:, 2:]) + 0.5 * way) * rng.standard_normal((len(steps), 1))
     way = [poses[0]]
     for step in steps:
-        way.append(composed(way[-1], step))
+        way.append(compose(way[-1], step))
     return np.array(way)
 
 
@@ -132,6 +132,7 @@ def known_to(found: Calibration, count=COUNT):
 # What may change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poses_free", [False, True])
 def test_offset_modes_move_no_mean_and_have_the_spread_that_is_expected(nominal, poses_free):
     modes = ring_modes(nominal, FREE, poses_free=poses_free, speed_sd=0.02)
@@ -164,6 +165,7 @@ def test_with_free_poses_no_mode_is_a_motion_of_the_robot():
     np.testing.assert_allclose(columns @ columns, POSITION_SD * columns, atol=1e-17)
 
 
+@pytest.mark.slow
 def test_modes_that_are_held_leave_the_shape(nominal):
     modes = ring_modes(nominal, ("offset", "speed"), poses_free=False, speed_sd=0.01)
     held = modes.only("offset")
@@ -172,6 +174,7 @@ def test_modes_that_are_held_leave_the_shape(nominal):
     np.testing.assert_array_equal(held.columns[:, COUNT:], 0)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_free_is_refused(nominal):
     with pytest.raises(SonarError, match="free 'temper'; allowed are offset, speed, position, radius, heading"):
         check_free(("offset", "temper"))
@@ -185,6 +188,7 @@ def test_what_cannot_be_free_is_refused(nominal):
 # Offsets and speed
 
 
+@pytest.mark.slow
 def test_offsets_and_speed_are_found_within_what_is_said_of_them(found, true):
     error = relative_offsets(found.ring, true)
     assert np.abs(error / found.range_offset_sd).max() < Z
@@ -195,6 +199,7 @@ def test_offsets_and_speed_are_found_within_what_is_said_of_them(found, true):
     known_to(found)
 
 
+@pytest.mark.slow
 def test_residuals_are_the_noise(found):
     assert found.rms == pytest.approx(SIGMA, rel=0.15)
     assert found.sigma == pytest.approx(SIGMA, rel=0.15)
@@ -203,6 +208,7 @@ def test_residuals_are_the_noise(found):
     assert abs(np.mean(found.residuals)) < 0.2 * SIGMA
 
 
+@pytest.mark.slow
 def test_the_mean_offset_is_known_or_held_with_a_reason(found, true):
     mean = float(np.mean(found.ring.range_offset) - np.mean(true.range_offset))
     if "mean_offset" in found.held:
@@ -214,15 +220,17 @@ def test_the_mean_offset_is_known_or_held_with_a_reason(found, true):
         assert abs(mean) < Z * found.mean_offset_sd
 
 
+@pytest.mark.slow
 def test_a_moved_and_turned_world_gives_the_same_ring(found, nominal, log):
     motion = np.array([3.0, -7.0, 2.3])
-    again = calibrate(nominal, replace(log, pose=composed(motion, log.pose)))
+    again = calibrate(nominal, replace(log, pose=compose(motion, log.pose)))
     np.testing.assert_allclose(relative_offsets(again.ring, found.ring), 0, atol=5e-5)
     assert float(again.ring.speed_of_sound) == pytest.approx(float(found.ring.speed_of_sound), abs=0.02)
-    back = composed(inverse(motion), again.poses[0])
+    back = compose(inverse(motion), again.poses[0])
     np.testing.assert_allclose(back[:, :2], found.poses[0][:, :2], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_was_found_is_found_again_from_there(found, log):
     """The result does not depend on where it began, but for what is expected of offsets: 3 cm."""
     again = calibrate(found.ring, log)
@@ -231,6 +239,7 @@ def test_what_was_found_is_found_again_from_there(found, log):
     assert again.rms_before == pytest.approx(again.rms, rel=0.02)
 
 
+@pytest.mark.slow
 def test_two_logs_tell_as_much_as_one(found, nominal, log):
     """Every other scan in a log of its own: two worlds with fewer echoes each, so a little less is known."""
     again = calibrate(nominal, [log[::2], log[1::2]])
@@ -245,6 +254,7 @@ def test_two_logs_tell_as_much_as_one(found, nominal, log):
 # One at a time
 
 
+@pytest.mark.slow
 def test_the_speed_of_sound_is_found(speed):
     _, true, found = speed
     assert abs(float(found.ring.speed_of_sound - true.speed_of_sound)) < Z * found.speed_of_sound_sd
@@ -252,6 +262,7 @@ def test_the_speed_of_sound_is_found(speed):
     known_to(found)
 
 
+@pytest.mark.slow
 def test_a_thermometer_is_one_more_measurement(nominal, speed):
     """One that is 3 K off: precisions add up, and the result is the mean weighed by them."""
     log, true, free = speed
@@ -268,6 +279,7 @@ def test_a_thermometer_is_one_more_measurement(nominal, speed):
     assert abs(np.log(float(told.ring.speed_of_sound)) - expected) < 0.3 * sd
 
 
+@pytest.mark.slow
 def test_a_larger_radius_is_found(wider):
     radius, sd = wider.radius
     assert abs(radius - (0.28 + WIDER)) < Z * sd
@@ -277,6 +289,7 @@ def test_a_larger_radius_is_found(wider):
     known_to(wider)
 
 
+@pytest.mark.slow
 def test_a_turned_sensor_is_found_by_what_it_hears(turned, nominal):
     change = np.asarray(turned.ring.heading) - np.asarray(nominal.heading)
     expected = np.where(np.arange(COUNT) == TURNED, BY, 0)
@@ -288,6 +301,7 @@ def test_a_turned_sensor_is_found_by_what_it_hears(turned, nominal):
 # Poses unknown
 
 
+@pytest.mark.slow
 def test_poses_are_estimated_along(estimated, true):
     error = relative_offsets(estimated.ring, true)
     assert np.sqrt(np.mean(error**2)) < 0.001
@@ -297,6 +311,7 @@ def test_poses_are_estimated_along(estimated, true):
     known_to(estimated)
 
 
+@pytest.mark.slow
 def test_the_estimated_way_is_nearer_to_the_truth_than_odometry(estimated, log, odometry):
     [poses] = estimated.poses
     known = np.isfinite(poses).all(axis=1)
@@ -304,7 +319,7 @@ def test_the_estimated_way_is_nearer_to_the_truth_than_odometry(estimated, log, 
     first = np.flatnonzero(known)[0]
 
     def off(way):
-        error = relative(*(composed(inverse(path[first]), path[known]) for path in (log.pose, way)))
+        error = relative(*(compose(inverse(path[first]), path[known]) for path in (log.pose, way)))
         return np.hypot(error[:, 0], error[:, 1]).max(), np.abs(wrap_angle(error[:, 2])).max()
 
     (estimated_way, estimated_turn), (way, turn) = off(poses), off(odometry)
@@ -327,15 +342,18 @@ def refused(match, *arguments, **options):
     assert "\n" not in str(failure.value)
 
 
+@pytest.mark.slow
 def test_a_ring_with_half_the_speed_of_sound_is_refused(nominal, log):
     half = replace(nominal, speed_of_sound=nominal.speed_of_sound / 2)
     refused("speed_of_sound 171.6 m/s; allowed is that of air, 290 to 380", half, log)
 
 
+@pytest.mark.slow
 def test_ranges_that_are_whole_path_lengths_are_refused(nominal, log):
     refused("allowed|needed", nominal, replace(log, range=2 * log.range), free=("speed",))
 
 
+@pytest.mark.slow
 def test_a_log_without_poses_is_not_to_be_trusted(nominal, log):
     unknown = replace(log, pose=np.full_like(log.pose, np.nan))
     refused("0 of 17 scans have a pose; allowed are 3 or more", nominal, unknown, free=("speed",))
@@ -344,6 +362,7 @@ def test_a_log_without_poses_is_not_to_be_trusted(nominal, log):
     refused("2 of 17 scans have a pose", nominal, two, free=("speed",))
 
 
+@pytest.mark.slow
 def test_a_log_without_walls_is_refused(nominal, log):
     refused("no wall found", nominal, silent(), free=("speed",))
     refused("allowed", nominal, silent())
@@ -352,6 +371,7 @@ def test_a_log_without_walls_is_refused(nominal, log):
     refused("no wall|no echo fits|explain", nominal, clutter, free=("speed",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "match"),
     [
@@ -370,6 +390,7 @@ def test_choices_that_are_none_are_refused(nominal, log, options, match):
     refused(match, nominal, log, **options)
 
 
+@pytest.mark.slow
 def test_no_log_is_refused(nominal):
     refused("no log came", nominal, [])
 
@@ -377,6 +398,7 @@ def test_no_log_is_refused(nominal):
 # Told
 
 
+@pytest.mark.slow
 def test_the_file_is_a_ring_and_says_how_well_it_is_known(found, tmp_path):
     path = tmp_path / "ring.toml"
     save_calibration(found, path)
@@ -400,6 +422,7 @@ def test_the_file_is_a_ring_and_says_how_well_it_is_known(found, tmp_path):
         assert len(pair["between"]) == 2
 
 
+@pytest.mark.slow
 def test_each_parameter_has_its_keys(wider, turned, tmp_path):
     tables = []
     for one in (wider, turned):
@@ -414,6 +437,7 @@ def test_each_parameter_has_its_keys(wider, turned, tmp_path):
     assert "heading_sd_deg" not in tables[0]
 
 
+@pytest.mark.slow
 def test_the_summary_says_what_was_found(found, wider):
     lines = found.summary()
     assert all("\n" not in line for line in lines)
@@ -423,6 +447,7 @@ def test_the_summary_says_what_was_found(found, wider):
     assert any("radius" in line and "mm" in line for line in wider.summary())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["found", "wider", "estimated"])
 def test_the_figure_has_units_and_legends(which, request, tmp_path):
     figure = calibration_figure(request.getfixturevalue(which))

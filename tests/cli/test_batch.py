@@ -68,6 +68,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "answer"), WRONG.items())
 def test_a_wrong_call_is_one_line(here, capsys, words, answer):
     pytest.importorskip("distributed")
@@ -79,6 +80,7 @@ def test_a_wrong_call_is_one_line(here, capsys, words, answer):
     assert not list(here.glob("out/*/*.parquet"))
 
 
+@pytest.mark.slow
 def test_set_aside_is_exit_code_1_and_one_more_line(here, capsys):
     for _ in range(2):  # going on says it again
         assert call("batch", ".", "--ring", "faw", "--method", "hough", "-o", "out", "--workers", 1) == 1
@@ -92,6 +94,7 @@ def test_set_aside_is_exit_code_1_and_one_more_line(here, capsys):
     assert pq.read_table("out/scans")["empty"].to_pylist() == ["fewer than 3 echoes within the maximum range"] * 40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("module", "extra"), [("distributed", "cluster"), ("rosbags", "ros"), ("pyarrow", "parquet")])
 def test_a_missing_extra_is_one_line(here, module, extra):
     (here / "x.bag").write_bytes(b"#ROSBAG V2.0\n")

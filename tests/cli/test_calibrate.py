@@ -35,6 +35,7 @@ def here(office, tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_ring_that_is_written_is_a_ring_with_its_calibration(office):
     ring = load_ring(office / "ring.toml")
     assert float(ring.speed_of_sound) == pytest.approx(FASTER * 343.2, rel=1e-3)
@@ -46,12 +47,14 @@ def test_the_ring_that_is_written_is_a_ring_with_its_calibration(office):
     assert table["residual_rms_after"] < table["residual_rms_before"]
 
 
+@pytest.mark.slow
 def test_the_figure_is_drawn(office):
     text = (office / "figure.svg").read_text()
     assert text.startswith("<?xml")
     assert "<svg" in text
 
 
+@pytest.mark.slow
 def test_a_dash_writes_to_standard_output_and_words_go_elsewhere(here, capsys):
     before = contents(here)
     assert call(*CALIBRATE.split(), "-o", "-") == 0
@@ -113,6 +116,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "files", "words"), MISTAKES.values(), ids=MISTAKES.keys())
 def test_a_mistake_is_one_line_and_writes_nothing(here, capsys, command, files, words):
     for name, text in files.items():

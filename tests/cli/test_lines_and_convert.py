@@ -195,6 +195,7 @@ def test_a_figure_of_one_scan(here, suffix, start):
     assert Path("again.jsonl").read_bytes() == Path("lines.jsonl").read_bytes()
 
 
+@pytest.mark.slow
 def test_scan_chooses_what_is_drawn(here):
     def drawn(*chosen):
         assert call("lines", "log.csv", "--ring", "faw", "-o", "again.jsonl", "--figure", "a.svg", *chosen) == 0
@@ -457,6 +458,7 @@ def test_ctrl_c_leaves_no_half_result(here, capsys, monkeypatch, faw_ring):
     assert contents(here) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command", [SIMULATE, ["lines", "long.csv", "--ring", "faw", "--method", "hough"]], ids=["simulate", "lines"]
 )

@@ -131,6 +131,7 @@ def rows_of(path):
 # What is written
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("merging", ["fused", "paper"])
 def test_a_map_is_as_documented(here, merging):
     assert call(*MAP.split(), "--merging", merging) == 0
@@ -138,6 +139,7 @@ def test_a_map_is_as_documented(here, merging):
     assert walls
 
 
+@pytest.mark.slow
 def test_the_office_is_found_and_evaluated(here, capsys):
     assert call(*EVALUATE.split(), "--json", "out.json") == 0
     table = capsys.readouterr().out
@@ -159,6 +161,7 @@ def test_the_office_is_found_and_evaluated(here, capsys):
     assert capsys.readouterr().out == Path("out.json").read_text()
 
 
+@pytest.mark.slow
 def test_a_map_agrees_with_itself_and_gates_part(here):
     assert call("evaluate", "map.geojson", "map.geojson", "--json", "same.json") == 0
     same = strict(Path("same.json").read_text())
@@ -172,6 +175,7 @@ def test_a_map_agrees_with_itself_and_gates_part(here):
     assert tight["distance_max_m"] is None
 
 
+@pytest.mark.slow
 def test_a_map_to_standard_output_leaves_only_what_was_asked_for(here, capsys):
     before = contents(here)
     assert call("map", "log.csv", "--ring", "faw", "-o", "-", "--figure", "a.svg", "--grid", "g.yaml") == 0
@@ -182,6 +186,7 @@ def test_a_map_to_standard_output_leaves_only_what_was_asked_for(here, capsys):
     assert set(contents(here)) - set(before) == {Path("a.svg"), Path("g.yaml"), Path("g.pgm")}
 
 
+@pytest.mark.slow
 def test_settings_beside_the_map_give_it_again(here):
     assert call(*MAP.split(), "--settings", "map.settings.toml") == 0
     assert Path("out.geojson").read_bytes() == Path("map.geojson").read_bytes()
@@ -191,6 +196,7 @@ def test_settings_beside_the_map_give_it_again(here):
     assert Path("map.geojson").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_figure_grid_and_drawing_are_of_the_map(here):
     ezdxf = pytest.importorskip("ezdxf")
     assert call(*MAP.split(), "--figure", "A.PDF", "--grid", "g.YML", "--dxf", "D.DXF") == 0
@@ -204,6 +210,7 @@ def test_figure_grid_and_drawing_are_of_the_map(here):
     np.testing.assert_allclose(drawn, [wall["geometry"]["coordinates"] for wall in segments("map.geojson")], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_parquet_is_as_good_as_csv(here):
     pytest.importorskip("pyarrow")
     assert call("convert", "log.csv", "log.parquet") == 0
@@ -211,6 +218,7 @@ def test_parquet_is_as_good_as_csv(here):
     assert Path("out.geojson").read_bytes() == Path("map.geojson").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_scan_without_a_pose_is_as_none(here, capsys):
     rows = [row for row in rows_of("log.csv") if int(row["scan"]) < 5]
     nowhere = {axis: lambda row, axis=axis: "" if row["scan"] == "2" else row[axis] for axis in ("x", "y", "theta")}
@@ -225,6 +233,7 @@ def test_a_scan_without_a_pose_is_as_none(here, capsys):
     assert "without" not in less
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
     [HEADER, HEADER + "0,0,0,0,0,,,\n1,1,1,0,0,,,\n", HEADER + "0,,0,0,0,3,3,1.9\n", HEADER + "0,0,0,0,0,3,15,1\n"],
@@ -240,6 +249,7 @@ def test_logs_that_tell_of_no_wall_are_no_mistake(here, capsys, text):
     assert (found["segments"], found["precision"], found["recall"]) == (0, None, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a$b_{$.csv", "日本.csv", "a & <b>.csv"])
 def test_a_figure_of_a_log_of_any_name(here, name):
     Path("log.csv").rename(name)
@@ -247,6 +257,7 @@ def test_a_figure_of_a_log_of_any_name(here, name):
     assert Path("a.svg").is_file()
 
 
+@pytest.mark.slow
 def test_a_reference_is_the_room_around_the_laser(here, capsys):
     Path("room.geojson").write_text(
         json.dumps(
@@ -270,6 +281,7 @@ def test_a_reference_is_the_room_around_the_laser(here, capsys):
     assert capsys.readouterr().out.encode() == Path("out.geojson").read_bytes()
 
 
+@pytest.mark.slow
 def test_one_scan_of_the_laser_is_a_polygonal_model(here, capsys):
     assert call(*REFERENCE.split(), "--scan", "11", "--figure", "a.png") == 0
     kinds = {(entry["geometry"]["type"], entry["properties"]["kind"]) for entry in features("out.geojson")}
@@ -492,6 +504,7 @@ def mistaken(here, capsys, line, files):
     return came.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "files", "said"), list(MISTAKES.values()), ids=list(MISTAKES))
 def test_a_mistake_is_one_line_and_leaves_everything_as_it_was(here, capsys, line, files, said):
     if "--dxf" in line and ".dwg" not in line:
@@ -503,6 +516,7 @@ def test_a_mistake_is_one_line_and_leaves_everything_as_it_was(here, capsys, lin
         assert words in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["--figure l.svg", "--grid l.yaml", "--json l.json"])
 def test_the_option_that_would_overwrite_an_input_is_named(here, capsys, option):
     name = option.split()[1]
@@ -537,6 +551,7 @@ NO_MAPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("text", "said"), list(NO_MAPS.values()), ids=list(NO_MAPS))
 @pytest.mark.parametrize("place", ["evaluate bad.json office.geojson", "evaluate map.geojson bad.json"])
 def test_what_is_no_map_is_named(here, capsys, place, text, said):
@@ -545,6 +560,7 @@ def test_what_is_no_map_is_named(here, capsys, place, text, said):
     assert "allowed" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
     [lines(), lines([[0, 0, 5], [1, 0, 5]]), lines([[0, 0], [0, 0]]), lines([[0, 0], [9e11, 1e-300]])],
@@ -560,6 +576,7 @@ def test_unusual_maps_are_no_mistake(here, capsys, text):
     assert strict(Path("out.json").read_text())["segments"] > 0
 
 
+@pytest.mark.slow
 def test_a_drawing_needs_its_extra_and_a_map_does_not(here, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "ezdxf", None)
     err = mistaken(here, capsys, f"{MAP} --dxf a.dxf", {})
@@ -571,6 +588,7 @@ def test_a_drawing_needs_its_extra_and_a_map_does_not(here, capsys, monkeypatch)
 # What ends a command early
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_no_half_result(here, capsys, monkeypatch, faw_ring):
     def stopped(*_, **__):
         raise KeyboardInterrupt
@@ -587,6 +605,7 @@ def test_ctrl_c_leaves_no_half_result(here, capsys, monkeypatch, faw_ring):
     assert contents(here) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "line",
     ["map log.csv --ring faw -o -", "reference rec --scan 0 -o -", EVALUATE, f"{EVALUATE} --json -"],
@@ -603,6 +622,7 @@ def test_a_reader_that_has_gone_is_no_accident(here, capsys, monkeypatch, line):
     assert contents(here) == before
 
 
+@pytest.mark.slow
 def test_the_installed_command_says_what_it_says_here(here, capsys):
     done = script(*EVALUATE.split(), "--json", "-")
     assert (done.returncode, done.stderr) == (0, "")
@@ -610,6 +630,7 @@ def test_the_installed_command_says_what_it_says_here(here, capsys):
     assert done.stdout == capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extra", ["", " --json -"], ids=["table", "json"])
 def test_a_full_disk_behind_standard_output_is_one_line(here, extra):
     if not Path("/dev/full").exists():
@@ -622,6 +643,7 @@ def test_a_full_disk_behind_standard_output_is_one_line(here, extra):
     assert "No space left" in done.stderr
 
 
+@pytest.mark.slow
 def test_results_to_files_need_no_standard_output(here, monkeypatch):
     monkeypatch.setattr(sys, "stdout", None)  # as Python starts under `>&-`
     assert call(*REFERENCE.split(), "--scan", "0") == 0

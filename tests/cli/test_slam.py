@@ -14,7 +14,7 @@ from jaxsonar.estimation.trajectory import Trajectory, load_trajectory, save_tra
 from jaxsonar.mapping.build_map import build_map
 from jaxsonar.mapping.map_geojson import load_map, save_map
 
-ODOMETRY = f"{100 * SLIP.place:g},{np.degrees(SLIP.heading):g}"
+ODOMETRY = f"{100 * SLIP.position_per_meter:g},{np.degrees(SLIP.heading_per_meter):g}"
 COUNT = 14
 
 
@@ -40,6 +40,7 @@ def here(made, tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_slam_writes_what_it_was_asked_for(here):
     poses, given = load_trajectory(here / "poses.tum"), load_trajectory(here / "truth.tum")
     assert len(poses) == COUNT
@@ -57,6 +58,7 @@ def test_slam_writes_what_it_was_asked_for(here):
     assert len(given) == COUNT
 
 
+@pytest.mark.slow
 def test_errors_are_told_and_a_trajectory_may_go_to_standard_output(here, capsys):
     arguments = ("--odometry", ODOMETRY, "--no-smoothing", "--truth", "truth.tum", "--trajectory", "-")
     assert call("slam", "log.csv", "--ring", "faw", "-o", "again.geojson", *arguments) == 0
@@ -91,6 +93,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", BAD)
 def test_a_bad_call_is_answered_in_one_line(here, capsys, line):
     save_trajectory(Trajectory(np.array([1e6]), np.zeros((1, 3))), here / "other.tum")
@@ -108,6 +111,7 @@ def test_a_bad_call_is_answered_in_one_line(here, capsys, line):
     assert {path.name: path.read_bytes() for path in here.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_localize_in_a_map(here, capsys):
     """From nothing, and from about where it is."""
     pose = truth()[0]
@@ -121,6 +125,7 @@ def test_localize_in_a_map(here, capsys):
     assert (here / "where.svg").exists()
 
 
+@pytest.mark.slow
 def test_localize_in_a_floor_plan_with_a_negative_start(here, capsys):
     from jaxsonar.floor_plans.room_geojson import save_room
 
@@ -136,6 +141,7 @@ def test_localize_in_a_floor_plan_with_a_negative_start(here, capsys):
     assert not (here / "q.tum").exists()
 
 
+@pytest.mark.slow
 def test_truth_needs_stamps_that_rise(here, capsys):
     falling = load_log(here / "log.csv")
     save_log(replace(falling, stamp=falling.stamp[::-1].copy()), here / "falling.csv")
@@ -144,6 +150,7 @@ def test_truth_needs_stamps_that_rise(here, capsys):
     assert not (here / "out.geojson").exists()
 
 
+@pytest.mark.slow
 def test_localize_says_where_it_is_not_sure(here, capsys):
     """Half a turn of a rectangle: code 1, both places, no file."""
     from jaxsonar import Room, simulate
@@ -165,6 +172,7 @@ def test_localize_says_where_it_is_not_sure(here, capsys):
     assert not (here / "where.tum").exists()
 
 
+@pytest.mark.slow
 def test_stream_estimates_poses(here):
     """Poses of the device are odometry; the trajectory is written at the end."""
     options = ("--slam", "--odometry", ODOMETRY, "--trajectory", "live.tum", "--map", "live.geojson")

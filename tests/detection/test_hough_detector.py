@@ -18,7 +18,7 @@ from support import oracles
 
 import jaxsonar
 from jaxsonar import HoughSettings, Log, Ring, SonarError, kernels
-from jaxsonar.detection.extract import arcs_of
+from jaxsonar.detection.arc_tables import arc_tables
 
 extract_lines = partial(jaxsonar.extract_lines, method="hough")
 local_model = partial(jaxsonar.local_model, method="hough")
@@ -69,6 +69,7 @@ def found(lines, scan=0):
     return [tuple(column[scan, k] for column in columns) for k in range(count)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("ring", [Ring.circular(), TURNED_RING, BUMPER])
 def test_lines_of_a_scan_are_those_of_the_slow_oracle(ring, seed):
@@ -100,6 +101,7 @@ def test_walls_come_out_where_they_are(faw_ring):
         assert abs(np.degrees(oracles.wrap(nearest[1] - theta))) < 7.4149
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(st.integers(0, 10_000), st.integers(0, 23))
 def test_turning_the_robot_by_sensor_steps_permutes_paths_and_shifts_theta(seed, steps):
@@ -142,6 +144,7 @@ def test_both_ways_of_a_pair_measure_one_geometry(faw_ring, rng):
     np.testing.assert_allclose(lines.rho[0], lines.rho[1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_scan_gives_the_same_lines_alone_in_a_batch_and_from_a_log(faw_ring, rng):
     scans = [a_scan(faw_ring, rng, false=int(rng.integers(0, 60))) for _ in range(300)]
     scans[7] = []
@@ -273,7 +276,7 @@ def test_one_jitted_step_from_echoes_to_cells(faw_ring):
     """Votes, low pass and threshold are one program: no call of the host in it, cells and points come out."""
     echoes = kernels.Echoes(jnp.zeros((2, 64), jnp.int32), jnp.full((2, 64), jnp.nan, jnp.float32))
     step = partial(kernels.vote, settings=HoughSettings())
-    program = jax.make_jaxpr(step)(arcs_of(faw_ring, HoughSettings()), echoes)
+    program = jax.make_jaxpr(step)(arc_tables(faw_ring, HoughSettings()).arcs, echoes)
     came = [(out.shape, str(out.dtype)) for out in program.out_avals]
     assert came == [((2, 100, 100), "bool"), ((2, 64, 64), "int32"), ((2, 64, 64), "float32")]
     inside = set(primitives(program.jaxpr))
@@ -301,6 +304,7 @@ def test_ranges_beyond_single_precision_are_no_echo(faw_ring):
     assert len(next(local_models(faw_ring, as_log(faw_ring, [echoes]))).lines) == 1
 
 
+@pytest.mark.slow
 def test_large_accumulators_run_fewer_scans_at_once(faw_ring):
     fine = HoughSettings(theta_cells=720, rho_cells=300, rho_cell=0.01)
     ranges = np.concatenate([dense(faw_ring, oracles.wall_echoes(faw_ring, 1.2, 0.3))] * 40)

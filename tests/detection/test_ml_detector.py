@@ -28,7 +28,8 @@ from jaxsonar import (
 )
 from jaxsonar.cli import app as cli
 from jaxsonar.detection import ml_detector as method_ml
-from jaxsonar.detection.ml_detector import DECIDED, KINDS
+from jaxsonar.detection.local_map import KIND_NAMES
+from jaxsonar.detection.settings import SETTINGS
 from jaxsonar.sensors.ring_toml import load_ring
 from jaxsonar.simulation.simulator import Acoustics
 
@@ -88,6 +89,7 @@ def positive_definite(cov):
 # lines of batches and models of logs
 
 
+@pytest.mark.slow
 def test_lines_are_those_of_the_local_models(log, models):
     lines = extract_lines(RING, dense_of(log))
     assert lines.rho.shape == (SCANS, max(1, *(len(model.lines) for model in models)))
@@ -105,6 +107,7 @@ def test_lines_are_those_of_the_local_models(log, models):
             assert np.isnan(getattr(lines, name)[row, count:]).all(), name
 
 
+@pytest.mark.slow
 def test_lines_are_sorted_folded_and_padded(log):
     lines = extract_lines(RING, dense_of(log), sigma=0.003)
     there = lines.echoes > 0
@@ -119,6 +122,7 @@ def test_lines_are_sorted_folded_and_padded(log):
     assert lines.echoes.dtype == np.int64
 
 
+@pytest.mark.slow
 def test_two_slots_a_path_are_enough_for_two_echoes(log):
     """Of paths with more echoes, the nearest two."""
     ranges = np.sort(dense_of(log), axis=2)
@@ -129,6 +133,7 @@ def test_two_slots_a_path_are_enough_for_two_echoes(log):
         np.testing.assert_array_equal(getattr(narrow, field.name), getattr(same, field.name))
 
 
+@pytest.mark.slow
 def test_what_a_model_holds_explains_each_echo_once(log, models):
     for row, model in enumerate(models):
         echoes = int((log.echo_scan == row).sum())
@@ -146,10 +151,10 @@ def test_what_a_model_holds_explains_each_echo_once(log, models):
             assert positive_definite(line.cov)
         for point in model.points:
             assert point.kind in ("corner", "edge")
-            assert DECIDED <= point.probability <= 1
+            assert SETTINGS.min_probability <= point.probability <= 1
             assert positive_definite(point.cov)
         for reflector in model.undecided:
-            assert set(reflector.probability) == set(KINDS)
+            assert set(reflector.probability) == set(KIND_NAMES)
             assert sum(reflector.probability.values()) == pytest.approx(1, abs=1e-4)
             assert reflector.rho >= 0
             assert -math.pi <= reflector.theta < math.pi
@@ -157,6 +162,7 @@ def test_what_a_model_holds_explains_each_echo_once(log, models):
         assert 1e-4 <= model.sigma < 0.1
 
 
+@pytest.mark.slow
 def test_json_of_a_model_is_plain_and_complete(models):
     assert any(model.points for model in models)
     assert any(model.undecided for model in models)
@@ -178,6 +184,7 @@ def test_json_of_a_model_is_plain_and_complete(models):
             assert came["echoes"] == reflector.echoes
 
 
+@pytest.mark.slow
 def test_the_papers_way_knows_no_points_no_noise_and_no_covariance(log):
     for model in local_models(RING, log, method="hough"):
         back = written(model)
@@ -191,6 +198,7 @@ def test_the_papers_way_knows_no_points_no_noise_and_no_covariance(log):
     assert np.isnan(extract_lines(RING, dense_of(log), method="hough").cov).all()
 
 
+@pytest.mark.slow
 def test_a_known_noise_is_reported_and_scales_covariances(log):
     models = [list(local_models(RING, log, sigma=sigma)) for sigma in (0.003, 0.0033)]
     ratios = []
@@ -221,6 +229,7 @@ def test_a_corner_between_its_walls_is_a_point_of_the_model():
     assert math.hypot(point.x - 1.2, point.y - 1.0) < 0.001
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corner", [True, False])
 def test_direct_echoes_alone_leave_corner_and_edge_open_and_the_model_says_so(corner):
     ring = dataclasses.replace(RING, neighbors=0)
@@ -232,7 +241,7 @@ def test_direct_echoes_alone_leave_corner_and_edge_open_and_the_model_says_so(co
     (reflector,) = model.undecided
     assert reflector.probability["corner"] > 0.1
     assert reflector.probability["edge"] > 0.1
-    assert max(reflector.probability.values()) < DECIDED
+    assert max(reflector.probability.values()) < SETTINGS.min_probability
     assert math.hypot(reflector.x, reflector.y) == pytest.approx(math.hypot(*place), abs=0.03)
     assert reflector.rho == pytest.approx(math.hypot(*place), abs=0.03)
     assert abs(oracles.wrap(reflector.theta - math.atan2(place[1], place[0]))) < 0.1
@@ -293,6 +302,7 @@ def call(*arguments):
         return end.code
 
 
+@pytest.mark.slow
 def test_the_command_takes_the_noise_and_writes_what_the_library_gives(log, tmp_path, capsys):
     save_log(log, tmp_path / "log.csv")
     arguments = ["lines", tmp_path / "log.csv", "--ring", "faw", "-o", tmp_path / "lines.jsonl"]
@@ -333,6 +343,6 @@ def test_a_wrong_argument_is_one_line_and_exit_code_2(tmp_path, capsys, options,
 
 
 def test_kinds_have_the_names_of_the_kernels_numbers():
-    assert [KINDS[kind] for kind in (kernels.PLANE, kernels.CORNER, kernels.EDGE)] == ["plane", "corner", "edge"]
+    assert [KIND_NAMES[kind] for kind in (kernels.PLANE, kernels.CORNER, kernels.EDGE)] == ["plane", "corner", "edge"]
     assert HoughSettings().rho_cells == 100
     assert method_ml.DECIDED > 0.5

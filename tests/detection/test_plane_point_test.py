@@ -5,9 +5,9 @@ import pytest
 from support import oracles
 
 from jaxsonar import HoughSettings, Log, Room, SonarError, load_ring, local_models, simulate
-from jaxsonar.detection.plane_point_test import MIN_ECHOES, MIN_EXTENT
+from jaxsonar.detection.settings import SETTINGS
 from jaxsonar.floor_plans.room import lines_in
-from jaxsonar.geometry.se2 import to_world
+from jaxsonar.geometry.se2 import transform_points
 
 RING = load_ring("corridor8")
 LEFT, RIGHT = [[-3.0, 0.9], [12.0, 0.9]], [[-3.0, -1.1], [12.0, -1.1]]
@@ -48,6 +48,7 @@ def is_wall(room, pose, line):
     return (np.abs(rho - line.rho) < 0.015) & (np.abs(oracles.wrap(theta - line.theta)) < np.radians(1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("stale", [True, False])
 def test_both_walls_of_a_corridor_and_nothing_else(seed, stale):
@@ -70,8 +71,8 @@ def test_lines_are_made_of_their_echoes(seed):
         for line in model.lines:
             n = np.array([np.cos(line.theta), np.sin(line.theta)])
             np.testing.assert_allclose(line.segment @ n, line.rho, atol=1e-5)
-            assert line.echoes >= MIN_ECHOES
-            assert np.linalg.norm(line.segment[1] - line.segment[0]) >= MIN_EXTENT
+            assert line.echoes >= SETTINGS.min_wall_echoes
+            assert np.linalg.norm(line.segment[1] - line.segment[0]) >= SETTINGS.min_wall_extent
             assert (line.segment[1] - line.segment[0]) @ [-n[1], n[0]] > 0
             assert set(line.scans) <= set(log.scan[: model.scan + 1].tolist())
         scans = {scan for line in model.lines for scan in line.scans}
@@ -98,7 +99,7 @@ def test_a_door_splits_the_wall(middle, seed):
     before = beyond = False
     for pose, model in windows:
         for line in model.lines:
-            x, y = np.sort(to_world(pose, line.segment), axis=0).T
+            x, y = np.sort(transform_points(pose, line.segment), axis=0).T
             if y.mean() > 0:
                 assert not x[0] < middle < x[1], f"{x} covers the door at {middle}"
                 before, beyond = before or x[1] < middle, beyond or x[0] > middle
@@ -111,7 +112,7 @@ def test_turning_and_moving_the_world_moves_no_line():
     room, poses = CORRIDOR, drive()
     log = recorded(room, poses, 0)
     motion = np.array([3.0, -7.0, 2.0])
-    elsewhere = np.column_stack([to_world(motion, poses[:, :2]), poses[:, 2] + motion[2]])
+    elsewhere = np.column_stack([transform_points(motion, poses[:, :2]), poses[:, 2] + motion[2]])
     moved = Log.from_echoes(log.echo_scan, log.tx, log.rx, log.range, stamp=log.stamp, pose=elsewhere)
     for one, other in zip(
         local_models(RING, log, window=LENGTH), local_models(RING, moved, window=LENGTH), strict=True

@@ -14,7 +14,7 @@ from jaxsonar import Log, Ring, SonarError, random_pose, random_room, simulate
 from jaxsonar.diagnostics.beam_width import CENTRES, curve_share, each_cone, fitted_cone
 from jaxsonar.diagnostics.check_ring import check
 from jaxsonar.diagnostics.range_offsets import without_gauge
-from jaxsonar.kernels.health import outlook
+from jaxsonar.kernels.measurement_model import predict_all_echoes
 from jaxsonar.reports import plot_style as figures
 from jaxsonar.reports.plot_health import health_figure
 from jaxsonar.reports.terminal_tables_health import health_table
@@ -75,6 +75,7 @@ def test_the_cones_are_as_wide_as_they_were_simulated(healthy):
     assert error < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [(5, 6), (5, 7)])
 def test_swapped_sensors_are_named(log, pair):
     place = np.arange(24)
@@ -121,6 +122,7 @@ def test_a_dead_sensor_is_named(log):
     assert sum(map(bool, found.remarks)) == 1
 
 
+@pytest.mark.slow
 def test_deaf_and_mute_sensors_are_told_apart(log):
     deaf = check(RING, only(log, log.rx != 11))
     mute = check(RING, only(log, log.tx != 11))
@@ -158,6 +160,7 @@ def test_a_stuck_sensor_is_named(log):
     np.testing.assert_allclose(found.constant[4], [0.777, 1])
 
 
+@pytest.mark.slow
 def test_no_echo_and_no_wall_say_why(log, rng):
     silent = check(RING, only(log, log.tx < 0))
     far = check(RING, dataclasses.replace(log, range=log.range + 3))
@@ -207,12 +210,13 @@ def test_json_table_and_figure(healthy, tmp_path):
     assert (tmp_path / "health.svg").stat().st_size > 10_000
 
 
-def test_outlook_is_the_image_source(rng):
+@pytest.mark.slow
+def test_predicted_echoes_are_those_of_the_image_source(rng):
     """Ranges by mirrored receivers, angles from the sound's way to the mirror image."""
     ring = Ring.circular(neighbors=2)
     rho, theta = rng.uniform(0.5, 1.5, 8), rng.uniform(-np.pi, np.pi, 8)
     parameters = np.stack([rho, theta], axis=-1)[:, None].astype(np.float32)
-    seen = outlook(ring.echo_paths, np.zeros((8, 1), np.int32), parameters)
+    seen = predict_all_echoes(ring.echo_paths, np.zeros((8, 1), np.int32), parameters)
     n = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     tx, rx = ring.position[ring.paths.T]
     image = rx + 2 * (rho[:, None] - n @ rx.T)[..., None] * n[:, None]
@@ -220,13 +224,14 @@ def test_outlook_is_the_image_source(rng):
     np.testing.assert_allclose(seen.range[:, 0], np.linalg.norm(way, axis=-1) / 2, atol=2e-6)
     off = np.arctan2(way[..., 1], way[..., 0]) - ring.heading[ring.paths[:, 0]]
     off = (off + np.pi) % (2 * np.pi) - np.pi
-    apart = (np.asarray(seen.angle[:, 0]) - off + np.pi) % (2 * np.pi) - np.pi
+    apart = (np.asarray(seen.departure_angle[:, 0]) - off + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(apart, 0, atol=2e-6)
-    nothing = outlook(ring.echo_paths, np.full((1, 1), -1, np.int32), parameters[:1])
-    assert not np.asarray(nothing.share).any()
+    nothing = predict_all_echoes(ring.echo_paths, np.full((1, 1), -1, np.int32), parameters[:1])
+    assert not np.asarray(nothing.visibility).any()
     assert not np.asarray(nothing.exists).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", [10.0, 25.0, 45.0])
 def test_cones_are_found_in_drawn_sightings(rng, half):
     truth = np.array([np.radians(half), np.radians(2), 0.85, 0.03])

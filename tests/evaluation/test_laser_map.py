@@ -10,7 +10,7 @@ from jaxsonar import random_pose, random_room
 from jaxsonar.evaluation.laser_map import reference_map
 from jaxsonar.evaluation.laser_segments import fitted, polygonal_model
 from jaxsonar.evaluation.map_accuracy import evaluate
-from jaxsonar.geometry.se2 import rotation, to_world
+from jaxsonar.geometry.se2 import rotation, transform_points
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.laser_datasets import LaserRecording, read_corridor8_laser
 
@@ -39,7 +39,7 @@ def cast(walls, pose, bearing, far=40.0):
 def drive(walls, poses, bearing=AROUND, noise=0.0, rng=None):
     ranges = []
     for pose in poses:
-        laser = np.append(to_world(pose, MOUNT[:2]), pose[2] + MOUNT[2])
+        laser = np.append(transform_points(pose, MOUNT[:2]), pose[2] + MOUNT[2])
         ranges.append(cast(walls, laser, bearing))
     ranges = np.array(ranges)
     if rng is not None:
@@ -60,8 +60,8 @@ def test_a_rectangle_is_four_walls_and_four_corners():
     model = polygonal_model(AROUND, cast(walls, pose, AROUND))
     assert len(model.segments) == len(model.intersections) == 4
     assert len(model.pseudo) == 0
-    found = to_world(pose, model.segments)
-    corners = to_world(pose, model.intersections)  # the beam next to one may count for either wall
+    found = transform_points(pose, model.segments)
+    corners = transform_points(pose, model.intersections)  # the beam next to one may count for either wall
     assert np.linalg.norm(corners[:, None] - walls[:, 0], axis=-1).min(axis=1).max() < 1e-3
     inward = np.stack([-(found[:, 1] - found[:, 0])[:, 1], (found[:, 1] - found[:, 0])[:, 0]], axis=-1)
     assert (((np.array([2.5, 1.5]) - found[:, 0]) * inward).sum(axis=-1) > 0).all()  # free space to the left
@@ -72,7 +72,7 @@ def test_what_hides_behind_an_edge_is_a_pseudo_segment():
     pose = np.array([1.0, 1.0, 0.0])
     model = polygonal_model(HALF, cast(walls, pose, HALF))
     assert len(model.pseudo) == 1
-    start, end = to_world(pose, model.pseudo)[0]
+    start, end = transform_points(pose, model.pseudo)[0]
     assert np.linalg.norm(start - [6, 8 / 3 + 1]) < 0.5 or np.linalg.norm(end - [3, 2]) < 0.05
     edge = np.array([3.0, 2.0])
     assert abs(np.linalg.det(np.stack([start - edge, pose[:2] - edge]))) < 0.1  # along the line of sight
@@ -85,7 +85,7 @@ def test_a_model_turns_with_the_laser():
     turned = pose + np.array([0, 0, 40 * step])
     two = polygonal_model(AROUND, cast(walls, turned, AROUND))
     assert len(one.segments) == len(two.segments)
-    first, second = to_world(pose, one.segments), to_world(turned, two.segments)
+    first, second = transform_points(pose, one.segments), transform_points(turned, two.segments)
     apart = np.abs(first[:, None] - second).max(axis=(2, 3)).min(axis=1)
     assert apart.max() < 1e-6  # the seam at the back is nowhere
 

@@ -42,6 +42,7 @@ def numbers(evaluation):
     ]
 
 
+@pytest.mark.slow
 @given(seed=seeds)
 def test_moving_both_changes_nothing(seed):
     segments, reference = scene(seed)
@@ -50,6 +51,7 @@ def test_moving_both_changes_nothing(seed):
         np.testing.assert_allclose(one, two, atol=1e-9)
 
 
+@pytest.mark.slow
 @given(seed=seeds)
 def test_a_map_is_itself(seed):
     segments = np.random.default_rng(seed).uniform(-4, 4, (9, 2, 2))
@@ -61,6 +63,7 @@ def test_a_map_is_itself(seed):
     assert result.recall_length == pytest.approx(1)
 
 
+@pytest.mark.slow
 @given(seed=seeds, share=st.floats(0.05, 0.95))
 def test_cutting_a_reference_or_a_segment_changes_no_length(seed, share):
     def cut(lines):
@@ -74,6 +77,7 @@ def test_cutting_a_reference_or_a_segment_changes_no_length(seed, share):
         assert part.segment_matched.sum() == pytest.approx(whole.segment_matched.sum(), abs=1e-6)
 
 
+@pytest.mark.slow
 @given(seed=seeds)
 def test_turning_segments_round_changes_only_signs_of_the_reference(seed):
     segments, reference = scene(seed)
@@ -85,6 +89,7 @@ def test_turning_segments_round_changes_only_signs_of_the_reference(seed):
     np.testing.assert_allclose(here.angle, other.angle, atol=1e-9)
 
 
+@pytest.mark.slow
 @given(seed=seeds, gate=st.floats(0.02, 0.5))
 def test_covered_length_as_shapely_sees_it(seed, gate):
     shapely = pytest.importorskip("shapely")

@@ -17,7 +17,7 @@ from jaxsonar.estimation.trajectory import (
     save_trajectory,
     stamps_of,
 )
-from jaxsonar.geometry.se2 import composed, wrap_angle
+from jaxsonar.geometry.se2 import compose, wrap_angle
 
 LINE = "1.5 1 2 0 0 0 0 1\n"
 
@@ -137,12 +137,12 @@ def test_scans_without_stamps_have_numbers():
 
 def test_no_error_in_another_frame(rng):
     poses = walk(rng)
-    moved = composed(np.array([3.0, -2.0, 2.5]), poses)
+    moved = compose(np.array([3.0, -2.0, 2.5]), poses)
     for align in ("best", "first"):
         got = errors(trajectory(moved), trajectory(poses), align=align)
         for name in ("ate", "ate_heading", "worst", "relative", "relative_heading"):
             assert getattr(got, name) < 1e-7, name
-        np.testing.assert_allclose(composed(got.truth_from_estimate, moved), poses, atol=1e-9)
+        np.testing.assert_allclose(compose(got.truth_from_estimate, moved), poses, atol=1e-9)
     as_it_is = errors(trajectory(moved), trajectory(poses), align="none")
     distance = np.linalg.norm(moved[:, :2] - poses[:, :2], axis=-1)
     np.testing.assert_allclose(as_it_is.ate, np.sqrt(np.mean(distance**2)))
@@ -155,10 +155,10 @@ def test_no_error_in_another_frame(rng):
 def test_the_best_alignment_is_found_by_search_too(seed):
     rng = np.random.default_rng(seed)
     truth = walk(rng)
-    poses = composed(rng.normal(0, 2, 3), truth + rng.normal(0, 0.3, truth.shape))
+    poses = compose(rng.normal(0, 2, 3), truth + rng.normal(0, 0.3, truth.shape))
 
     def cost(motion):
-        return np.sum((composed(motion, poses)[:, :2] - truth[:, :2]) ** 2)
+        return np.sum((compose(motion, poses)[:, :2] - truth[:, :2]) ** 2)
 
     starts = [np.array([0.0, 0.0, turn]) for turn in np.linspace(-3, 3, 7)]
     best = min((minimize(cost, start) for start in starts), key=lambda one: one.fun)
@@ -170,7 +170,7 @@ def test_the_best_alignment_is_found_by_search_too(seed):
 def test_where_all_positions_are_one_place_headings_align():
     truth = np.array([[1.0, 2.0, 0.1], [1.0, 2.0, 0.3]])
     poses = truth + np.array([5.0, 0.0, 1.0])
-    np.testing.assert_allclose(composed(alignment(poses, truth), poses), truth, atol=1e-12)
+    np.testing.assert_allclose(compose(alignment(poses, truth), poses), truth, atol=1e-12)
     assert errors(trajectory(truth[:1]), trajectory(truth[:1])).ate == 0
 
 

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsonar import Room, load_room, random_pose, random_room, save_room
-from jaxsonar.floor_plans.room import lines_in, point_to_walls
+from jaxsonar.floor_plans.room import lines_in
+from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.hardware.errors import SonarError
 
 SQUARE = [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]]
@@ -287,7 +288,7 @@ def test_random_rooms_are_closed_and_poses_keep_clear(seed):
     x, y, theta = random_pose(rng, room)
     assert outline.contains(shapely.Point(x, y))
     assert -np.pi <= theta < np.pi
-    assert point_to_walls(np.array([[x, y]]), room.walls).min() >= 0.45
+    assert point_to_segments(np.array([[x, y]]), room.walls).min() >= 0.45
     assert np.linalg.norm(room.poles - [x, y], axis=-1).min(initial=np.inf) >= 0.45
 
 

@@ -95,11 +95,12 @@ def dense(mean, prior, path, ranges, rows=ROWS):
 
 def tracked(mean, prior, path, ranges, rows=ROWS, kinds=KINDS, anchors=ANCHORS):
     belief = kernels.Belief(mean[:3], scene_of(mean[3:].reshape(-1, 2), kinds, anchors), prior)
-    found = kernels.track(belief, paths_of(path), ranges, rows.astype(np.int32), np.float64(SIGMA**2))
+    found = kernels.ekf_update(belief, paths_of(path), ranges, rows.astype(np.int32), np.float64(SIGMA**2))
     state = np.concatenate([found.belief.pose, np.asarray(found.belief.scene.parameters).ravel()])
     return state, np.asarray(found.belief.covariance), found
 
 
+@pytest.mark.slow
 def test_an_update_is_least_squares_on_prior_and_ranges(case):
     mean, prior, path, ranges, truth = case
     state, covariance, found = tracked(mean, prior, path, ranges)
@@ -127,6 +128,7 @@ def test_wrong_echoes_are_left_out(case, rng):
     np.testing.assert_allclose(covariance, wanted_cov, atol=2e-3 * wanted_cov.max())
 
 
+@pytest.mark.slow
 def test_neither_order_nor_padding_matters(case, rng):
     mean, prior, path, ranges, _ = case
     plain, plain_cov, found = tracked(mean, prior, path, ranges)
@@ -141,10 +143,11 @@ def test_neither_order_nor_padding_matters(case, rng):
     np.testing.assert_allclose(covariance[:11, :11], plain_cov, atol=1e-12)
     np.testing.assert_allclose(np.asarray(padded.residual)[:ECHOES], np.asarray(found.residual)[order], atol=1e-10)
     assert not np.asarray(padded.used)[ECHOES:].any()
-    predicted = kernels.predict(padded.belief, paths_of(more_path))
+    predicted = kernels.predict_ranges(padded.belief, paths_of(more_path))
     assert np.isinf(np.asarray(predicted.expected)[4:]).all()
 
 
+@pytest.mark.slow
 def test_a_wall_alone_says_nothing_of_the_way_along_it(rng):
     """What is known of y is what the prior says, by the heading that y hangs on."""
     path = rng.integers(len(RING.paths), size=40)
@@ -164,6 +167,7 @@ def test_a_wall_alone_says_nothing_of_the_way_along_it(rng):
     assert cov[0, 0] < SIGMA**2
 
 
+@pytest.mark.slow
 def test_ranges_are_those_that_the_simulator_hears():
     """Every first echo of a wall of the office, to the micrometre; and what is expected besides is little."""
     office = load_office()
@@ -297,6 +301,7 @@ def test_corners_are_no_walls():
 # Submaps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("distance", "carried"), [(8.0, False), (0.8, True)])
 def test_only_walls_that_should_be_heard_tell_that_the_robot_was_carried(distance, carried):
     """Around a corner all is new, and becomes known; where walls that face the ring are silent it is elsewhere."""

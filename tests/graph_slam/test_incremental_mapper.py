@@ -64,6 +64,7 @@ def size_of(state):
     return sum(array.nbytes for array in arrays_of(state))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "merging"), [("driven", "fused"), ("shuffled", "fused"), ("shuffled", "paper")])
 def test_scan_by_scan_is_all_at_once(office, order, merging):
     log = office_log(office)
@@ -79,6 +80,7 @@ def test_scan_by_scan_is_all_at_once(office, order, merging):
     assert max(map(len, mapper.map(state).scans)) <= SETTINGS.evidence.listed_scans
 
 
+@pytest.mark.slow
 def test_every_map_on_the_way_is_that_of_the_scans_so_far(office):
     """Also the map of nothing; and old states still give their maps when all is done."""
     log, mapper = office_log(office, seed=1), Mapper(ring=RING)
@@ -91,6 +93,7 @@ def test_every_map_on_the_way_is_that_of_the_scans_so_far(office):
     assert [[array.tobytes() for array in arrays_of(state)] for state in states] == bytes_before
 
 
+@pytest.mark.slow
 def test_two_ways_from_one_state_do_not_disturb_each_other(office):
     log, mapper = office_log(office), Mapper(ring=RING)
     middle, _ = driven(mapper, log[:8])
@@ -115,6 +118,7 @@ def test_a_step_tells_what_the_scan_came_to(office):
         np.testing.assert_allclose(np.sort(info.segments, axis=1), np.sort(world, axis=1), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_scans_without_a_pose_are_ignored_and_said_so(office):
     """With windows too, below."""
     log, mapper = office_log(office), Mapper(ring=RING)
@@ -171,6 +175,7 @@ def corridor_log(seed=0):
     return ring, simulate(ring, CORRIDOR, poses, sigma=0.005, seed=seed).as_log(ring, poses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [(), (0, 20, 21, 44)])
 def test_windows_scan_by_scan_are_those_of_the_whole_log(lost):
     """Along the path, with a robot that waits, and with poses missing."""
@@ -212,6 +217,7 @@ def a_round(number):
     ]
 
 
+@pytest.mark.slow
 def test_driving_the_same_round_again_needs_no_more_memory():
     """Pieces, tiles and numbers of scans are bounded by the walls: ten rounds are hardly more than three."""
     mapper = Mapper(ring=RING)

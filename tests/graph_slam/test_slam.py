@@ -41,6 +41,7 @@ def assert_near(found, *, share):
     assert 0.05 < own.nees < 4.0
 
 
+@pytest.mark.slow
 def test_scan_by_scan_is_the_log_without_smoothing_and_much_better_than_odometry():
     tracker, state, _ = tracked()
     poses, covariance = tracker.poses(tracker.finish(state))
@@ -56,6 +57,7 @@ def test_scan_by_scan_is_the_log_without_smoothing_and_much_better_than_odometry
     assert_near(found.trajectory, share=0.2)
 
 
+@pytest.mark.slow
 def test_a_step_leaves_the_state_given_as_it_was():
     """Two ways from one state; and the first pose is that of odometry."""
     tracker, _, steps = tracked()
@@ -79,6 +81,7 @@ def test_a_step_leaves_the_state_given_as_it_was():
     assert all(np.linalg.eigvalsh(step.covariance)[0] >= -1e-15 for step in steps)
 
 
+@pytest.mark.slow
 def test_without_odometry_scans_are_placed_by_what_they_see():
     some = log()[:16]
     found = slam(RING, replace(some, pose=np.full((16, 3), np.nan)), smooth=False)
@@ -92,6 +95,7 @@ def test_without_odometry_scans_are_placed_by_what_they_see():
     assert own.ate < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", [[5], [4, 5, 11]])
 def test_scans_without_odometry_between_others_bend_nothing(missing):
     """The odometry leads on over them; what they see places them, or they are left out."""
@@ -139,6 +143,7 @@ def test_what_odometry_can_not_do_is_refused_before_the_work(pose, choices, said
         slam(RING, replace(some, pose=kept), **choices)
 
 
+@pytest.mark.slow
 def test_a_robot_that_was_carried_begins_anew():
     """Odometry knows nothing of it: another submap, and no pose that is sure of the wrong place."""
     there = compose(np.array([1.5, 0.6, 2.0]), np.array([relative(truth()[0], one) for one in truth()[:8]]))
@@ -157,6 +162,7 @@ def test_a_robot_that_was_carried_begins_anew():
     assert np.hypot(*off[:2]) < 4 * max(sd[:2]) or np.hypot(*off[:2]) < 0.05
 
 
+@pytest.mark.slow
 def test_a_mapper_estimates_poses_and_draws_its_map_there():
     mapper = Mapper(ring=RING, odometry_noise=SLIP)
     state, infos = mapper.start(), []

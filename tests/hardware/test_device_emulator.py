@@ -12,7 +12,7 @@ from jaxsonar.geometry.se2 import relative
 from jaxsonar.hardware import SonarError
 from jaxsonar.hardware import device_emulator as emulator
 from jaxsonar.hardware.device_emulator import emulate
-from jaxsonar.hardware.fault_injection import BadLink, Faults, damage, parse_stall
+from jaxsonar.hardware.fault_injection import FaultInjector, FaultSettings, corrupt_frame, parse_stall
 from jaxsonar.hardware.messages import Group, Pose
 from jaxsonar.hardware.protocol import Decoder, encode
 from jaxsonar.hardware.transport_base import EndOfStream, open_source
@@ -438,7 +438,7 @@ def test_a_message_that_no_frame_holds_is_an_error():
 def test_faults_on_the_line(office, log):
     """What arrives is true, what is lost or damaged is counted, the order is nearly the order."""
     sent = list(log_messages(log, office.ring))
-    faults = Faults(corrupt=0.1, drop=0.1, reorder=0.1, seed=5)
+    faults = FaultSettings(corrupt=0.1, drop=0.1, reorder=0.1, seed=5)
     with Running(sent, "tcp://127.0.0.1:0", speed=0.0, faults=faults) as device:
         found, decoder, _ = receive(device.url)
     done = device.served
@@ -458,8 +458,8 @@ def test_the_same_seed_makes_the_same_faults(office, log):
     frames = [encode(message) for message in log_messages(log, office.ring)]
 
     def passed(seed):
-        link = BadLink(Faults(corrupt=0.2, drop=0.2, reorder=0.2, seed=seed))
-        return [piece for data in frames for piece in link.pass_on(data)] + link.rest()
+        link = FaultInjector(FaultSettings(corrupt=0.2, drop=0.2, reorder=0.2, seed=seed))
+        return [piece for data in frames for piece in link.transmit(data)] + link.rest()
 
     assert passed(1) == passed(1)
     assert passed(1) != passed(2)
@@ -467,12 +467,12 @@ def test_the_same_seed_makes_the_same_faults(office, log):
 
 def test_each_fault_does_what_it_says():
     frames = [bytes([k, 255, 0]) for k in range(1, 201)]
-    none, lost = BadLink(Faults()), BadLink(Faults(drop=1.0))
-    bad, swapped = BadLink(Faults(corrupt=1.0)), BadLink(Faults(reorder=1.0))
-    assert [none.pass_on(data) for data in frames] == [[data] for data in frames]
-    assert [lost.pass_on(data) for data in frames] == [[]] * 200
-    assert all(bad.pass_on(data) != [data] for data in frames)
-    pairs = [swapped.pass_on(data) for data in frames[:5]]
+    none, lost = FaultInjector(FaultSettings()), FaultInjector(FaultSettings(drop=1.0))
+    bad, swapped = FaultInjector(FaultSettings(corrupt=1.0)), FaultInjector(FaultSettings(reorder=1.0))
+    assert [none.transmit(data) for data in frames] == [[data] for data in frames]
+    assert [lost.transmit(data) for data in frames] == [[]] * 200
+    assert all(bad.transmit(data) != [data] for data in frames)
+    pairs = [swapped.transmit(data) for data in frames[:5]]
     assert pairs == [[], [frames[1], frames[0]], [], [frames[3], frames[2]], []]
     assert swapped.rest() == [frames[4]]
     assert swapped.rest() == []
@@ -481,10 +481,10 @@ def test_each_fault_does_what_it_says():
 
 def test_damage_is_of_every_kind(rng):
     whole = bytes(range(1, 100)) + b"\0"
-    sizes = Counter(np.sign(len(damage(rng, whole)) - len(whole)) for _ in range(600))
+    sizes = Counter(np.sign(len(corrupt_frame(rng, whole)) - len(whole)) for _ in range(600))
     assert min(sizes[-1], sizes[0], sizes[1]) > 150
-    assert all(damage(rng, whole) != whole for _ in range(1000))
-    assert all(damage(rng, b"\0") != b"\0" for _ in range(100))
+    assert all(corrupt_frame(rng, whole) != whole for _ in range(1000))
+    assert all(corrupt_frame(rng, b"\0") != b"\0" for _ in range(100))
 
 
 def test_a_device_that_stalls(office, log):
@@ -497,7 +497,7 @@ def test_a_device_that_stalls(office, log):
             yield message
 
     events = []
-    with Running(slowly(), "tcp://127.0.0.1:0", speed=0.0, faults=Faults(stall=0.5, every=0.6)) as device:
+    with Running(slowly(), "tcp://127.0.0.1:0", speed=0.0, faults=FaultSettings(stall=0.5, every=0.6)) as device:
         found, *_ = receive(device.url, on_event=events.append, silence=0.3)
     assert len(found) == len(sent)
     assert device.served.stalls >= 1
@@ -505,10 +505,10 @@ def test_a_device_that_stalls(office, log):
 
 
 def test_stalls_come_every_so_often():
-    link = BadLink(Faults(stall=1.0, every=10.0))
+    link = FaultInjector(FaultSettings(stall=1.0, every=10.0))
     pauses = [(k / 10, link.pause(k / 10)) for k in range(500)]
     assert [when for when, pause in pauses if pause] == [10.0, 20.0, 30.0, 40.0]
-    late = BadLink(Faults(stall=1.0, every=10.0))
+    late = FaultInjector(FaultSettings(stall=1.0, every=10.0))
     assert [late.pause(when) for when in (9.9, 35.0, 39.0, 40.0, 41.0)] == [0.0, 1.0, 0.0, 1.0, 0.0]
 
 
@@ -517,7 +517,7 @@ def test_stalls_come_every_so_often():
 )
 def test_stalls_as_people_write_them(text, stall):
     assert parse_stall(text) == stall
-    Faults(stall=stall[0], every=stall[1])
+    FaultSettings(stall=stall[0], every=stall[1])
 
 
 @pytest.mark.parametrize("text", ["", "x", "2@", "@2", "-1", "2@3@4", "nan", "1e3"])
@@ -540,7 +540,7 @@ def test_stalls_that_are_none(text):
 )
 def test_faults_that_are_none(faults):
     with pytest.raises(SonarError, match=rf"--{next(iter(faults))}: .* came; allowed is"):
-        Faults(**faults)
+        FaultSettings(**faults)
 
 
 def test_the_end_is_said_often_enough_for_a_bad_line():

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsonar.hardware.drop_oldest_queue import NewestQueue
+from jaxsonar.hardware.drop_oldest_queue import DropOldestQueue
 from jaxsonar.hardware.messages import ECHO, Group, Pose
-from jaxsonar.hardware.scan_assembler import MOST_ECHOES, MOST_GROUPS, REFERENCE_SPEED_OF_SOUND, Assembler
+from jaxsonar.hardware.scan_assembler import MOST_ECHOES, MOST_GROUPS, REFERENCE_SPEED_OF_SOUND, ScanAssembler
 from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND as RING_REFERENCE
 
 GROUPS, PERIOD_US = 8, 11_700
@@ -34,7 +34,7 @@ def device(scans, *, first=0, sequence=0, time_us=5_000_000, poses=True, groups=
 
 
 def assembled(messages, assembler=None, *, flush=True):
-    assembler = assembler or Assembler()
+    assembler = assembler or ScanAssembler()
     scans = [scan for k, message in enumerate(messages) for scan in assembler.push(message, 0.01 * k)]
     return (scans + assembler.flush() if flush else scans), assembler.counts
 
@@ -49,7 +49,7 @@ def assert_true(scan):
 
 
 def test_what_is_sent_in_order_comes_out_at_once():
-    assembler = Assembler()
+    assembler = ScanAssembler()
     for k, message in enumerate(device(5)):
         out = assembler.push(message, 0.0)
         last = isinstance(message, Group) and message.group == GROUPS - 1
@@ -64,6 +64,7 @@ def test_what_is_sent_in_order_comes_out_at_once():
     assert (counts.scans, counts.echoes, counts.lost, counts.late, counts.restarts) == (5, 40, 0, 0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("groups", [1, 3, 8])
 @given(seed=st.integers(0, 2**32 - 1))
 def test_neighbors_in_any_order_make_no_difference(groups, seed):
@@ -81,6 +82,7 @@ def test_neighbors_in_any_order_make_no_difference(groups, seed):
         assert np.isfinite(scan.group_pose).all()
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), loss=st.floats(0, 0.6), again=st.floats(0, 0.5))
 def test_lost_repeated_and_late_messages(seed, loss, again):
     """No echo twice, none in a wrong scan, none with another group's pose; what is missing is counted."""
@@ -126,18 +128,19 @@ def test_a_lost_group_does_not_cost_a_pose():
 
 def test_a_sender_that_says_unknown_things_keeps_its_poses():
     sent = [m for m in device(3) if m.sequence % 5 != 2 or isinstance(m, Group)]
-    assembler = Assembler()
+    assembler = ScanAssembler()
     assembler.skipped = True
     scans, _ = assembled(sent, assembler)
     assert all(np.isfinite(scan.pose).all() for scan in scans)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", [0, 1, 3, 10, 100, 500])
 @pytest.mark.parametrize("poses", [True, False])
 def test_a_sender_that_starts_anew_goes_on(run, poses):
     """However little or much came before: all scans of the new run come out, under numbers and stamps that go on."""
     before, after = device(run, poses=poses), device(6, poses=poses, time_us=1_000)
-    assembler = Assembler()
+    assembler = ScanAssembler()
     first = [s for m in before for s in assembler.push(m, 100.0)]
     second = [s for m in after for s in assembler.push(m, 130.0)] + assembler.flush()
     assert [s.scan for s in first] == list(range(run))
@@ -182,7 +185,7 @@ def test_sequence_numbers_and_their_overflow():
 
 def test_an_incomplete_scan_is_handed_on_in_time():
     sent = device(1)[:-4]
-    assembler = Assembler(waited=0.5)
+    assembler = ScanAssembler(waited=0.5)
     for message in sent:
         assert assembler.push(message, 10.0) == []
     assert assembler.expire(10.4) == []
@@ -191,8 +194,9 @@ def test_an_incomplete_scan_is_handed_on_in_time():
     assert assembler.expire(99.0) == assembler.flush() == []
 
 
+@pytest.mark.slow
 def test_hostile_groups_need_no_room():
-    assembler = Assembler()
+    assembler = ScanAssembler()
     echoes = np.zeros(1, ECHO)
     for k in range(3000):
         assembler.push(Group(k, k, (k * 7919) % 2**32, k % 500, 500 if k % 2 else 40_000, float("nan"), echoes), 0.0)
@@ -205,7 +209,7 @@ def test_hostile_groups_need_no_room():
 
 
 def test_a_scan_of_too_many_echoes_keeps_those_that_came_first():
-    assembler = Assembler()
+    assembler = ScanAssembler()
     echoes = np.zeros(4096, ECHO)
     for k in range(8):
         assembler.push(Group(k, k, 0, k, 8, float("nan"), echoes), 0.0)
@@ -231,7 +235,7 @@ def test_echoes_stand_in_the_order_of_the_paths(faw_ring):
     echoes = np.zeros(100, ECHO)
     echoes["tx"], echoes["rx"] = faw_ring.paths[rng.integers(len(faw_ring.paths), size=100)].T
     echoes["time_us"] = rng.uniform(1000, 9000, 100)
-    (scan,) = Assembler(sensors=24).push(Group(0, 0, 0, 0, 1, float("nan"), echoes), 0.0)
+    (scan,) = ScanAssembler(sensors=24).push(Group(0, 0, 0, 0, 1, float("nan"), echoes), 0.0)
     path = faw_ring.path_index[scan.echoes["tx"], scan.echoes["rx"]]
     key = list(zip(path.tolist(), scan.echoes["time_us"].tolist(), strict=True))
     assert key == sorted(key)
@@ -248,24 +252,24 @@ def test_a_pose_that_is_not_known_any_more_ends_the_one_before():
 
 
 def test_large_items_make_room_as_many_small_ones_do():
-    queue = NewestQueue[int](100, size=lambda item: item, room=10)
+    queue = DropOldestQueue[int](100, size_of=lambda item: item, max_total_size=10)
     for item in (4, 4, 4, 1, 30, 2, 3):  # one that is too large alone stays until the next one comes
         queue.put(item)
     assert queue.dropped == 5
-    assert queue.get(0.0, most=9) == [2, 3]
+    assert queue.get(0.0, max_items=9) == [2, 3]
     queue.put(8)
     stop = threading.Event()
     stop.set()
     queue.put(9, wait=stop)
-    assert queue.get(0.0, most=9) == [9]
+    assert queue.get(0.0, max_items=9) == [9]
 
 
 def test_the_newest_win_and_are_counted():
-    queue = NewestQueue[int](3)
+    queue = DropOldestQueue[int](3)
     for k in range(10):
         queue.put(k)
     assert (queue.dropped, len(queue)) == (7, 3)
-    assert queue.get(0.0, most=2) == [7, 8]
+    assert queue.get(0.0, max_items=2) == [7, 8]
     queue.close(ValueError("the cable"))
     queue.put(11)
     assert queue.get(0.0) == [9]

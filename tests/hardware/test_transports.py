@@ -12,7 +12,7 @@ import pytest
 from jaxsonar.hardware import SonarError
 from jaxsonar.hardware import transport_base as transports
 from jaxsonar.hardware import transport_clients as transport_sources
-from jaxsonar.hardware.transport_base import EndOfStream, Event, Source, open_source, parse_url
+from jaxsonar.hardware.transport_base import EndOfStream, LinkEvent, Source, open_source, parse_url
 from jaxsonar.hardware.transport_servers import listen
 
 NEVER = threading.Event()
@@ -213,14 +213,14 @@ def test_other_packages_bring_transports(monkeypatch):
         assert source.url == "echo:x"
         assert source.settings["silence"] == 7.0
         assert source.settings["reconnect"] is False
-        assert source.settings["on_event"](Event("lost", "nobody hears this")) is None
+        assert source.settings["on_event"](LinkEvent("lost", "nobody hears this")) is None
     with pytest.raises(SonarError, match="echo:"):
         open_source("ecco:x")
 
 
 def test_a_program_brings_transports(monkeypatch):
     monkeypatch.setattr(transports, "_registered", {})
-    transports.register("tcp", Echo)
+    transports.register_transport("tcp", Echo)
     assert isinstance(open_source("tcp:whatever"), Echo)
 
 
@@ -371,9 +371,9 @@ def test_back_off_doubles_up_to_a_limit(monkeypatch):
     with Device("tcp://127.0.0.1:0") as device:
         events, tell = events_of()
         source = open_source(device.url, on_event=tell)
-        assert isinstance(source, transport_sources.Link)
+        assert isinstance(source, transport_sources.ReconnectingSource)
         monkeypatch.setattr(transport_sources, "time", Clock)
-        monkeypatch.setattr(transport_sources.TcpLink, "_open", refuse)
+        monkeypatch.setattr(transport_sources.TcpSource, "_open", refuse)
         source._lost(ConnectionResetError(104, "Connection reset by peer"))
         while now[0] < 30:
             assert source.read(0.3) is None
@@ -384,6 +384,7 @@ def test_back_off_doubles_up_to_a_limit(monkeypatch):
     assert kinds(events) == ["lost"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["tcp", "udp", "pty"])
 def test_silence_is_told_once_and_its_end_too(scheme, pty_url):
     url = {"pty": pty_url}.get(scheme, f"{scheme}://127.0.0.1:0")

@@ -139,7 +139,7 @@ def test_groups_and_poses_are_the_same_bytes(device, rng):
 def test_what_python_writes_c_reads(device, rng):
     records = [bytes(rng.integers(0, top, size, dtype=np.uint8)) for top in (2, 255) for size in range(16, 600, 7)]
     records += [bytes([1]) * size for size in range(245, 260)] + [bytes([1]) * size + b"\0" for size in range(245, 260)]
-    assert device([decode_command(protocol.frame(record)[:-1]) for record in records]) == records
+    assert device([decode_command(protocol.encode_frame(record)[:-1]) for record in records]) == records
 
 
 def test_c_refuses_damaged_frames(device, rng):

@@ -73,15 +73,18 @@ def test_plane_range_is_half_the_way_from_the_image_source(rho, theta, offset, b
     tx, rx = np.array([offset, 0.1]), np.array([offset - baseline, -0.05])
     assume(min(rho - tx @ n, rho - rx @ n) > 0.05)
     image = tx + 2 * (rho - tx @ n) * n
-    came = kernels.plane_range(*(jnp.asarray(a, jnp.float32) for a in (rho, theta, tx, rx)))
+    arguments = (np.array([rho, theta]), (tx + rx) / 2, (rx - tx) / 2)
+    came = kernels.plane_range(*(jnp.asarray(a, jnp.float32) for a in arguments))
     assert float(came) == pytest.approx(np.linalg.norm(image - rx) / 2, abs=1e-5)
 
 
 def test_a_corner_answers_like_two_reflections_and_an_edge_like_its_own_source():
     tx, rx, corner = np.array([0.28, 0.1]), np.array([0.1, 0.27]), np.array([1.3, 0.8])
     twice_mirrored = 2 * corner - tx  # mirrored in both walls of a right angle, whatever its orientation
-    as_arrays = [jnp.asarray(a, jnp.float32) for a in (corner, tx, rx)]
-    assert float(kernels.point_range(*as_arrays)) == pytest.approx(np.linalg.norm(twice_mirrored - rx) / 2, abs=1e-6)
+    as_arrays = [jnp.asarray(a, jnp.float32) for a in (corner, (tx + rx) / 2, (rx - tx) / 2)]
+    assert float(kernels.corner_range(*as_arrays[:2])) == pytest.approx(
+        np.linalg.norm(twice_mirrored - rx) / 2, abs=1e-6
+    )
     way = np.linalg.norm(corner - tx) + np.linalg.norm(corner - rx)
     assert float(kernels.edge_range(*as_arrays)) == pytest.approx(way / 2, abs=1e-6)
 
@@ -89,6 +92,7 @@ def test_a_corner_answers_like_two_reflections_and_an_edge_like_its_own_source()
 # arcs
 
 
+@pytest.mark.slow
 @ways
 @pytest.mark.parametrize("path", [0, 5, 30, 50, 80, 100, 130, 167])
 def test_tangent_lines_of_an_arc(faw_ring, run, path):
@@ -169,6 +173,7 @@ def test_votes_fall_into_the_cells_of_their_lines(rng, run):
     np.testing.assert_array_equal(came, oracles.accumulate(cells, SMALL))
 
 
+@pytest.mark.slow
 @ways
 @pytest.mark.parametrize("taps", [(1,), (1, 2, 1), (1, 4, 6, 4, 1), (0, 1, 0)])
 def test_low_pass(rng, run, taps):
@@ -201,6 +206,7 @@ def test_soft_votes_add_up_and_do_not_see_the_seams(rho, theta, weight):
     np.testing.assert_allclose(folded, soft, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ring",
     [
@@ -225,6 +231,7 @@ def test_threshold_does_not_depend_on_the_point_pitch(faw_ring):
 # clusters
 
 
+@pytest.mark.slow
 @ways
 def test_centres_of_gravity(rng, run):
     """Around theta = pi, around rho = 0, an ordinary one, and one without points."""
@@ -254,6 +261,7 @@ def test_centres_of_gravity(rng, run):
         assert abs(oracles.wrap(float(came.theta[k]) - wanted[1])) < 1e-5
 
 
+@pytest.mark.slow
 @ways
 def test_extent_is_bounded_by_the_outermost_feet(rng, run):
     sensors = rng.normal(size=(7, 2)).astype(np.float32)
@@ -284,6 +292,7 @@ def soft_votes(ring, ranges):
     return (kernels.soft_accumulate(rho, theta, weight, HoughSettings()) ** 2).sum()
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere(faw_ring, rng):
     ranges = rng.uniform(0.3, 1.9, 168)
     awkward = [np.nan, 0.0, 2.0, 2.5, np.inf, -1.0, *np.linalg.norm(faw_ring.echo_paths.half_baseline, axis=1)[:140:20]]

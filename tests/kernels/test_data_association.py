@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsonar import Ring, Room, kernels, simulate
-from jaxsonar.kernels import CORNER, EDGE, PLANE, SECOND, Candidates, Reflection, Scene
+from jaxsonar.kernels import CORNER, EDGE, PLANE, SECOND_ORDER, CandidateReflections, Landmarks, Reflection
 from jaxsonar.simulation.image_sources import Kind
 
 WIDE = 1.2  # cones, and the soft border around them
@@ -43,11 +43,11 @@ def the_scene(corners=CORNERS):
     theta = np.arctan2(-along[:, 0], along[:, 1])  # the tangent, its normal turned to the left, is along
     anchor = np.concatenate([middle, corners, FREE, np.zeros((1, 2))])
     lines = np.stack([np.zeros(5), theta], axis=-1)
-    return Scene(
+    return Landmarks(
         kind=np.array([PLANE] * 5 + [CORNER] * 4 + [EDGE] * 2 + [-1], np.int32),
         parameters=np.concatenate([lines, np.zeros((7, 2))]),
         anchor=anchor,
-        ends=np.concatenate([np.stack([-half, half], axis=-1), np.zeros((7, 2))]),
+        extent=np.concatenate([np.stack([-half, half], axis=-1), np.zeros((7, 2))]),
     )
 
 
@@ -59,11 +59,11 @@ def the_candidates(*, wall_to_wall=False):
     alone = list(range(11))
     first = [*alone, *(a for a, _ in PAIRS), *(b for _, b in PAIRS), 0]
     second = [*alone, *(b for _, b in PAIRS), *(a for a, _ in PAIRS), 0]
-    kind = np.concatenate([the_scene().kind[:11], np.full(8, SECOND), [-1]]).astype(np.int32)
+    kind = np.concatenate([the_scene().kind[:11], np.full(8, SECOND_ORDER), [-1]]).astype(np.int32)
     group = np.concatenate([alone, 11 + np.tile(np.arange(4), 2), [-1]]).astype(np.int32)
     world = np.concatenate([np.zeros(11), np.full(8, 0 if wall_to_wall else -2), [-1]]).astype(np.int32)
     reflection = Reflection(kind, np.array(first, np.int32), np.array(second, np.int32))
-    return Candidates(reflection=reflection, world=world, group=group)
+    return CandidateReflections(reflection=reflection, world=world, group=group)
 
 
 @pytest.fixture(autouse=True)
@@ -104,7 +104,7 @@ def associated(poses, path, reported, world=None, candidates=None, scene=None):
         *(jnp.asarray(x) for x in (poses, world, path, reported)),
         every(candidates, poses),
     )
-    return [np.asarray(x) for x in (found.candidate, found.residual, found.rival)]
+    return [np.asarray(x) for x in (found.candidate, found.residual, found.competitor_gap)]
 
 
 def every(candidates, poses):
@@ -180,6 +180,7 @@ def searched(pose, path):
     return out
 
 
+@pytest.mark.slow
 def test_the_nearest_audible_reflection_is_chosen_as_by_a_slow_search(heard, rng):
     """Echoes at random among walls that are not square."""
     poses, path, _, _ = heard
@@ -203,7 +204,7 @@ def test_the_nearest_audible_reflection_is_chosen_as_by_a_slow_search(heard, rng
             others = np.abs(expected - expected[best])[group != group[best]].min()
             assert rival[k, e] == (pytest.approx(others, abs=1e-9) if np.isfinite(others) else np.inf)
             kinds.add(int(candidates.reflection.kind[best]))
-    assert kinds == {PLANE, CORNER, EDGE, SECOND}
+    assert kinds == {PLANE, CORNER, EDGE, SECOND_ORDER}
 
 
 def test_true_reflectors_are_chosen(heard):
@@ -247,7 +248,7 @@ def test_other_worlds_are_never_chosen(heard):
     own = the_candidates()
     half = np.arange(SCANS) % 2
     for number in (0, 1):
-        candidates = Candidates(own.reflection, np.where(own.world == 0, number, -1).astype(np.int32), own.group)
+        candidates = CandidateReflections(own.reflection, np.where(own.world == 0, number, -1).astype(np.int32), own.group)
         candidate, residual, _ = associated(poses, path, reported, half.astype(np.int32), candidates)
         assert (candidate[half != number] == -1).all()
         assert np.isinf(residual[half != number]).all()
@@ -270,7 +271,7 @@ def test_offsets_and_speed_of_sound_are_part_of_what_is_expected(heard, rng):
     """A ring that reports otherwise, and echoes reported so: the same choice, the residual as it is reported."""
     poses, path, reported, _ = heard
     offset, scale = rng.uniform(-0.05, 0.05, 10), 1.03
-    sensors = kernels.moved_sensors(
+    sensors = kernels.apply_parameters(
         RING.sensors, jnp.concatenate([jnp.asarray(offset), jnp.log(jnp.asarray([scale])), jnp.zeros(20)])
     )
     tx, rx = RING.paths[path].transpose(2, 0, 1)
@@ -293,6 +294,7 @@ def test_offsets_and_speed_of_sound_are_part_of_what_is_expected(heard, rng):
     np.testing.assert_allclose(np.asarray(found.residual)[kept], before[1][kept] / scale, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_single_precision_chooses_the_same(heard):
     poses, path, reported, _ = heard
     wide = associated(poses, path, reported)

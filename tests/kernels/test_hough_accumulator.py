@@ -70,6 +70,7 @@ def test_maxima_are_those_of_a_loop_over_all_cells_highest_first(seed, level):
         same_lines(came, wanted)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(seeds, st.integers(1, 5))
 def test_too_little_room_keeps_the_highest(seed, size):
@@ -137,6 +138,7 @@ def test_turning_the_accumulator_turns_the_lines(seed, steps):
     np.testing.assert_allclose(off, 0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_batch_is_one_by_one(rng):
     smooth = jnp.asarray(rng.random((3, ROWS, COLUMNS)), jnp.float32)
     level = jnp.float32(0.5)
@@ -155,6 +157,7 @@ RINGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RINGS)
 def test_paths_that_hear_a_wide_wall_are_those_of_the_loop(name):
     ring = RINGS[name]

@@ -22,14 +22,14 @@ PATHS = 64
 FAR = 60.0  # m; walls as long as this have no ends that any path sees
 seeds = st.integers(0, 10_000)
 MODELS = {
-    "plane": (jax.jit(jax.vmap(reflectors.plane, in_axes=(None, 0))), 1),
-    "corner": (jax.jit(jax.vmap(reflectors.corner, in_axes=(None, 0))), 1),
-    "edge": (jax.jit(jax.vmap(reflectors.edge, in_axes=(None, 0))), 1),
-    "second order": (jax.jit(jax.vmap(reflectors.second_order, in_axes=(None, None, 0))), 2),
+    "plane": (jax.jit(jax.vmap(reflectors.plane_echo, in_axes=(None, 0))), 1),
+    "corner": (jax.jit(jax.vmap(reflectors.corner_echo, in_axes=(None, 0))), 1),
+    "edge": (jax.jit(jax.vmap(reflectors.edge_echo, in_axes=(None, 0))), 1),
+    "second order": (jax.jit(jax.vmap(reflectors.second_order_echo, in_axes=(None, None, 0))), 2),
 }
 models = pytest.mark.parametrize("model", MODELS)
-shares = jax.jit(jax.vmap(reflectors.heard_share))
-off_axis = jax.jit(jax.vmap(reflectors.off_axis))
+shares = jax.jit(jax.vmap(reflectors.visibility))
+off_axis = jax.jit(jax.vmap(reflectors.off_axis_ratio))
 
 
 def unit(angle):
@@ -245,6 +245,7 @@ def test_a_mirror_mirrors_directions_and_changes_no_range(model, seed):
 # gradients
 
 
+@pytest.mark.slow
 @models
 def test_slopes_agree_with_finite_differences_and_with_gradients_forward_and_backward(model, rng):
     kernel, count = MODELS[model]
@@ -273,6 +274,7 @@ def test_slopes_agree_with_finite_differences_and_with_gradients_forward_and_bac
             np.testing.assert_allclose(jax.jit(jacobian(ranges))(x, path)[good], numerical[good], atol=1e-7)
 
 
+@pytest.mark.slow
 @models
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.3, 0.0), (0.0, 0.3)])
 def test_gradients_are_finite_where_a_sensor_sits_on_the_reflector(model, place):
@@ -363,9 +365,10 @@ def test_the_narrowest_and_the_widest_cones_have_a_share(half_beam):
     assert share[3] == 0
 
 
+@pytest.mark.slow
 def test_one_path_alone_is_as_in_a_batch(rng):
     """Kernels take one path; batches are vmapped."""
-    kernels: list[Callable[..., Any]] = [reflectors.plane, reflectors.corner, reflectors.edge]
+    kernels: list[Callable[..., Any]] = [reflectors.plane_echo, reflectors.corner_echo, reflectors.edge_echo]
     tx, rx = some_sensors(rng)
     paths = paths_between(tx, rx)
     x = jnp.asarray([1.1, 0.4], jnp.float32)

@@ -14,13 +14,13 @@ import pytest
 from support import oracles
 
 from jaxsonar import HoughSettings, Ring, Room, kernels, load_ring, random_pose, random_room, simulate
-from jaxsonar.detection.extract import arcs_of
+from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.floor_plans.room import lines_in
-from jaxsonar.scans.echo_batches import DEAR_SCANS_PER_STEP
+from jaxsonar.scans.echo_batches import SLOW_SCANS
 from jaxsonar.simulation.simulator import Acoustics, Kind
 
 RING, SETTINGS, EXPECTED = Ring.circular(), HoughSettings(), kernels.Expectations()
-SCANS, ROOM, PATHS, POINTS = DEAR_SCANS_PER_STEP[0], 64, 168, 64
+SCANS, ROOM, PATHS, POINTS = SLOW_SCANS.rows[0], 64, 168, 64
 DECIDED = 0.7
 PLAIN: dict[str, Any] = {"box": 0.0, "segment": 0.0, "pole": 0.0}
 ORIGIN = np.zeros((1, 3))
@@ -41,7 +41,7 @@ TRIANGLE = polygon((1.4, 0.1), (1.6, 2.2), (1.3, -2.0))
 
 def explained(scans, sigma=math.nan, arcs=None):
     """The explanation of scans, each a list of (path, range); one array a field."""
-    arcs = arcs_of(RING, SETTINGS) if arcs is None else arcs
+    arcs = arc_tables(RING, SETTINGS).arcs if arcs is None else arcs
     parts = []
     for begin in range(0, len(scans), SCANS):
         some = scans[begin : begin + SCANS]
@@ -123,6 +123,7 @@ def permuted(scans, change):
 # what holds for every scan
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [math.nan, 0.003])
 def test_every_echo_explains_itself_once_and_everything_is_finite(sigma):
     scans = scans_of_rooms(32, sigma=0.003, dropout=0.2, clutter=0.2)
@@ -390,6 +391,7 @@ def test_walls_are_found_at_the_bound_of_their_ranges():
     assert (ratio > 0.9).all(), ratio
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.001, 0.003, 0.01])
 def test_noise_is_estimated(sigma):
     found = explained(scans_of_rooms(32, sigma=sigma))
@@ -444,6 +446,7 @@ STRANGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STRANGE)
 def test_strange_rings_explain_what_they_hear(name):
     ring = STRANGE[name]
@@ -477,6 +480,7 @@ def test_with_direct_echoes_alone_corner_and_edge_stay_open():
     np.testing.assert_allclose(found.parameters[points, 0], place[points], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_deaf_paths_are_deaf():
     """Those that ``roomy`` adds: neither the threshold nor what is found is another."""
     ring = dataclasses.replace(RING, neighbors=2)

@@ -13,17 +13,17 @@ from hypothesis import strategies as st
 from support import oracles
 
 from jaxsonar import HoughSettings, Ring, kernels
-from jaxsonar.detection.extract import arcs_of
-from jaxsonar.detection.plane_point_test import BETTER, TOLERANCE
+from jaxsonar.detection.arc_tables import arc_tables
+from jaxsonar.detection.settings import SETTINGS
 from jaxsonar.geometry.se2 import relative
 from jaxsonar.kernels import robust_fit as fitting
 
 RING = Ring.circular(count=16, beam=1.0, neighbors=2, first_heading=0.0123)
-ARCS = arcs_of(RING, HoughSettings())
+ARCS = arc_tables(RING, HoughSettings()).arcs
 ROOM, LINES = 256, 4
 seeds = st.integers(0, 10_000)
-fit = jax.jit(fitting.fit, static_argnames=("model", "tolerance"))
-heard = jax.jit(lambda echoes: fitting.heard(ARCS, jax.tree.map(lambda leaf: leaf[0], echoes)))
+fit = jax.jit(fitting.fit_reflector, static_argnames=("model", "tolerance"))
+paths_and_ranges = jax.jit(lambda echoes: fitting.paths_and_ranges(ARCS, jax.tree.map(lambda leaf: leaf[0], echoes)))
 
 
 def packed(echoes):
@@ -40,7 +40,9 @@ def fits_of(echoes, *lines):
     """Fits to the candidates (rho, theta), and NaN beyond: one array a field, without the axis of scans."""
     rho, theta = np.full((2, 1, LINES), np.nan, np.float32)
     rho[0, : len(lines)], theta[0, : len(lines)] = np.array(lines).T
-    fits = kernels.fit_candidates(ARCS, packed(echoes), jnp.asarray(rho), jnp.asarray(theta), tolerance=TOLERANCE)
+    fits = kernels.fit_candidates(
+        ARCS, packed(echoes), jnp.asarray(rho), jnp.asarray(theta), tolerance=SETTINGS.window_tolerance
+    )
     return jax.tree.map(lambda leaf: np.asarray(leaf)[0], fits)
 
 
@@ -66,6 +68,7 @@ def off(fits, plane, k=0):
 # planes
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(seeds)
 def test_a_plane_comes_out_and_explains_all_its_echoes_better_than_a_point_does(seed):
@@ -80,7 +83,7 @@ def test_a_plane_comes_out_and_explains_all_its_echoes_better_than_a_point_does(
     assert fits.explained[0, : len(echoes)].all()
     assert not fits.explained[0, len(echoes) :].any()
     assert fits.plane_score[0] == pytest.approx(len(echoes), rel=1e-4)
-    assert fits.plane_score[0] > BETTER * fits.point_score[0]
+    assert fits.plane_score[0] > SETTINGS.plane_to_point_ratio * fits.point_score[0]
 
 
 @settings(max_examples=10)
@@ -206,13 +209,21 @@ def test_a_point_explains_its_echoes_better_than_a_plane_does(seed, corner, spre
     assert fits.point_score[0] == pytest.approx(len(echoes), rel=1e-3)
     assert fits.point_score[0] > fits.plane_score[0]
     if spread > 0.5:
-        assert fits.point_score[0] > BETTER * fits.plane_score[0]
+        assert fits.point_score[0] > SETTINGS.plane_to_point_ratio * fits.plane_score[0]
 
 
 def tracked(x):
     return jnp.asarray(x, jnp.float64)
 
 
+def path_between(tx, rx):
+    """ONE echo path; only its midpoint and half baseline matter."""
+    zero, pair = jnp.zeros(()), jnp.zeros(2)
+    midpoint, half_baseline = jnp.asarray((tx + rx) / 2), jnp.asarray((rx - tx) / 2)
+    return kernels.EchoPaths(midpoint, half_baseline, zero, zero, zero, jnp.zeros((2, 2)), pair)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [fitting.plane, fitting.corner, fitting.edge])
 def test_gradients_of_the_ranges_agree_with_finite_differences(model: Callable[..., Any], rng):
     def ranges(x, echo):
@@ -222,9 +233,7 @@ def test_gradients_of_the_ranges_agree_with_finite_differences(model: Callable[.
     with jax.enable_x64(True):
         for _ in range(5):
             at = tracked(rng.uniform(0.8, 1.2, 2))
-            zero = jnp.zeros((), jnp.float64)
-            tx, rx = (tracked(p) for p in rng.uniform(-0.2, 0.2, (2, 2)))
-            echo = fitting.Heard(tx, rx, zero, zero, zero)
+            echo = path_between(*rng.uniform(-0.2, 0.2, (2, 2)))
             steps = 1e-5 * np.eye(2)
             numerical = [float(ranges(at + step, echo) - ranges(at - step, echo)) / 2e-5 for step in steps]
             for slope in (model(at, echo)[1], forward(at, echo), backward(at, echo)):
@@ -233,13 +242,14 @@ def test_gradients_of_the_ranges_agree_with_finite_differences(model: Callable[.
 
 @pytest.mark.parametrize("model", [fitting.plane, fitting.corner, fitting.edge])
 def test_gradients_are_finite_where_a_sensor_sits_on_the_reflector(model: Callable[..., Any]):
-    zero, here = jnp.zeros(()), jnp.asarray([0.5, 0.0])
-    echo = fitting.Heard(here, here, zero, zero, zero)
+    here = jnp.asarray([0.5, 0.0])
+    echo = path_between(here, here)
     came = jax.jit(model)(here, echo)
     for values in (*came, jax.jit(jax.grad(lambda x: model(x, echo)[0]))(here)):
         assert np.isfinite(values).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [fitting.plane, fitting.corner, fitting.edge])
 def test_ranges_are_those_of_the_oracle(model: Callable[..., Any], rng):
     """One fit of one model to its own echoes: nothing is left of any residual."""
@@ -250,7 +260,7 @@ def test_ranges_are_those_of_the_oracle(model: Callable[..., Any], rng):
         truth, corner = place, model is fitting.corner
         echoes = [echo for pose in poses for echo in oracles.point_echoes(RING, pose, place, corner=corner)][:ROOM]
     start = jnp.asarray(truth + np.array([0.03, -0.03]), jnp.float32)
-    came, score = fit(model, start, heard(packed(echoes)), tolerance=TOLERANCE)
+    came, score = fit(model, start, *paths_and_ranges(packed(echoes)), tolerance=SETTINGS.window_tolerance)
     np.testing.assert_allclose(came, truth, atol=1e-4)
     np.testing.assert_allclose(score[: len(echoes)], 1, atol=1e-4)
     assert not np.asarray(score)[len(echoes) :].any()
@@ -263,7 +273,7 @@ def test_candidates_that_are_none_explain_nothing_and_disturb_nobody(rng):
     plane, guess = a_plane(rng)
     echoes = echoes_of_plane(some_poses(rng), plane)
     alone, among = fits_of(echoes, guess), fits_of(echoes, (np.nan, np.nan), guess, (np.nan, 0.3), (0.5, np.nan))
-    for name in ("rho", "theta", "explained", "foot", "plane_score", "point_score"):
+    for name in ("rho", "theta", "explained", "footpoint", "plane_score", "point_score"):
         np.testing.assert_array_equal(getattr(among, name)[1], getattr(alone, name)[0])
         assert np.isfinite(getattr(among, name)[1]).all()
     for nobody in (0, 2, 3):
@@ -279,7 +289,7 @@ def test_echoes_that_are_none_are_not_explained():
     reported = np.resize(rows, (1, ROOM)).astype(np.float32)
     echoes = kernels.Echoes(jnp.asarray(paths), jnp.asarray(reported), jnp.asarray(poses))
     rho, theta = (jnp.full((1, LINES), value, jnp.float32) for value in (1.0, 0.1))
-    fits = kernels.fit_candidates(ARCS, echoes, rho, theta, tolerance=TOLERANCE)
+    fits = kernels.fit_candidates(ARCS, echoes, rho, theta, tolerance=SETTINGS.window_tolerance)
     assert not fits.explained.any()
     assert (fits.plane_score == 0).all()
     assert (fits.point_score == 0).all()
@@ -290,7 +300,7 @@ def test_echoes_that_are_none_are_not_explained():
 def test_echoes_without_poses_were_all_taken_at_the_origin():
     echoes = packed(echoes_of_plane(np.zeros((1, 3)), (0.9, 1.0)))
     plain = kernels.Echoes(echoes.path, echoes.range)
-    jax.tree.map(np.testing.assert_array_equal, heard(echoes), heard(plain))
+    jax.tree.map(np.testing.assert_array_equal, paths_and_ranges(echoes), paths_and_ranges(plain))
 
 
 def test_lines_are_folded(rng):

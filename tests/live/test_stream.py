@@ -27,12 +27,13 @@ from jaxsonar import (
     simulate,
 )
 from jaxsonar.cli.app import main
-from jaxsonar.detection.hough_detector import arcs_of, settings_for
+from jaxsonar.detection.arc_tables import arc_tables
+from jaxsonar.detection.settings import hough_settings
 from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.hardware.device_emulator import emulate
-from jaxsonar.hardware.fault_injection import Faults
+from jaxsonar.hardware.fault_injection import FaultSettings
 from jaxsonar.hardware.messages import ECHO
-from jaxsonar.hardware.scan_assembler import Assembler, RawScan
+from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler
 from jaxsonar.hardware.transport_servers import listen
 from jaxsonar.live.live_map import LiveMap
 from jaxsonar.live.stream import Status, stream
@@ -63,7 +64,7 @@ def log_file(log, tmp_path_factory):
 
 
 def raw_scans(messages):
-    assembler = Assembler(sensors=RING.count)
+    assembler = ScanAssembler(sensors=RING.count)
     return [scan for m in messages for scan in assembler.push(m, time.monotonic())] + assembler.flush()
 
 
@@ -103,6 +104,7 @@ def expected(office, log):
     return build_map(office.ring, log, method="hough")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("link", "record"), [*((link, "rec.csv") for link in LINKS), (LINKS[0], "rec.parquet"), ("file", "rec.parquet")]
 )
@@ -125,6 +127,7 @@ def test_a_stream_is_the_log(link, record, office, log, log_file, expected, tmp_
     assert counts["dropped"] == counts["rejected"] == counts["lost"] == counts["missing"] == counts["gaps"] == 0
 
 
+@pytest.mark.slow
 def test_method_ml_gives_the_map_of_the_log(office, log, tmp_path):
     path = tmp_path / "map.geojson"
     with Device("tcp://127.0.0.1:0", log_messages(log, office.ring)) as device:
@@ -137,6 +140,7 @@ def test_method_ml_gives_the_map_of_the_log(office, log, tmp_path):
     assert status.lines > 0
 
 
+@pytest.mark.slow
 def test_a_raw_record_is_the_device_again(office, log, expected, tmp_path):
     raw, path, again = tmp_path / "raw.mcap", tmp_path / "map.geojson", tmp_path / "again.csv"
     stream_of = {"method": "hough", "map_path": path}
@@ -148,6 +152,7 @@ def test_a_raw_record_is_the_device_again(office, log, expected, tmp_path):
     np.testing.assert_array_equal(load_log(again).pose, log.pose)
 
 
+@pytest.mark.slow
 def test_scans_without_a_pose_stay_without_one_when_played(office, log, tmp_path):
     pose = log.pose.copy()
     pose[[0, 5, 6, 16]] = np.nan
@@ -158,9 +163,10 @@ def test_scans_without_a_pose_stay_without_one_when_played(office, log, tmp_path
     assert status.unplaced == 4
 
 
+@pytest.mark.slow
 def test_a_bad_link_gives_less_and_never_anything_else(office, log, tmp_path):
     """Every echo of the record was sent; what is damaged is counted."""
-    faults = Faults(corrupt=0.1, drop=0.05, reorder=0.1, seed=5)
+    faults = FaultSettings(corrupt=0.1, drop=0.05, reorder=0.1, seed=5)
     with Device("tcp://127.0.0.1:0", log_messages(log, office.ring), faults=faults) as device:
         status = stream(device.sink.url, office.ring, method="hough", record=tmp_path / "rec.csv", map_path=None)
     found = load_log(tmp_path / "rec.csv")
@@ -181,6 +187,7 @@ def test_a_bad_link_gives_less_and_never_anything_else(office, log, tmp_path):
     assert "\n" not in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("link", ["tcp", "pty"])
 def test_a_device_that_goes_and_comes_back(link, office, log, tmp_path):
     """The stream goes on; the time without a device is in the raw record, and told."""
@@ -213,6 +220,7 @@ def test_a_device_that_goes_and_comes_back(link, office, log, tmp_path):
     assert [b'"lost"' in data for topic, _, data in read_mcap(path) if topic == EVENTS] == [True, False]
 
 
+@pytest.mark.slow
 def test_the_first_scans_wait_for_the_compiler_and_a_number_of_scans_ends_it(office, log, tmp_path):
     messages = log_messages(log, office.ring)
     seen = []
@@ -224,6 +232,7 @@ def test_the_first_scans_wait_for_the_compiler_and_a_number_of_scans_ends_it(off
     assert status.warm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mapping", [False, True])
 def test_the_end_waits_for_the_compiler_only_where_a_map_does(mapping, office, log, tmp_path, monkeypatch):
     """The record is whole at once, either way."""
@@ -253,6 +262,7 @@ def test_the_end_waits_for_the_compiler_only_where_a_map_does(mapping, office, l
         assert len(load_map(map_path)) > 0
 
 
+@pytest.mark.slow
 def test_errors_come_after_everything_was_written(office, log, tmp_path, monkeypatch):
     from jaxsonar.hardware.transport_base import Source
 
@@ -330,9 +340,9 @@ def test_a_moving_robot_is_as_exact_as_one_at_rest():
 def test_moved_paths_are_those_of_moved_sensors():
     """One pose for all paths: the arcs of a ring mounted there, and so the lines, seen from the origin."""
     pose = np.array([0.12, -0.07, 0.4])
-    settings = settings_for(RING, None)
+    settings = hough_settings(RING, None)
     poses = np.broadcast_to(pose, (len(RING.paths), 3)).astype(np.float32)
-    moved = kernels.moved_arcs(arcs_of(RING, settings), jax.numpy.asarray(poses), settings=settings)
+    moved = kernels.moved_arcs(arc_tables(RING, settings).arcs, jax.numpy.asarray(poses), settings=settings)
     there = Ring(
         transform_points(pose, np.asarray(RING.position)),
         RING.heading + pose[2],
@@ -340,13 +350,14 @@ def test_moved_paths_are_those_of_moved_sensors():
         neighbors=3,
         max_range=2.0,
     )
-    other = arcs_of(there, settings)
+    other = arc_tables(there, settings).arcs
     for one, two in zip(jax.tree.leaves(moved.paths), jax.tree.leaves(other.paths), strict=True):
         np.testing.assert_allclose(one, two, atol=2e-6)
     for name in ("along", "across_squared", "half_baseline_squared"):
         np.testing.assert_allclose(getattr(moved.arcs, name), getattr(other.arcs, name), atol=2e-6)
 
 
+@pytest.mark.slow
 def test_a_robot_at_rest_needs_no_moved_paths(office, log):
     live = LiveMap(office.ring, method="hough", mapping=False)
     for raw in raw_scans(log_messages(log, office.ring)):
@@ -420,6 +431,7 @@ def device(log_file, command):
         process.communicate(timeout=20)
 
 
+@pytest.mark.slow
 def test_emulate_and_stream_are_the_map_command(device, command, log_file, tmp_path):
     """Processes and a real link from end to end; the first line of the device is where it listens."""
     map_path, record = tmp_path / "map.geojson", tmp_path / "rec.parquet"
@@ -435,6 +447,7 @@ def test_emulate_and_stream_are_the_map_command(device, command, log_file, tmp_p
     assert np.abs(load_log(record).range - load_log(log_file).range).max() < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_with_everything_written(number, device, command, tmp_path):
     record, map_path = tmp_path / "rec.csv", tmp_path / "map.geojson"
@@ -453,6 +466,7 @@ def test_a_signal_ends_it_with_everything_written(number, device, command, tmp_p
     assert f"{len(log)} scans" in told.splitlines()[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mapping", [False, True])
 def test_signals_end_it_while_it_compiles(mapping, device, command, tmp_path):
     """Method ml takes many seconds to compile: one signal is enough for a record, and two for a map."""
@@ -477,6 +491,7 @@ def test_signals_end_it_while_it_compiles(mapping, device, command, tmp_path):
     assert len(load_log(record)) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -514,6 +529,7 @@ def test_wrong_calls_are_answered_in_one_line(arguments, log_file, capsys):
     assert "allowed" in told or "needed" in told, told
 
 
+@pytest.mark.slow
 def test_a_view_as_a_file_and_a_clear_word_without_the_extra(office, log, log_file, tmp_path, monkeypatch, capsys):
     pytest.importorskip("rerun")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -533,6 +549,7 @@ def test_status_lines_are_lines():
     assert "1 gaps" in status.line()
 
 
+@pytest.mark.slow
 def test_records_need_a_place(tmp_path, office, log_file):
     with pytest.raises(SonarError, match="allowed"):
         stream(f"file:{log_file}?speed=0", office.ring, record=tmp_path / "no" / "x.csv")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxsonar import Log, Ring, Room, SonarError, simulate
-from jaxsonar.geometry.se2 import composed, inverse, to_world, wrap_angle
+from jaxsonar.geometry.se2 import compose, inverse, transform_points, wrap_angle
 from jaxsonar.localization.localize import Localized, localize
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.simulation.office import load_office
@@ -59,16 +59,17 @@ def world():
     return world_of(office().room.walls)
 
 
+@pytest.mark.slow
 def test_found_from_nothing_wherever_the_map_lies(world):
     """Odometry begins somewhere else, and the map is turned: poses turn with it."""
     some = log()[:10]
-    odometry = composed(np.array([5.0, -3.0, 1.0]), office().poses[:10])
+    odometry = compose(np.array([5.0, -3.0, 1.0]), office().poses[:10])
     found = localize(RING, world, replace(some, pose=odometry), sigma=SIGMA)
     assert_there(found, office().poses[:10])
     turn = np.array([-4.0, 7.0, 2.5])
-    moved = localize(RING, world_of(to_world(turn, office().room.walls)), some, sigma=SIGMA)
-    assert_there(moved, composed(turn, office().poses[:10]))
-    np.testing.assert_allclose(composed(inverse(turn), moved.poses), found.poses, atol=2e-3)
+    moved = localize(RING, world_of(transform_points(turn, office().room.walls)), some, sigma=SIGMA)
+    assert_there(moved, compose(turn, office().poses[:10]))
+    np.testing.assert_allclose(compose(inverse(turn), moved.poses), found.poses, atol=2e-3)
 
 
 def test_one_scan_and_a_rough_pose(world):
@@ -78,6 +79,7 @@ def test_one_scan_and_a_rough_pose(world):
         assert_there(found, truth)
 
 
+@pytest.mark.slow
 def test_rooms_that_look_alike_from_both_ends():
     """A rectangle is itself after half a turn: two places, and nothing is guessed."""
     walls = np.array([[[0, 0], [3, 0]], [[3, 0], [3, 2]], [[3, 2], [0, 2]], [[0, 2], [0, 0]]], dtype=float)
@@ -105,6 +107,7 @@ def test_corners_of_a_floor_plan_are_heard_too(world):
     assert found.places[0].explained > 0.6
 
 
+@pytest.mark.slow
 def test_another_place_is_not_in_the_map(world):
     walls = np.array([[[0, 0], [1.3, 0.2]], [[1.3, 0.2], [1.9, 1.4]], [[1.9, 1.4], [0.2, 1.7]], [[0.2, 1.7], [0, 0]]])
     poses = np.array([[0.8, 0.8, 0.1 * k] for k in range(4)])

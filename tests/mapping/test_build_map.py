@@ -9,14 +9,16 @@ import shapely
 from support import oracles
 
 from jaxsonar import Log, Ring, Room, SonarError, load_log, local_models, random_pose, random_room, save_log, simulate
-from jaxsonar.detection.extract import METHODS
+from jaxsonar.detection.settings import METHODS
 from jaxsonar.geometry.se2 import rotation
-from jaxsonar.mapping.build_map import CONFIRMED, MERGINGS, assemble, build_map, gather_evidence
+from jaxsonar.mapping.build_map import MERGING_METHODS, assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.mapping.wall_segments import SIGMA_THETA
+from jaxsonar.mapping.map_evidence import gather_evidence
+from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.simulation.office import load_office
 from jaxsonar.simulation.simulator import Kind
 
+LEAST_SCANS = SETTINGS.evidence.min_scans
 SIGMA = 0.003
 SEEDS = range(5)
 ON_WALL, ON_ANGLE, BEYOND = 0.06, math.radians(6.0), 0.12
@@ -111,7 +113,7 @@ def well_heard(sim, room, scans, *, least=8):
     counts = np.zeros((scans, len(room.walls)), int)
     plane = sim.kind == Kind.PLANE
     np.add.at(counts, (sim.scan[plane], sim.reflector[plane]), 1)
-    return np.flatnonzero((counts >= least).sum(axis=0) >= CONFIRMED)
+    return np.flatnonzero((counts >= least).sum(axis=0) >= LEAST_SCANS)
 
 
 def covered(world, line, *, within=0.08):
@@ -126,7 +128,7 @@ def covered(world, line, *, within=0.08):
     return total
 
 
-@pytest.mark.parametrize("merging", MERGINGS)
+@pytest.mark.parametrize("merging", MERGING_METHODS)
 @pytest.mark.parametrize("shift", [(0.3, -0.7), (-12.1, 4.0), (1000.0, 0.1)])
 def test_moving_the_world_by_whole_cells_moves_the_map_and_nothing_else(office_log, shift, merging):
     """Cells of the floor are 5 and 10 cm: shifts by tenths of a metre map them onto one another."""
@@ -151,15 +153,16 @@ def test_the_evidence_of_two_parts_is_that_of_the_whole(office_log, split):
     parts = [in_order(office_log, rows) for rows in np.split(np.arange(len(office_log)), [split])]
     one, other = (gather_evidence(RING, part, list(local_models(RING, part))) for part in parts)
     whole = gather_evidence(RING, office_log, list(local_models(RING, office_log)))
-    for both in (one.joined(other), other.joined(one)):
+    for both in (one.union(other), other.union(one)):
         assert both.models == whole.models == 17
-        assert (both.cut, both.gap) == (whole.cut, whole.gap)
-        for merging in MERGINGS:
-            came, wanted = assemble(both, merging=merging), assemble(whole, merging=merging)
+        assert (both.linkage_distance, both.gap) == (whole.linkage_distance, whole.gap)
+        for merging in MERGING_METHODS:
+            came, wanted = assemble_map(both, merging=merging), assemble_map(whole, merging=merging)
             assert_same_map(came, wanted, atol=1e-9 if merging == "fused" else 1e-5)
 
 
-@pytest.mark.parametrize("merging", MERGINGS)
+@pytest.mark.slow
+@pytest.mark.parametrize("merging", MERGING_METHODS)
 @pytest.mark.parametrize("seed", range(3))
 def test_the_order_of_the_scans_does_not_matter(office_log, seed, merging):
     order = np.random.default_rng(seed).permutation(len(office_log)) if seed else np.arange(len(office_log))[::-1]
@@ -183,13 +186,13 @@ def test_a_map_says_what_it_promises(office_maps):
         assert (world.rho >= 0).all()
         assert ((world.theta >= -np.pi) & (world.theta < np.pi)).all()
         assert (np.diff(world.echoes) <= 0).all()
-        assert all(list(scans) == sorted(set(scans)) and len(scans) >= CONFIRMED for scans in world.scans)
+        assert all(list(scans) == sorted(set(scans)) and len(scans) >= LEAST_SCANS for scans in world.scans)
         assert (world.sigma_rho > 0).all()
         assert (world.sigma_theta > 0).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("merging", MERGINGS)
+@pytest.mark.parametrize("merging", MERGING_METHODS)
 def test_one_scan_is_a_map(office_log, merging, method):
     """Nothing can confirm it: the map is its local model, in the world."""
     world = build_map(RING, office_log[:1], merging=merging, method=method)
@@ -197,14 +200,14 @@ def test_one_scan_is_a_map(office_log, merging, method):
     assert 1 <= len(world) <= len(model.lines)
     alone = len(world) == len(model.lines)
     if alone and method == "hough":
-        assert world.sigma_theta == pytest.approx(SIGMA_THETA, rel=1e-9)  # what is expected of one line
+        assert world.sigma_theta == pytest.approx(SETTINGS.segments.theta_sd, rel=1e-9)  # what is expected of one line
     elif alone:
         expected = [math.sqrt(line.cov[1, 1]) for line in model.lines if line.cov is not None]
         np.testing.assert_allclose(np.sort(world.sigma_theta), np.sort(expected), rtol=1e-6)
     assert set(world.scans) == {(0,)}
 
 
-@pytest.mark.parametrize("merging", MERGINGS)
+@pytest.mark.parametrize("merging", MERGING_METHODS)
 def test_nothing_in_nothing_out(office_log, merging):
     """No scan at all; scans that heard nothing; scans that heard only what is beyond reach."""
     empty = build_map(RING, office_log[:0], merging=merging)
@@ -219,7 +222,7 @@ def test_nothing_in_nothing_out(office_log, merging):
     assert len(build_map(RING, far, merging=merging)) == 0
 
 
-@pytest.mark.parametrize("merging", MERGINGS)
+@pytest.mark.parametrize("merging", MERGING_METHODS)
 def test_a_robot_that_is_shut_in_still_gets_a_map(merging):
     """All sensors hear something close by: no place is claimed to be free."""
     tx = np.arange(24)
@@ -227,7 +230,7 @@ def test_a_robot_that_is_shut_in_still_gets_a_map(merging):
     assert isinstance(build_map(RING, log, merging=merging), GlobalMap)
 
 
-@pytest.mark.parametrize("merging", MERGINGS)
+@pytest.mark.parametrize("merging", MERGING_METHODS)
 def test_scans_without_a_pose_are_left_out(office_log, merging):
     pose = office_log.pose.copy()
     pose[[0, 5, 16]] = np.nan
@@ -237,7 +240,7 @@ def test_scans_without_a_pose_are_left_out(office_log, merging):
     assert not {0, 5, 16} & {scan for scans in with_some.scans for scan in scans}
 
 
-@pytest.mark.parametrize("merging", MERGINGS)
+@pytest.mark.parametrize("merging", MERGING_METHODS)
 @pytest.mark.parametrize("window", [None, 1.0])
 def test_a_log_without_a_single_pose_is_refused(office_log, merging, window):
     lost = with_poses(office_log, np.full((17, 3), np.nan))
@@ -361,6 +364,7 @@ def heard(walls, poses, *, seed, ring=RING):
     return simulate(ring, room, poses, sigma=SIGMA, seed=seed).as_log(ring, poses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "rounds"), [(28, 2), (56, 1)])
 @pytest.mark.parametrize("thing", [BOX, CHAIR], ids=["box", "chair"])
 def test_what_is_gone_leaves_the_map_and_what_is_new_enters_it(thing, count, rounds):

@@ -10,12 +10,14 @@ from hypothesis import strategies as st
 from support import oracles
 
 from jaxsonar import Log, Ring, load_ring, local_models, random_pose, random_room, simulate
-from jaxsonar.geometry.se2 import to_world
-from jaxsonar.mapping.build_map import gather_evidence
-from jaxsonar.mapping.free_space import CELL, DIRECTIONS, FACING, HIDDEN, LATEST, MARGIN, SURE, SeenThrough, silence
+from jaxsonar.geometry.se2 import transform_points
+from jaxsonar.mapping.free_space import DirectionalFreeSpace, observe_free_space
+from jaxsonar.mapping.map_evidence import gather_evidence
+from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.simulation.office import load_office
 
-STEP = 2 * math.pi / DIRECTIONS
+FREE = SETTINGS.free_space
+STEP = 2 * math.pi / FREE.directions
 RAYS, POINTS = 17, 33
 """Rays of a cone, as the code has them; the oracle shares the samples, not the arithmetic."""
 BUMPER = Ring(
@@ -28,23 +30,23 @@ BUMPER = Ring(
 
 
 def direction_of(theta):
-    return math.floor((theta % (2 * math.pi)) / STEP) % DIRECTIONS
+    return math.floor((theta % (2 * math.pi)) / STEP) % FREE.directions
 
 
 def place_of(point, theta):
     """(cell x, cell y, direction) of a wall at a point with a normal."""
-    return math.floor(point[0] / CELL), math.floor(point[1] / CELL), direction_of(theta)
+    return math.floor(point[0] / FREE.cell), math.floor(point[1] / FREE.cell), direction_of(theta)
 
 
 def centre_of(cells):
     """A point and a normal in the middle of each cell."""
     cells = np.asarray(cells)
-    return (cells[:, :2] + 0.5) * CELL, (cells[:, 2] + 0.5) * STEP
+    return (cells[:, :2] + 0.5) * FREE.cell, (cells[:, 2] + 0.5) * STEP
 
 
 def some_cells(rng, count, *, around=(0, 0)):
     """Cells over several tiles on both sides of a place, many of them more than once."""
-    cells = np.column_stack([rng.integers(-40, 40, (count, 2)), rng.integers(0, DIRECTIONS, count)])
+    cells = np.column_stack([rng.integers(-40, 40, (count, 2)), rng.integers(0, FREE.directions, count)])
     cells = cells[rng.integers(0, max(count // 4, 1), count)]
     return cells + np.array([*around, 0]), rng.integers(-5, 50, count).astype(float)
 
@@ -59,15 +61,16 @@ def copied(seen):
     return {key: times.copy() for key, times in seen.tiles.items()}
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.integers(0, 300), st.integers(1, 6))
 def test_any_split_and_order_of_the_scans_is_remembered_alike(seed, count, parts):
     rng = np.random.default_rng(seed)
     cells, when = some_cells(rng, count)
-    whole = SeenThrough().including(cells, when)
-    apart = SeenThrough()
+    whole = DirectionalFreeSpace().updated(cells, when)
+    apart = DirectionalFreeSpace()
     for rows in np.array_split(rng.permutation(count), parts):
-        apart = apart.including(cells[rows], when[rows])
+        apart = apart.updated(cells[rows], when[rows])
     assert_same(whole, apart)
 
 
@@ -77,49 +80,50 @@ def test_the_latest_are_remembered_and_told_latest_first(seed, count, around):
     """Against sorting the times of every cell by hand; also on both sides of the origin and 100 km from it."""
     rng = np.random.default_rng(seed)
     cells, when = some_cells(rng, count, around=around)
-    seen = SeenThrough().including(cells, when)
+    seen = DirectionalFreeSpace().updated(cells, when)
     points, theta = centre_of(cells)
-    told = seen.look(points, theta + 2 * math.pi * rng.integers(-2, 3, count))
+    told = seen.query(points, theta + 2 * math.pi * rng.integers(-2, 3, count))
     for cell, times in zip(cells, told, strict=True):
-        by_hand = sorted(when[(cells == cell).all(axis=1)].tolist(), reverse=True)[:LATEST]
-        assert times.tolist() == by_hand + [-np.inf] * (LATEST - len(by_hand))
+        by_hand = sorted(when[(cells == cell).all(axis=1)].tolist(), reverse=True)[: FREE.remembered]
+        assert times.tolist() == by_hand + [-np.inf] * (FREE.remembered - len(by_hand))
 
 
 def test_what_was_never_seen_through_is_not_told(rng):
     cells, when = some_cells(rng, 200)
-    seen = SeenThrough().including(cells, when)
+    seen = DirectionalFreeSpace().updated(cells, when)
     known = set(map(tuple, cells.tolist()))
     others = [cell for cell in map(tuple, some_cells(rng, 2000)[0].tolist()) if cell not in known]
     assert len(others) > 100
-    assert np.isneginf(seen.look(*centre_of(others))).all()
-    assert np.isneginf(SeenThrough().look(*centre_of(cells))).all()
-    assert seen.look(np.zeros((0, 2)), np.zeros(0)).shape == (0, LATEST)
+    assert np.isneginf(seen.query(*centre_of(others))).all()
+    assert np.isneginf(DirectionalFreeSpace().query(*centre_of(cells))).all()
+    assert seen.query(np.zeros((0, 2)), np.zeros(0)).shape == (0, FREE.remembered)
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(st.integers(0, 10_000), st.lists(st.integers(0, 120), min_size=3, max_size=3))
 def test_joining_is_a_sum(seed, counts):
     """Commutative, associative, neutral with nothing, and the same as including all at once."""
     rng = np.random.default_rng(seed)
     parts = [some_cells(rng, count) for count in counts]
-    a, b, c = (SeenThrough().including(*part) for part in parts)
-    assert_same(a.joined(b), b.joined(a))
-    assert_same(a.joined(b).joined(c), a.joined(b.joined(c)))
-    assert_same(a.joined(SeenThrough()), a)
-    assert_same(SeenThrough().joined(a), a)
+    a, b, c = (DirectionalFreeSpace().updated(*part) for part in parts)
+    assert_same(a.union(b), b.union(a))
+    assert_same(a.union(b).union(c), a.union(b.union(c)))
+    assert_same(a.union(DirectionalFreeSpace()), a)
+    assert_same(DirectionalFreeSpace().union(a), a)
     cells, when = (np.concatenate(column) for column in zip(*parts, strict=True))
-    assert_same(a.joined(b).joined(c), SeenThrough().including(cells, when))
+    assert_same(a.union(b).union(c), DirectionalFreeSpace().updated(cells, when))
 
 
 def test_old_states_stay_as_they_were(rng):
-    first = SeenThrough().including(*some_cells(rng, 300))
-    second = SeenThrough().including(*some_cells(rng, 300))
+    first = DirectionalFreeSpace().updated(*some_cells(rng, 300))
+    second = DirectionalFreeSpace().updated(*some_cells(rng, 300))
     before, before_second = copied(first), copied(second)
-    first.including(*some_cells(rng, 300)).including(*some_cells(rng, 300))
-    first.joined(second)
-    second.joined(first)
-    assert_same(first, SeenThrough(before))
-    assert_same(second, SeenThrough(before_second))
+    first.updated(*some_cells(rng, 300)).updated(*some_cells(rng, 300))
+    first.union(second)
+    second.union(first)
+    assert_same(first, DirectionalFreeSpace(before))
+    assert_same(second, DirectionalFreeSpace(before_second))
 
 
 def path_geometry(ring, path):
@@ -135,7 +139,7 @@ def slow_silence(ring, pose, echoes, walls):
     """Cells that one scan (path, reach) saw through: loops over sensors, rays and distances, shapely for what hides."""
     hides = []
     for start, end in walls:
-        beyond = HIDDEN * (end - start) / np.linalg.norm(end - start)
+        beyond = FREE.extension * (end - start) / np.linalg.norm(end - start)
         normal = math.atan2(beyond[0], -beyond[1])
         hides.append((normal, shapely.LineString([start, end]), shapely.LineString([start - beyond, end + beyond])))
     votes = {}
@@ -143,34 +147,34 @@ def slow_silence(ring, pose, echoes, walls):
         if tx != rx:
             continue
         middle, first, width = path_geometry(ring, path)
-        sensor = to_world(pose, middle)
+        sensor = transform_points(pose, middle)
         nearest = min([reach for k, reach in echoes if k == path], default=math.inf)
-        nearest = min(nearest, SURE * ring.max_range + MARGIN)
+        nearest = min(nearest, FREE.certain * ring.max_range + FREE.margin)
         for k in range(RAYS):
-            theta = pose[2] + first + width * (0.5 + SURE * (k / (RAYS - 1) - 0.5))
+            theta = pose[2] + first + width * (0.5 + FREE.certain * (k / (RAYS - 1) - 0.5))
             ray = np.array([math.cos(theta), math.sin(theta)])
             sight = shapely.LineString([sensor, sensor + 100 * ray])
             # A wall may go on beyond its ends, but whoever faces it there would have heard it.
-            facing = [abs(oracles.wrap(2 * (theta - normal))) / 2 <= FACING for normal, _, _ in hides]
+            facing = [abs(oracles.wrap(2 * (theta - normal))) / 2 <= FREE.facing for normal, _, _ in hides]
             met = [seen if faces else guessed for faces, (_, seen, guessed) in zip(facing, hides, strict=True)]
             met = [sight.intersection(wall) for wall in met if sight.intersects(wall)]
             hidden = min((shapely.Point(sensor).distance(place) for place in met), default=math.inf)
-            distance = CELL / 2
-            while distance < SURE * ring.max_range:
+            distance = FREE.cell / 2
+            while distance < FREE.certain * ring.max_range:
                 cell = place_of(sensor + distance * ray, theta)
-                middle = (np.array(cell[:2]) + 0.5) * CELL
-                sector = 2 * math.pi / DIRECTIONS
+                middle = (np.array(cell[:2]) + 0.5) * FREE.cell
+                sector = 2 * math.pi / FREE.directions
                 faced = (cell[2] * sector - pose[2] - first) % (2 * math.pi) <= width - sector
-                if faced and max(distance, np.linalg.norm(middle - sensor)) < min(nearest, hidden) - MARGIN:
+                if faced and max(distance, np.linalg.norm(middle - sensor)) < min(nearest, hidden) - FREE.margin:
                     votes.setdefault(cell, set()).add(path)
-                distance += CELL * 0.7
+                distance += FREE.cell * 0.7
     against = set()
     for path, reach in echoes:
         middle, first, width = path_geometry(ring, path)
-        sensor = to_world(pose, middle)
+        sensor = transform_points(pose, middle)
         for k in range(POINTS):
             theta = pose[2] + first + width * k / (POINTS - 1)
-            for distance in (reach - CELL / 2, reach, reach + CELL / 2):
+            for distance in (reach - FREE.cell / 2, reach, reach + FREE.cell / 2):
                 point = sensor + distance * np.array([math.cos(theta), math.sin(theta)])
                 against.add(place_of(point, theta))
     together = sum(path_geometry(ring, k)[2] for k, (tx, rx) in enumerate(ring.paths) if tx == rx) / (2 * math.pi)
@@ -187,10 +191,11 @@ def quick_silence(ring, poses, echoes, walls):
     flat = [echo for part in echoes for echo in part]
     path = np.array([k for k, _ in flat], np.int64)
     reach = np.array([r for _, r in flat], np.float64)
-    cells, who = silence(ring, np.asarray(poses, np.float64), scan, path, reach, walls)
+    cells, who = observe_free_space(ring, np.asarray(poses, np.float64), scan, path, reach, walls)
     return [set(map(tuple, cells[who == k].tolist())) for k in range(len(poses))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ring", [Ring.circular(), Ring.circular(count=12, beam=0.9, neighbors=1), BUMPER, load_ring("corridor8")]
 )
@@ -217,7 +222,7 @@ def test_no_echo_at_all_rules_out_the_cones(faw_ring):
     (cells,) = quick_silence(faw_ring, [(0.0, 0.0, 0.0)], [[]], [np.zeros((0, 2, 2))])
     points, theta = centre_of(sorted(cells))
     farthest = np.linalg.norm(points, axis=-1).max()
-    assert 0.28 + SURE * 2.0 - 2 * CELL < farthest < 0.28 + SURE * 2.0 + CELL
+    assert 0.28 + FREE.certain * 2.0 - 2 * FREE.cell < farthest < 0.28 + FREE.certain * 2.0 + FREE.cell
     # Most places that face a sensor, all around; farther ones lie between the rays.
     rng = np.random.default_rng(0)
     claimed = []
@@ -238,13 +243,15 @@ def test_no_echo_at_all_rules_out_the_cones(faw_ring):
 def test_nothing_seen_through_changes_nothing(rng):
     """A scan that claims no place: all sensors heard something close by."""
     nothing = (np.zeros((0, 3), np.int64), np.zeros(0))
-    assert_same(SeenThrough().including(*nothing), SeenThrough())
-    seen = SeenThrough().including(*some_cells(rng, 50))
-    assert_same(seen.including(*nothing), seen)
+    assert_same(DirectionalFreeSpace().updated(*nothing), DirectionalFreeSpace())
+    seen = DirectionalFreeSpace().updated(*some_cells(rng, 50))
+    assert_same(seen.updated(*nothing), seen)
 
 
 def test_a_deaf_ring_says_nothing(faw_ring):
-    cells, who = silence(faw_ring, np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), [])
+    cells, who = observe_free_space(
+        faw_ring, np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), []
+    )
     assert cells.shape == (0, 3)
     assert len(who) == 0
 
@@ -260,13 +267,13 @@ def test_the_echo_of_a_wall_keeps_its_place(rho, theta, heading, x):
     normal = np.array([math.cos(theta), math.sin(theta)])
     for position in ring.position:
         for shift in (-0.03, 0.0, 0.03):
-            foot = to_world(pose, position + (rho - position @ normal + shift) * normal)
+            foot = transform_points(pose, position + (rho - position @ normal + shift) * normal)
             assert place_of(foot, theta + heading) not in cells
     points, facing = centre_of(sorted(cells))
     robot = (points - pose[:2]) @ np.array(
         [[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]]
     )
-    behind = (robot @ normal > rho + CELL) & (np.abs(oracles.wrap(facing - theta - heading)) < math.radians(10))
+    behind = (robot @ normal > rho + FREE.cell) & (np.abs(oracles.wrap(facing - theta - heading)) < math.radians(10))
     assert not behind.any()
 
 
@@ -274,7 +281,7 @@ def true_places(ring, room, pose):
     """Places of true walls that face a sensor: the foot is on the wall, in the cone, within range, and in sight."""
     places = {}
     for sensor, heading, beam in zip(ring.position, ring.heading, ring.beam, strict=True):
-        at = to_world(pose, sensor)
+        at = transform_points(pose, sensor)
         for k, (start, end) in enumerate(room.walls):
             along = (end - start) / np.linalg.norm(end - start)
             share = (at - start) @ along
@@ -293,6 +300,7 @@ def true_places(ring, room, pose):
     return places
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_no_true_wall_is_seen_through(faw_ring, seed):
     """In random rooms without noise; with what the scans show of walls, and without."""
@@ -302,7 +310,7 @@ def test_no_true_wall_is_seen_through(faw_ring, seed):
     heard = simulate(faw_ring, room, poses)
     near = heard.range < faw_ring.max_range
     nothing = [np.zeros((0, 2, 2))] * len(poses)
-    cells, who = silence(faw_ring, poses, heard.scan[near], heard.path[near], heard.range[near], nothing)
+    cells, who = observe_free_space(faw_ring, poses, heard.scan[near], heard.path[near], heard.range[near], nothing)
     checked = 0
     for k, pose in enumerate(poses):
         claimed = set(map(tuple, cells[who == k].tolist()))
@@ -318,10 +326,10 @@ def test_the_walls_of_the_office_are_never_seen_through():
     office = load_office()
     heard = simulate(office.ring, office.room, office.poses, stamps=office.stamps)
     log = heard.as_log(office.ring, office.poses)
-    seen = gather_evidence(office.ring, log, list(local_models(office.ring, log))).seen
+    seen = gather_evidence(office.ring, log, list(local_models(office.ring, log))).free_space
     truth = {place for pose in office.poses for place in true_places(office.ring, office.room, pose)}
     points, theta = centre_of(sorted(truth))
-    told = seen.look(points, theta)
+    told = seen.query(points, theta)
     assert len(truth) > 50
     assert np.isneginf(told[:, -1]).all()  # three scans in agreement would remove a wall
 
@@ -335,5 +343,5 @@ def test_only_scans_with_a_pose_and_echoes_within_range_speak(faw_ring):
     silent = Log.from_echoes(
         np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0), stamp=np.zeros(1), pose=np.zeros((1, 3))
     )
-    came = [gather_evidence(faw_ring, log, list(local_models(faw_ring, log))).seen for log in (far, silent)]
+    came = [gather_evidence(faw_ring, log, list(local_models(faw_ring, log))).free_space for log in (far, silent)]
     assert_same(*came)

@@ -8,11 +8,12 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.cluster.hierarchy import fcluster, linkage
 from support import oracles
-from support.segments import moved, pieces_at, same
+from support.segments import moved, same, segments_at
 
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.kernels import HoughSettings
-from jaxsonar.mapping.hough_merging import THRESHOLD, merge_as_paper, single_linkage
+from jaxsonar.mapping.hough_merging import merge_by_hough, single_linkage
+from jaxsonar.mapping.settings import SETTINGS
 
 CUT = 0.4
 SEEDS = st.integers(0, 2**32 - 1)
@@ -73,7 +74,7 @@ SETS = [
 
 @pytest.mark.parametrize("points", SETS, ids=lambda points: points.__name__)
 @settings(max_examples=25, phases=[Phase.generate])
-@given(seed=SEEDS, n=st.integers(2, 50), cut=st.sampled_from([0.05, 0.4, 2.0]))
+@given(seed=SEEDS, n=st.integers(2, 50), linkage_distance=st.sampled_from([0.05, 0.4, 2.0]))
 def test_single_linkage_is_that_of_scipy(points, seed, n, cut):
     found = points(np.random.default_rng(seed), n)
     cluster = single_linkage(found, cut)
@@ -100,23 +101,23 @@ def test_a_chain_is_one_cluster():
 # --- clusters of lines ---
 
 
-def paper(pieces, cut):
+def paper(segments, cut):
     """The recipe step by step: members, and (foot, direction up to half a turn, both ends) of each merged line."""
-    midpoints = pieces.segments.mean(axis=1)
-    cluster = fcluster(linkage(midpoints, "single"), cut, "distance") if len(pieces) > 1 else np.zeros(1)
+    midpoints = segments.endpoints.mean(axis=1)
+    cluster = fcluster(linkage(midpoints, "single"), cut, "distance") if len(segments) > 1 else np.zeros(1)
     merged = []
     for k in np.unique(cluster):
         members = np.flatnonzero(cluster == k)
         origin = midpoints[members].mean(axis=0)
         lines = []
         for m in members:
-            rho, theta = (pieces.centre[m] - origin) @ pieces.normal[m], pieces.theta[m]
+            rho, theta = (segments.centre[m] - origin) @ segments.normal[m], segments.theta[m]
             lines.append((rho, theta) if rho >= 0 else (-rho, oracles.wrap(theta + math.pi)))
         columns = int(max(rho for rho, _ in lines) / 0.10) + 3
         settings = HoughSettings(rho_cell=0.10, rho_cells=columns)
         assert settings.theta_cell == pytest.approx(0.0628, abs=1e-4)
         cells = [oracles.cell(rho, theta, settings) for rho, theta in lines]
-        mask = oracles.lowpass(oracles.accumulate(cells, settings), settings) > THRESHOLD
+        mask = oracles.lowpass(oracles.accumulate(cells, settings), settings) > SETTINGS.hough.threshold
         for component in oracles.components(mask):
             mine = [i for i, cell in enumerate(cells) if cell in component]
             if mine:
@@ -124,11 +125,11 @@ def paper(pieces, cut):
     return merged
 
 
-def projected(pieces, members, origin, line):
+def projected(segments, members, origin, line):
     """Outermost projections of the ends of the members onto the line."""
     rho, theta = line
     n, t = np.array([math.cos(theta), math.sin(theta)]), np.array([-math.sin(theta), math.cos(theta)])
-    way = [(end - origin) @ t for end in pieces.segments[members].reshape(-1, 2)]
+    way = [(end - origin) @ t for end in segments.endpoints[members].reshape(-1, 2)]
     return np.array([origin + rho * n + s * t for s in (min(way), max(way))])
 
 
@@ -149,28 +150,30 @@ def office(rng, count):
     turn = theta[wall] + rng.normal(0, np.radians(3), count)
     stray = rng.random(count) < 0.1
     centre[stray], turn[stray] = rng.uniform(-3, 3, (stray.sum(), 2)), rng.uniform(-np.pi, np.pi, stray.sum())
-    return pieces_at(centre, turn, length=rng.uniform(0.3, 0.6, count))
+    return segments_at(centre, turn, length=rng.uniform(0.3, 0.6, count))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_merging_is_the_recipe_of_the_paper(seed):
     rng = np.random.default_rng(seed)
-    pieces = office(rng, int(rng.integers(20, 50)))
-    merged, expected = merge_as_paper(pieces, cut=CUT), paper(pieces, CUT)
-    assert sorted(merged.scan_lists()) == sorted(tuple(pieces.scans[1][m].tolist()) for m, _, _ in expected)
+    segments = office(rng, int(rng.integers(20, 50)))
+    merged, expected = merge_by_hough(segments, linkage_distance=CUT), paper(segments, CUT)
+    assert sorted(merged.scan_lists()) == sorted(tuple(segments.scans[1][m].tolist()) for m, _, _ in expected)
     got = {lists: k for k, lists in enumerate(merged.scan_lists())}
     for members, origin, line in expected:
-        k = got[tuple(pieces.scans[1][members].tolist())]
-        ends = pieces.segments[members[0]] if len(members) == 1 else projected(pieces, members, origin, line)
-        assert undirected(merged.segments[k]) == pytest.approx(undirected(ends), abs=1e-4)
+        k = got[tuple(segments.scans[1][members].tolist())]
+        ends = segments.endpoints[members[0]] if len(members) == 1 else projected(segments, members, origin, line)
+        assert undirected(merged.endpoints[k]) == pytest.approx(undirected(ends), abs=1e-4)
         assert merged.count[k] == len(members)
-        assert merged.echoes[k] == pieces.echoes[members].sum()
+        assert merged.echoes[k] == segments.echoes[members].sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_every_segment_is_in_one_wall(seed):
-    pieces = office(np.random.default_rng(seed), 60)
-    merged = merge_as_paper(pieces, cut=CUT)
+    segments = office(np.random.default_rng(seed), 60)
+    merged = merge_by_hough(segments, linkage_distance=CUT)
     assert sorted(number for numbers in merged.scan_lists() for number in numbers) == list(range(60))
     assert merged.count.sum() == 60
 
@@ -183,15 +186,15 @@ def walls_apart(rng, count, each):
     along = np.tile((np.arange(each) - (each - 1) / 2) * 0.2, count)
     tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
     centre = place + along[:, None] * tangent + rng.normal(0, 0.005, (len(wall), 2))
-    return pieces_at(centre, theta + rng.normal(0, np.radians(1), len(wall)))
+    return segments_at(centre, theta + rng.normal(0, np.radians(1), len(wall)))
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_merging_again_changes_nothing_where_walls_are_well_apart(seed):
-    pieces = walls_apart(np.random.default_rng(seed), 9, 6)
-    merged = merge_as_paper(pieces, cut=CUT)
+    segments = walls_apart(np.random.default_rng(seed), 9, 6)
+    merged = merge_by_hough(segments, linkage_distance=CUT)
     assert len(merged) == 9
-    again = merge_as_paper(merged, cut=CUT)
+    again = merge_by_hough(merged, linkage_distance=CUT)
     order = [merged.scan_lists().index(numbers) for numbers in again.scan_lists()]
     assert same(again, merged.take(np.array(order)))
 
@@ -199,22 +202,28 @@ def test_merging_again_changes_nothing_where_walls_are_well_apart(seed):
 @pytest.mark.parametrize(("cells", "shift"), [(0, (12.3, -4.5)), (1, (0.0, 0.0)), (50, (-7.0, 3.0)), (77, (1e4, 1e4))])
 def test_moving_the_world_moves_the_walls_and_nothing_else(cells, shift):
     """Turns by whole cells of theta, which the accumulator cannot tell apart; any shift."""
-    pieces = office(np.random.default_rng(4), 40)
+    segments = office(np.random.default_rng(4), 40)
     pose = (*shift, cells * 2 * np.pi / 100)
-    here, there = moved(merge_as_paper(pieces, cut=CUT), pose), merge_as_paper(moved(pieces, pose), cut=CUT)
+    here, there = (
+        moved(merge_by_hough(segments, linkage_distance=CUT), pose),
+        merge_by_hough(moved(segments, pose), linkage_distance=CUT),
+    )
     assert sorted(there.scan_lists()) == sorted(here.scan_lists())
     order = np.array([there.scan_lists().index(numbers) for numbers in here.scan_lists()])
-    assert undirected(there.segments - shift) == pytest.approx(undirected(here.segments - shift), abs=1e-4)
-    assert there.take(order).misfit == pytest.approx(here.misfit, rel=1e-3, abs=1e-6)
+    assert undirected(there.endpoints - shift) == pytest.approx(undirected(here.endpoints - shift), abs=1e-4)
+    assert there.take(order).chi_squared == pytest.approx(here.chi_squared, rel=1e-3, abs=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_order_of_the_segments_does_not_matter(seed):
     rng = np.random.default_rng(seed)
-    pieces = office(rng, 40)
-    one, other = merge_as_paper(pieces, cut=CUT), merge_as_paper(pieces.take(rng.permutation(40)), cut=CUT)
+    segments = office(rng, 40)
+    one, other = (
+        merge_by_hough(segments, linkage_distance=CUT),
+        merge_by_hough(segments.take(rng.permutation(40)), linkage_distance=CUT),
+    )
     assert sorted(one.scan_lists()) == sorted(other.scan_lists())
-    assert undirected(one.segments) == pytest.approx(undirected(other.segments), abs=1e-5)
+    assert undirected(one.endpoints) == pytest.approx(undirected(other.endpoints), abs=1e-5)
 
 
 @pytest.mark.parametrize("theta", np.linspace(-np.pi, np.pi, 9))
@@ -222,16 +231,16 @@ def test_parallel_walls_in_one_cluster_are_two(theta):
     """Half a metre apart, their midpoints joined by a cut of 0.6 m."""
     along = np.linspace(-0.5, 0.5, 6)
     one, other = np.stack([0 * along, along], axis=-1), np.stack([0 * along + 0.5, along], axis=-1)
-    pieces = moved(pieces_at(np.concatenate([one, other]), np.zeros(12)), (1.0, 2.0, theta))
-    merged = merge_as_paper(pieces, cut=0.6)
+    segments = moved(segments_at(np.concatenate([one, other]), np.zeros(12)), (1.0, 2.0, theta))
+    merged = merge_by_hough(segments, linkage_distance=0.6)
     assert sorted(merged.scan_lists()) == [tuple(range(6)), tuple(range(6, 12))]
     assert merged.length == pytest.approx([1.5, 1.5], abs=1e-3)
 
 
 def test_merged_walls_face_as_their_pieces_do():
     """Normals point away from the robot, not from the middle of the cluster."""
-    pieces = pieces_at([[0, 0], [0, 0.3], [0.5, 0], [0.5, 0.3]], np.zeros(4))
-    merged = merge_as_paper(pieces, cut=0.6)
+    segments = segments_at([[0, 0], [0, 0.3], [0.5, 0], [0.5, 0.3]], np.zeros(4))
+    merged = merge_by_hough(segments, linkage_distance=0.6)
     assert len(merged) == 2
     assert np.abs(wrap_angle(merged.theta)) == pytest.approx([0, 0], abs=1e-3)
 
@@ -241,31 +250,32 @@ def test_a_wall_far_from_the_origin_is_not_lost(far):
     """Ten metres of the paper's accumulator, from the world's origin, would hold none of these."""
     along = np.linspace(-0.5, 0.5, 6)
     centre = np.stack([0 * along, along], axis=-1)
-    there = moved(pieces_at(centre, np.zeros(6)), (far, far, 0.3))
-    merged = merge_as_paper(there, cut=CUT)
+    there = moved(segments_at(centre, np.zeros(6)), (far, far, 0.3))
+    merged = merge_by_hough(there, linkage_distance=CUT)
     assert len(merged) == 1
     assert ((merged.centre - far) @ [math.cos(0.3), math.sin(0.3)]) == pytest.approx([0], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_large_cluster_of_walls_far_from_its_middle():
     """Walls along a street, one cluster: rho goes up to a kilometre from its middle, and more."""
     along = np.arange(0, 2500, 50.0)
-    merged = merge_as_paper(pieces_at(np.stack([along, 0 * along], axis=-1), 0 * along), cut=60.0)
+    merged = merge_by_hough(segments_at(np.stack([along, 0 * along], axis=-1), 0 * along), linkage_distance=60.0)
     assert len(merged) == len(along)
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_nothing_to_merge(count):
-    pieces = pieces_at(np.ones((count, 2)), np.ones(count))
-    assert same(merge_as_paper(pieces, cut=CUT), pieces)
+    segments = segments_at(np.ones((count, 2)), np.ones(count))
+    assert same(merge_by_hough(segments, linkage_distance=CUT), segments)
 
 
 def test_one_wall_seen_from_both_sides_and_around_the_cluster_is_one():
     """Lines around rho = 0, with normals to both sides: the seam at rho = 0."""
     along = np.linspace(-0.6, 0.6, 8)
     across = 0.01 * (-1.0) ** np.arange(8)
-    pieces = pieces_at(np.stack([across, along], axis=-1), np.pi * (np.arange(8) % 3 > 0))
-    merged = merge_as_paper(pieces, cut=CUT)
+    segments = segments_at(np.stack([across, along], axis=-1), np.pi * (np.arange(8) % 3 > 0))
+    merged = merge_by_hough(segments, linkage_distance=CUT)
     assert len(merged) == 1
     assert merged.count.tolist() == [8]
     assert abs(merged.centre[0, 0]) < 1e-3

@@ -7,12 +7,14 @@ import pytest
 import shapely
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from support.segments import moved, pieces_at, same
+from support.segments import moved, same, segments_at
 
 from jaxsonar.geometry.se2 import wrap_angle
-from jaxsonar.mapping.segment_fusion import TURN_GATE, fuse, mismatch
-from jaxsonar.mapping.wall_segments import SIGMA_OFFSET, SIGMA_THETA, join
+from jaxsonar.mapping.observations import concatenate
+from jaxsonar.mapping.segment_fusion import fuse_segments, mismatch
+from jaxsonar.mapping.settings import SETTINGS
 
+NOISE = SETTINGS.segments
 GAP = 0.5
 SEEDS = st.integers(0, 2**32 - 1)
 SOME = settings(max_examples=10, phases=[Phase.generate])
@@ -38,10 +40,10 @@ def seen_walls(rng, walls, each, *, noise=1.0, reach=0.2):
     normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=-1)
     place = np.tile((np.arange(each) + 0.5) / each, len(walls)) * (size - 2 * reach) + reach
     centre = walls[wall, 0] + place[:, None] * tangent
-    centre += noise * rng.normal(0, SIGMA_OFFSET, len(wall))[:, None] * normal
-    theta = np.arctan2(normal[:, 1], normal[:, 0]) + noise * rng.normal(0, SIGMA_THETA, len(wall))
+    centre += noise * rng.normal(0, NOISE.offset_sd, len(wall))[:, None] * normal
+    theta = np.arctan2(normal[:, 1], normal[:, 0]) + noise * rng.normal(0, NOISE.theta_sd, len(wall))
     order = rng.permutation(len(wall))
-    return pieces_at(centre, theta, length=2 * reach).take(order), wall[order]
+    return segments_at(centre, theta, length=2 * reach).take(order), wall[order]
 
 
 def every_pair(count):
@@ -66,8 +68,8 @@ def near(one, two, tolerance):
     one, two = in_one_order(one), in_one_order(two)
     assert len(one) == len(two)
     assert np.abs(wrap_angle(one.theta - two.theta)).max() < tolerance
-    assert np.abs(one.segments - two.segments).max() < tolerance
-    for name in ("info_offset", "info_theta", "misfit"):
+    assert np.abs(one.endpoints - two.endpoints).max() < tolerance
+    for name in ("info_offset", "info_theta", "chi_squared"):
         assert getattr(one, name) == pytest.approx(getattr(two, name), rel=1e-6), name
     assert one.echoes.tolist() == two.echoes.tolist()
     assert one.scan_lists() == two.scan_lists()
@@ -75,13 +77,13 @@ def near(one, two, tolerance):
 
 def clutter(rng, count):
     theta, length, scan = rng.uniform(-np.pi, np.pi, count), rng.uniform(0.1, 0.9, count), 1000 + np.arange(count)
-    return pieces_at(rng.uniform(0, 5, (count, 2)), theta, length=length, scans=(np.arange(count), scan))
+    return segments_at(rng.uniform(0, 5, (count, 2)), theta, length=length, scans=(np.arange(count), scan))
 
 
 def crowd(rng):
     """Anything: walls, and pieces that belong to none."""
     walls, _ = seen_walls(rng, HOUSE[rng.permutation(8)[:4]], int(rng.integers(2, 9)))
-    return join([walls, clutter(rng, int(rng.integers(0, 12)))])
+    return concatenate([walls, clutter(rng, int(rng.integers(0, 12)))])
 
 
 # --- what comes out is the walls ---
@@ -91,10 +93,10 @@ def crowd(rng):
 @given(SEEDS)
 def test_pieces_of_a_house_are_its_walls(seed):
     """Doors stay open, both faces of a partition stay apart, corners do not join."""
-    pieces, truth = seen_walls(np.random.default_rng(seed), HOUSE, 24, noise=0.7)
-    walls, wall_of = fuse(pieces, gap=GAP)
+    segments, truth = seen_walls(np.random.default_rng(seed), HOUSE, 24, noise=0.7)
+    walls, wall_of = fuse_segments(segments, gap=GAP)
     assert partition(wall_of) == partition(truth)
-    for k, ends in enumerate(walls.segments):
+    for k, ends in enumerate(walls.endpoints):
         true = HOUSE[truth[wall_of == k][0]]
         true = shapely.LineString(true)
         assert shapely.hausdorff_distance(shapely.LineString(ends), true) < 0.15
@@ -105,7 +107,7 @@ def test_pieces_of_a_house_are_its_walls(seed):
 @SOME
 @given(SEEDS, st.sampled_from([0.2, 0.5, 1.0]))
 def test_no_two_walls_match(seed, gap):
-    assert least_mismatch(fuse(crowd(np.random.default_rng(seed)), gap=gap)[0], gap) > 1
+    assert least_mismatch(fuse_segments(crowd(np.random.default_rng(seed)), gap=gap)[0], gap) > 1
 
 
 def parallels(offset, first, last, *, theta=0.0):
@@ -113,43 +115,44 @@ def parallels(offset, first, last, *, theta=0.0):
     first, last = np.broadcast_arrays(np.asarray(first, float), np.asarray(last, float), offset)[:2]
     centre = np.stack([np.asarray(offset, float), (first + last) / 2], axis=-1)
     sure = np.full(len(centre), 1e6)
-    return pieces_at(centre, theta + 0 * first, length=last - first, info_offset=sure, info_theta=sure)
+    return segments_at(centre, theta + 0 * first, length=last - first, info_offset=sure, info_theta=sure)
 
 
 @pytest.mark.parametrize("beside", range(13))
 def test_no_two_walls_match_however_many_lie_beside_them(beside):
     """Two that go on in one another, with 0.45 m between them, among walls 6.5 cm apart."""
     away = [0.065 * (k // 2 + 1) * (-1) ** k for k in range(beside)]
-    pieces = parallels([0, 0, *away], [-2, 0.45] + [-2.2] * beside, [0, 2] + [2.2] * beside)
-    walls, wall_of = fuse(pieces, gap=GAP)
+    segments = parallels([0, 0, *away], [-2, 0.45] + [-2.2] * beside, [0, 2] + [2.2] * beside)
+    walls, wall_of = fuse_segments(segments, gap=GAP)
     assert least_mismatch(walls) > 1
     assert wall_of[0] == wall_of[1]
     assert len(walls) == 1 + beside
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [0.05, 0.1, 0.2, 0.5])
 def test_no_two_pieces_match_whatever_their_directions(gap):
     """At one place, turned; gaps that are short beside the reach of a turn."""
     for degrees in range(1, 40):
-        pieces = pieces_at([[0, 0], [0, 0.3 + gap]], np.radians([0, degrees]), length=0.3)
-        for one in (pieces, pieces_at([[0, 0], [0, 0]], np.radians([0, degrees]))):
-            assert least_mismatch(fuse(one, gap=gap)[0], gap) > 1, degrees
+        segments = segments_at([[0, 0], [0, 0.3 + gap]], np.radians([0, degrees]), length=0.3)
+        for one in (segments, segments_at([[0, 0], [0, 0]], np.radians([0, degrees]))):
+            assert least_mismatch(fuse_segments(one, gap=gap)[0], gap) > 1, degrees
 
 
 @SOME
 @given(SEEDS)
 def test_every_piece_lies_on_its_wall(seed):
-    pieces = crowd(np.random.default_rng(seed))
-    walls, wall_of = fuse(pieces, gap=GAP)
+    segments = crowd(np.random.default_rng(seed))
+    walls, wall_of = fuse_segments(segments, gap=GAP)
     assert sorted(set(wall_of.tolist())) == list(range(len(walls)))
-    lists = pieces.scan_lists()
-    for k, ends in enumerate(walls.segments):
+    lists = segments.scan_lists()
+    for k, ends in enumerate(walls.endpoints):
         mine = np.flatnonzero(wall_of == k)
         assert walls.count[k] == len(mine)
-        assert walls.echoes[k] == pieces.echoes[mine].sum()
+        assert walls.echoes[k] == segments.echoes[mine].sum()
         assert walls.scan_lists()[k] == tuple(sorted(set().union(*(lists[m] for m in mine))))
         wall = shapely.LineString(ends).buffer(0.25, cap_style="square")
-        assert wall.covers(shapely.MultiLineString(list(pieces.segments[mine])))
+        assert wall.covers(shapely.MultiLineString(list(segments.endpoints[mine])))
 
 
 # --- laws ---
@@ -159,9 +162,9 @@ def test_every_piece_lies_on_its_wall(seed):
 @given(SEEDS)
 def test_the_order_of_the_pieces_does_not_matter(seed):
     rng = np.random.default_rng(seed)
-    pieces = crowd(rng)
-    order = rng.permutation(len(pieces))
-    (walls, wall_of), (again, shuffled) = fuse(pieces, gap=GAP), fuse(pieces.take(order), gap=GAP)
+    segments = crowd(rng)
+    order = rng.permutation(len(segments))
+    (walls, wall_of), (again, shuffled) = fuse_segments(segments, gap=GAP), fuse_segments(segments.take(order), gap=GAP)
     assert partition(wall_of) == partition(shuffled[np.argsort(order)])
     near(again, walls, 1e-9)
 
@@ -169,8 +172,8 @@ def test_the_order_of_the_pieces_does_not_matter(seed):
 @SOME
 @given(SEEDS)
 def test_fusing_again_changes_nothing(seed):
-    walls, _ = fuse(crowd(np.random.default_rng(seed)), gap=GAP)
-    again, wall_of = fuse(walls, gap=GAP)
+    walls, _ = fuse_segments(crowd(np.random.default_rng(seed)), gap=GAP)
+    again, wall_of = fuse_segments(walls, gap=GAP)
     assert same(again, walls)
     assert wall_of.tolist() == list(range(len(walls)))
 
@@ -178,33 +181,37 @@ def test_fusing_again_changes_nothing(seed):
 @SOME
 @given(SEEDS, st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-4, 4)))
 def test_moving_the_world_moves_the_walls_and_nothing_else(seed, pose):
-    pieces, _ = seen_walls(np.random.default_rng(seed), HOUSE, 9)
-    walls, wall_of = fuse(pieces, gap=GAP)
-    there, wall_of_there = fuse(moved(pieces, pose), gap=GAP)
+    segments, _ = seen_walls(np.random.default_rng(seed), HOUSE, 9)
+    walls, wall_of = fuse_segments(segments, gap=GAP)
+    there, wall_of_there = fuse_segments(moved(segments, pose), gap=GAP)
     assert partition(wall_of) == partition(wall_of_there)
     near(there, moved(walls, pose), 1e-9)
 
 
 @pytest.mark.parametrize("shift", [(1e4, 0), (-1e4, 1e4), (3e3, -1e4)])
 def test_far_from_the_origin(shift):
-    pieces, _ = seen_walls(np.random.default_rng(5), HOUSE, 9)
-    near(fuse(moved(pieces, (*shift, 0.0)), gap=GAP)[0], moved(fuse(pieces, gap=GAP)[0], (*shift, 0.0)), 1e-6)
+    segments, _ = seen_walls(np.random.default_rng(5), HOUSE, 9)
+    near(
+        fuse_segments(moved(segments, (*shift, 0.0)), gap=GAP)[0],
+        moved(fuse_segments(segments, gap=GAP)[0], (*shift, 0.0)),
+        1e-6,
+    )
 
 
 def test_walls_far_apart_do_not_matter_to_each_other():
-    pieces, _ = seen_walls(np.random.default_rng(5), HOUSE, 9)
-    far = moved(pieces, (1e4, -1e4, 1.0))
-    both, _ = fuse(join([pieces, far]), gap=GAP)
-    one, other = fuse(pieces, gap=GAP)[0], fuse(far, gap=GAP)[0]
+    segments, _ = seen_walls(np.random.default_rng(5), HOUSE, 9)
+    far = moved(segments, (1e4, -1e4, 1.0))
+    both, _ = fuse_segments(concatenate([segments, far]), gap=GAP)
+    one, other = fuse_segments(segments, gap=GAP)[0], fuse_segments(far, gap=GAP)[0]
     near(both.take(both.centre[:, 0] < 1e3), one, 1e-9)
     near(both.take(both.centre[:, 0] > 1e3), other, 1e-9)
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_nothing_to_fuse(count):
-    pieces = pieces_at(np.zeros((count, 2)), np.zeros(count))
-    walls, wall_of = fuse(pieces, gap=GAP)
-    assert same(walls, pieces)
+    segments = segments_at(np.zeros((count, 2)), np.zeros(count))
+    walls, wall_of = fuse_segments(segments, gap=GAP)
+    assert same(walls, segments)
     assert wall_of.tolist() == list(range(count))
 
 
@@ -215,8 +222,8 @@ def test_nothing_to_fuse(count):
 @pytest.mark.parametrize("theta", [0.0, 2.0, np.pi])
 def test_gaps(gap, theta):
     def two(between):
-        there = moved(pieces_at([[0, 0], [0, 0.4 + between]], [0, 0], length=0.4), (1, 2, theta))
-        return len(fuse(there, gap=gap)[0])
+        there = moved(segments_at([[0, 0], [0, 0.4 + between]], [0, 0], length=0.4), (1, 2, theta))
+        return len(fuse_segments(there, gap=gap)[0])
 
     assert two(-0.2) == two(0.0) == two(0.99 * gap) == 1
     assert two(1.01 * gap) == 2
@@ -228,8 +235,8 @@ def test_parallel_walls(seed, apart):
     """10 cm apart they are two, 2 cm apart the noise makes them one."""
     offset, expected = apart
     side = np.array([[[0, 0], [0, 2.0]], [[offset, 0], [offset, 2.0]]])
-    pieces, _ = seen_walls(np.random.default_rng(seed), side, 8, noise=0.5)
-    assert len(fuse(pieces, gap=GAP)[0]) == expected
+    segments, _ = seen_walls(np.random.default_rng(seed), side, 8, noise=0.5)
+    assert len(fuse_segments(segments, gap=GAP)[0]) == expected
 
 
 @SOME
@@ -237,8 +244,8 @@ def test_parallel_walls(seed, apart):
 def test_the_two_faces_of_a_wall(seed, apart):
     thick, expected = apart
     faces = np.array([[[0, 0], [0, 2.0]], [[thick, 2.0], [thick, 0]]])
-    pieces, _ = seen_walls(np.random.default_rng(seed), faces, 8, noise=0.3)
-    assert len(fuse(pieces, gap=GAP)[0]) == expected
+    segments, _ = seen_walls(np.random.default_rng(seed), faces, 8, noise=0.3)
+    assert len(fuse_segments(segments, gap=GAP)[0]) == expected
 
 
 @SOME
@@ -246,30 +253,30 @@ def test_the_two_faces_of_a_wall(seed, apart):
 def test_walls_that_meet_at_20_degrees_are_two(seed):
     turn = np.radians(20)
     bent = np.array([[[-2, 0], [0, 0]], [[0, 0], [2 * np.cos(turn), 2 * np.sin(turn)]]])
-    pieces, truth = seen_walls(np.random.default_rng(seed), bent, 8, noise=0.5)
-    assert partition(fuse(pieces, gap=GAP)[1]) == partition(truth)
+    segments, truth = seen_walls(np.random.default_rng(seed), bent, 8, noise=0.5)
+    assert partition(fuse_segments(segments, gap=GAP)[1]) == partition(truth)
 
 
 def test_the_gate_of_directions_is_that_many_standard_deviations():
     """Of their difference, with what walls and odometry add to it."""
-    spread = np.hypot(np.sqrt(2) * SIGMA_THETA, np.sqrt(2) * np.radians(1.5))
-    for turn, expected in ((0.9 * TURN_GATE * spread, 1), (1.1 * TURN_GATE * spread, 2)):
-        assert len(fuse(pieces_at([[0, 0], [0, 0]], [0, turn]), gap=GAP)[0]) == expected, np.degrees(turn)
+    spread = np.hypot(np.sqrt(2) * NOISE.theta_sd, np.sqrt(2) * np.radians(1.5))
+    for turn, expected in ((0.9 * SETTINGS.fusion.gate * spread, 1), (1.1 * SETTINGS.fusion.gate * spread, 2)):
+        assert len(fuse_segments(segments_at([[0, 0], [0, 0]], [0, turn]), gap=GAP)[0]) == expected, np.degrees(turn)
 
 
 def test_two_lines_that_cross_at_20_degrees_are_two():
-    assert len(fuse(pieces_at([[0, 0], [0, 0]], np.radians([0, 20])), gap=GAP)[0]) == 2
+    assert len(fuse_segments(segments_at([[0, 0], [0, 0]], np.radians([0, 20])), gap=GAP)[0]) == 2
 
 
 @SOME
 @given(SEEDS)
 def test_mismatch_does_not_depend_on_which_comes_first(seed):
-    pieces = crowd(np.random.default_rng(seed))
-    pairs = every_pair(len(pieces))
-    there, back = mismatch(pieces, pairs, gap=GAP), mismatch(pieces, pairs[:, ::-1].copy(), gap=GAP)
+    segments = crowd(np.random.default_rng(seed))
+    pairs = every_pair(len(segments))
+    there, back = mismatch(segments, pairs, gap=GAP), mismatch(segments, pairs[:, ::-1].copy(), gap=GAP)
     assert there == pytest.approx(back, rel=1e-9, abs=1e-9)
-    itself = np.repeat(np.arange(len(pieces))[:, None], 2, axis=1)
-    assert np.abs(mismatch(pieces, itself, gap=GAP)).max() < 1e-9
+    itself = np.repeat(np.arange(len(segments))[:, None], 2, axis=1)
+    assert np.abs(mismatch(segments, itself, gap=GAP)).max() < 1e-9
 
 
 # --- openings ---
@@ -277,7 +284,7 @@ def test_mismatch_does_not_depend_on_which_comes_first(seed):
 
 def test_openings_stay_open():
     """A wall with two gaps of 0.4 m; one of them was seen through."""
-    pieces = pieces_at([[0, 0], [0, 1.0], [0, 2.0]], np.zeros(3), length=0.6)
+    segments = segments_at([[0, 0], [0, 1.0], [0, 2.0]], np.zeros(3), length=0.6)
     asked = []
 
     def opening(gaps, theta):
@@ -285,23 +292,23 @@ def test_openings_stay_open():
         assert np.cos(theta) == pytest.approx(1)
         return gaps[:, :, 1].mean(axis=1) > 1
 
-    walls, wall_of = fuse(pieces, gap=GAP, opening=opening)
+    walls, wall_of = fuse_segments(segments, gap=GAP, is_opening=opening)
     assert wall_of[0] == wall_of[1] != wall_of[2]
-    assert np.sort(walls.segments[..., 1], axis=1).tolist() == [[pytest.approx(-0.3), pytest.approx(1.3)], [1.7, 2.3]]
+    assert np.sort(walls.endpoints[..., 1], axis=1).tolist() == [[pytest.approx(-0.3), pytest.approx(1.3)], [1.7, 2.3]]
     ways = {tuple(np.round(np.sort(np.array(gap)[:, 1]), 9).tolist()) for gap in asked}
     assert ways == {(0.3, 0.7), (1.3, 1.7)}
-    assert same(fuse(walls, gap=GAP, opening=opening)[0], walls)
+    assert same(fuse_segments(walls, gap=GAP, is_opening=opening)[0], walls)
 
 
 @SOME
 @given(SEEDS)
 def test_an_opening_that_is_never_there_changes_nothing(seed):
-    pieces = crowd(np.random.default_rng(seed))
-    walls, _ = fuse(pieces, gap=GAP, opening=lambda gaps, theta: np.zeros(len(gaps), bool))
-    assert same(walls, fuse(pieces, gap=GAP)[0])
+    segments = crowd(np.random.default_rng(seed))
+    walls, _ = fuse_segments(segments, gap=GAP, is_opening=lambda gaps, theta: np.zeros(len(gaps), bool))
+    assert same(walls, fuse_segments(segments, gap=GAP)[0])
 
 
 def test_where_pieces_overlap_there_is_no_opening():
     """What lies between two pieces is a gap only if something does."""
-    pieces = pieces_at([[0, 0], [0, 0.3]], [0, 0], length=1.0)
-    assert len(fuse(pieces, gap=GAP, opening=lambda gaps, theta: np.ones(len(gaps), bool))[0]) == 1
+    segments = segments_at([[0, 0], [0, 0.3]], [0, 0], length=1.0)
+    assert len(fuse_segments(segments, gap=GAP, is_opening=lambda gaps, theta: np.ones(len(gaps), bool))[0]) == 1

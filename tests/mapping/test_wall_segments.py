@@ -7,12 +7,15 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
-from support.segments import COLUMNS, moved, pieces_at, same
+from support.segments import COLUMNS, moved, same, segments_at
 
-from jaxsonar.detection.extract import Line, LocalModel
+from jaxsonar.detection.local_map import Line, LocalModel
 from jaxsonar.geometry.se2 import rotation, wrap_angle
-from jaxsonar.mapping.wall_segments import SIGMA_OFFSET, SIGMA_THETA, Pieces, add_up, aggregate, join
+from jaxsonar.mapping.observations import concatenate
+from jaxsonar.mapping.settings import SETTINGS
+from jaxsonar.mapping.wall_segments import WallSegments, aggregate_segments
 
+NOISE = SETTINGS.segments
 SEEDS = st.integers(0, 2**32 - 1)
 SOME = settings(max_examples=40, phases=[Phase.generate])
 """A smaller seed is no simpler one."""
@@ -20,41 +23,41 @@ SOME = settings(max_examples=40, phases=[Phase.generate])
 
 def one_wall(rng, count, *, noise=1.0, theta=0.7, length=3.0):
     """Pieces of one straight wall with a distinct value in every column; noise 1 is that of the Hough step."""
-    along, across = rng.uniform(-length / 2, length / 2, count), rng.normal(0, noise * SIGMA_OFFSET, count)
+    along, across = rng.uniform(-length / 2, length / 2, count), rng.normal(0, noise * NOISE.offset_sd, count)
     centre = np.array([2.0, -1.0]) + np.stack([across, along], axis=-1) @ rotation(theta).T
     seen = [sorted(rng.choice(40, rng.integers(1, 5), replace=False).tolist()) for _ in range(count)]
-    return pieces_at(
+    return segments_at(
         centre,
-        theta + rng.normal(0, noise * SIGMA_THETA, count),
-        ends=np.sort(rng.uniform(-0.4, 0.4, (count, 2)), axis=1),
-        info_offset=rng.uniform(0.5, 3, count) * SIGMA_OFFSET**-2,
-        info_theta=rng.uniform(0.5, 3, count) * SIGMA_THETA**-2,
-        misfit=rng.uniform(0, 5, count),
+        theta + rng.normal(0, noise * NOISE.theta_sd, count),
+        extent=np.sort(rng.uniform(-0.4, 0.4, (count, 2)), axis=1),
+        info_offset=rng.uniform(0.5, 3, count) * NOISE.offset_sd**-2,
+        info_theta=rng.uniform(0.5, 3, count) * NOISE.theta_sd**-2,
+        chi_squared=rng.uniform(0, 5, count),
         count=rng.integers(1, 9, count),
         echoes=rng.integers(3, 99, count),
-        distance=rng.uniform(0.5, 4, count),
-        latest=rng.uniform(0, 99, count),
+        viewing_distance=rng.uniform(0.5, 4, count),
+        last_seen=rng.uniform(0, 99, count),
         scans=(np.repeat(np.arange(count), [len(s) for s in seen]), np.array([k for s in seen for k in s], np.int64)),
     )
 
 
-def near(one, two, tolerance, *, ends=None):
+def near(one, two, tolerance, *, extent=None):
     """The largest deviation of lines (m, rad) and of ends (m) is below the tolerance, all else the same."""
     turn = np.abs(wrap_angle(one.theta - two.theta))
     across = np.abs(((one.centre - two.centre) * one.normal).sum(-1))
     assert turn.max() < tolerance
     assert across.max() < tolerance
-    assert np.abs(one.segments - two.segments).max() < (tolerance if ends is None else ends)
-    for name in ("info_offset", "info_theta", "misfit", "distance", "latest"):
+    assert np.abs(one.endpoints - two.endpoints).max() < (tolerance if ends is None else ends)
+    for name in ("info_offset", "info_theta", "chi_squared", "viewing_distance", "last_seen"):
         assert getattr(one, name) == pytest.approx(getattr(two, name), rel=tolerance, abs=tolerance), name
     assert one.count.tolist() == two.count.tolist()
     assert one.echoes.tolist() == two.echoes.tolist()
     assert one.scan_lists() == two.scan_lists()
 
 
-def all_of(pieces):
+def all_of(segments):
     """All of them as one."""
-    return add_up(pieces, np.zeros(len(pieces), np.int64))
+    return segments.fuse(np.zeros(len(segments), np.int64))
 
 
 def some_groups(rng, count):
@@ -93,66 +96,66 @@ def test_segments_stand_where_the_poses_put_them(seed):
                 n = world_from_robot @ [math.cos(line.theta), math.sin(line.theta), 0]
                 ends = [world_from_robot @ [*end, 1] for end in line.segment]
                 expected.append((n[:2], np.array(ends)[:, :2], line, model))
-    pieces = aggregate(models, poses)
-    assert len(pieces) == len(expected)
+    segments = aggregate_segments(models, poses)
+    assert len(segments) == len(expected)
     for k, (n, ends, line, model) in enumerate(expected):
-        assert pieces.normal[k] == pytest.approx(n, abs=1e-12)
-        assert pieces.segments[k] == pytest.approx(ends, abs=1e-12)  # counter-clockwise as seen from the robot
-        assert pieces.echoes[k] == line.echoes
-        assert pieces.distance[k] == line.rho
-        assert pieces.latest[k] == (model.scan if math.isnan(model.stamp) else model.stamp)
-        assert pieces.scan_lists()[k] == line.scans
-    assert ((pieces.theta >= -np.pi) & (pieces.theta < np.pi)).all()
-    assert (pieces.count == 1).all()
-    assert (pieces.misfit == 0).all()
+        assert segments.normal[k] == pytest.approx(n, abs=1e-12)
+        assert segments.endpoints[k] == pytest.approx(ends, abs=1e-12)  # counter-clockwise as seen from the robot
+        assert segments.echoes[k] == line.echoes
+        assert segments.viewing_distance[k] == line.rho
+        assert segments.last_seen[k] == (model.scan if math.isnan(model.stamp) else model.stamp)
+        assert segments.scan_lists()[k] == line.scans
+    assert ((segments.theta >= -np.pi) & (segments.theta < np.pi)).all()
+    assert (segments.count == 1).all()
+    assert (segments.chi_squared == 0).all()
 
 
 def test_scans_without_stamp_count_by_their_number():
     rng = np.random.default_rng(0)
     models = [some_model(rng, 7, 1), some_model(rng, 8, 1)]
-    assert aggregate(models, np.zeros((2, 3))).latest.tolist() == [7, 0.8]
+    assert aggregate_segments(models, np.zeros((2, 3))).last_seen.tolist() == [7, 0.8]
 
 
 def test_no_models():
-    nothing = aggregate([], np.zeros((0, 3)))
+    nothing = aggregate_segments([], np.zeros((0, 3)))
     assert len(nothing) == 0
     assert nothing.scan_lists() == ()
-    assert same(add_up(nothing, np.zeros(0, np.int64)), nothing)
-    assert same(join([nothing, nothing]), nothing)
+    assert same(nothing.fuse(np.zeros(0, np.int64)), nothing)
+    assert same(concatenate([nothing, nothing]), nothing)
 
 
 def test_models_without_lines_or_without_poses():
     rng = np.random.default_rng(0)
-    assert len(aggregate([some_model(rng, 1, 0)], np.zeros((1, 3)))) == 0
-    assert len(aggregate([some_model(rng, 1, 2)], np.full((1, 3), np.nan))) == 0
+    assert len(aggregate_segments([some_model(rng, 1, 0)], np.zeros((1, 3)))) == 0
+    assert len(aggregate_segments([some_model(rng, 1, 2)], np.full((1, 3), np.nan))) == 0
 
 
 # --- adding up ---
 
 
-def least_squares_line(pieces, origin):
+def least_squares_line(segments, origin):
     """Offset at ``origin`` and direction of the line that fits best, its misfit and its information matrix."""
 
     def deviations(line):
         offset, theta = line
         n = np.array([math.cos(theta), math.sin(theta)])
-        across = [(centre - origin) @ n - offset for centre in pieces.centre]
-        turn = [(t - theta + math.pi) % (2 * math.pi) - math.pi for t in pieces.theta]
-        return np.concatenate([np.sqrt(pieces.info_offset) * across, np.sqrt(pieces.info_theta) * turn])
+        across = [(centre - origin) @ n - offset for centre in segments.centre]
+        turn = [(t - theta + math.pi) % (2 * math.pi) - math.pi for t in segments.theta]
+        return np.concatenate([np.sqrt(segments.info_offset) * across, np.sqrt(segments.info_theta) * turn])
 
-    found = least_squares(deviations, [0.0, pieces.theta[0]], xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac")
+    found = least_squares(deviations, [0.0, segments.theta[0]], xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac")
     return found.x, 2 * found.cost, found.jac.T @ found.jac
 
 
 @SOME
 @given(SEEDS, st.integers(2, 12))
 def test_the_sum_is_the_line_of_least_squares(seed, count):
-    pieces = one_wall(np.random.default_rng(seed), count, noise=0.02)  # small angles
-    total = all_of(pieces)
-    (offset, theta), misfit, information = least_squares_line(pieces, total.centre[0])
+    segments = one_wall(np.random.default_rng(seed), count, noise=0.02)  # small angles
+    total = all_of(segments)
+    (offset, theta), misfit, information = least_squares_line(segments, total.centre[0])
     assert wrap_angle(total.theta - theta) == pytest.approx(0, abs=1e-6)
     assert offset == pytest.approx(0, abs=1e-7)
-    assert total.misfit - pieces.misfit.sum() == pytest.approx(misfit, rel=1e-3)
+    assert total.chi_squared - segments.chi_squared.sum() == pytest.approx(misfit, rel=1e-3)
     # At the centre the errors of offset and direction are independent.
     assert np.diag(information) == pytest.approx([total.info_offset[0], total.info_theta[0]], rel=1e-3)
     assert abs(information[0, 1]) < 1e-3 * math.sqrt(information[0, 0] * information[1, 1])
@@ -163,83 +166,85 @@ def test_the_sum_is_the_line_of_least_squares(seed, count):
 def test_sums_of_sums_are_the_sum_of_all(seed, count):
     """Only the ends, projected twice, may differ: by across the wall times turned, 3 cm times 6 degrees."""
     rng = np.random.default_rng(seed)
-    pieces = one_wall(rng, count)
-    near(all_of(add_up(pieces, some_groups(rng, count))), all_of(pieces), 1e-6, ends=3e-3)
+    segments = one_wall(rng, count)
+    near(all_of(segments.fuse(some_groups(rng, count))), all_of(segments), 1e-6, extent=3e-3)
 
 
 @SOME
 @given(SEEDS, st.integers(1, 15))
 def test_the_order_does_not_matter(seed, count):
     rng = np.random.default_rng(seed)
-    pieces, group, order = one_wall(rng, count), some_groups(rng, count), rng.permutation(count)
-    near(add_up(pieces.take(order), group[order]), add_up(pieces, group), 1e-9)
+    segments, group, order = one_wall(rng, count), some_groups(rng, count), rng.permutation(count)
+    near(segments.take(order).fuse(group[order]), segments.fuse(group), 1e-9)
 
 
 @SOME
 @given(SEEDS, st.integers(2, 9), st.tuples(*[st.floats(-1e4, 1e4)] * 2, st.floats(-4, 4)))
 def test_moving_the_world_moves_the_sum_and_nothing_else(seed, count, pose):
-    pieces = one_wall(np.random.default_rng(seed), count)
-    near(all_of(moved(pieces, pose)), moved(all_of(pieces), pose), 1e-8)
+    segments = one_wall(np.random.default_rng(seed), count)
+    near(all_of(moved(segments, pose)), moved(all_of(segments), pose), 1e-8)
 
 
 def test_the_sum_of_three_does_not_depend_on_where_north_is():
     """The least one of the law above: which piece is left or right of which must not count."""
-    pieces = pieces_at([[0, -1], [0, 0], [0, 1]], np.radians([3, 0, 0]))
+    segments = segments_at([[0, -1], [0, 0], [0, 1]], np.radians([3, 0, 0]))
     half_turn = (0.0, 0.0, np.pi)
-    near(all_of(moved(pieces, half_turn)), moved(all_of(pieces), half_turn), 1e-8)
+    near(all_of(moved(segments, half_turn)), moved(all_of(segments), half_turn), 1e-8)
 
 
 @SOME
 @given(SEEDS, st.integers(1, 9))
 def test_a_group_of_one_stays_what_it_is(seed, count):
     rng = np.random.default_rng(seed)
-    pieces = one_wall(rng, count + 3, theta=rng.uniform(-np.pi, np.pi))
+    segments = one_wall(rng, count + 3, theta=rng.uniform(-np.pi, np.pi))
     group = np.append(rng.permutation(count), [count] * 3)  # the last three add up
     order = rng.permutation(count + 3)
-    total = add_up(pieces.take(order), group[order])
+    total = segments.take(order).fuse(group[order])
     alone = np.argsort(group[:count])
-    assert same(total.take(np.arange(count)), pieces.take(alone))
-    assert same(add_up(pieces, np.arange(count + 3)), pieces)
+    assert same(total.take(np.arange(count)), segments.take(alone))
+    assert same(segments.fuse(np.arange(count + 3)), segments)
 
 
 @SOME
 @given(SEEDS, st.integers(2, 9))
 def test_faces_seen_from_the_other_side_are_the_same_line(seed, count):
     rng = np.random.default_rng(seed)
-    pieces = one_wall(rng, count)
+    segments = one_wall(rng, count)
     behind = rng.random(count) < 0.5
-    behind[pieces.info_theta.argmax()] = False  # which way the wall faces is said by the piece that knows best
-    columns = {name: getattr(pieces, name) for name in COLUMNS}
-    columns["theta"] = wrap_angle(pieces.theta + np.where(behind, np.pi, 0))
-    columns["ends"] = np.where(behind[:, None], -pieces.ends[:, ::-1], pieces.ends)
-    near(all_of(Pieces(**columns, scans=pieces.scans)), all_of(pieces), 1e-9)
+    behind[segments.info_theta.argmax()] = False  # which way the wall faces is said by the piece that knows best
+    columns = {name: getattr(segments, name) for name in COLUMNS}
+    columns["theta"] = wrap_angle(segments.theta + np.where(behind, np.pi, 0))
+    columns["extent"] = np.where(behind[:, None], -segments.extent[:, ::-1], segments.extent)
+    near(all_of(WallSegments(**columns, scans=segments.scans)), all_of(segments), 1e-9)
 
 
 @SOME
 @given(SEEDS, st.integers(1, 15))
 def test_what_is_known_of_the_pieces_is_known_of_their_sum(seed, count):
     rng = np.random.default_rng(seed)
-    pieces, group = one_wall(rng, count), some_groups(rng, count)
-    total, lists = add_up(pieces, group), pieces.scan_lists()
+    segments, group = one_wall(rng, count), some_groups(rng, count)
+    total, lists = segments.fuse(group), segments.scan_lists()
     for k in range(group.max() + 1):
         mine = np.flatnonzero(group == k)
         assert total.scan_lists()[k] == tuple(sorted(set().union(*(lists[m] for m in mine))))
-        assert total.count[k] == sum(pieces.count[mine])
-        assert total.echoes[k] == sum(pieces.echoes[mine])
-        assert total.latest[k] == max(pieces.latest[mine])
-        assert total.distance[k] == pytest.approx(np.average(pieces.distance[mine], weights=pieces.count[mine]))
-        assert total.misfit[k] >= sum(pieces.misfit[mine]) * (1 - 1e-12)
-        assert total.info_theta[k] >= max(pieces.info_theta[mine])
-        way = [float((end - total.centre[k]) @ total.tangent[k]) for end in pieces.segments[mine].reshape(-1, 2)]
-        assert total.ends[k] == pytest.approx([min(way), max(way)], abs=1e-12)  # outermost projections, no farther
+        assert total.count[k] == sum(segments.count[mine])
+        assert total.echoes[k] == sum(segments.echoes[mine])
+        assert total.last_seen[k] == max(segments.last_seen[mine])
+        assert total.viewing_distance[k] == pytest.approx(
+            np.average(segments.viewing_distance[mine], weights=segments.count[mine])
+        )
+        assert total.chi_squared[k] >= sum(segments.chi_squared[mine]) * (1 - 1e-12)
+        assert total.info_theta[k] >= max(segments.info_theta[mine])
+        way = [float((end - total.centre[k]) @ total.tangent[k]) for end in segments.endpoints[mine].reshape(-1, 2)]
+        assert total.extent[k] == pytest.approx([min(way), max(way)], abs=1e-12)  # outermost projections, no farther
 
 
 @pytest.mark.parametrize("theta", [-np.pi, np.pi - 1e-9, np.pi / 2, -np.pi / 2, 0.0])
 def test_seams(theta):
     """Directions on both sides of +-pi are near one another."""
     rng = np.random.default_rng(3)
-    turn, along = rng.normal(0, SIGMA_THETA, 20), rng.uniform(-1, 1, 20)
-    lying = pieces_at(np.stack([0 * along, along], axis=-1), turn)
+    turn, along = rng.normal(0, NOISE.theta_sd, 20), rng.uniform(-1, 1, 20)
+    lying = segments_at(np.stack([0 * along, along], axis=-1), turn)
     pose = (0.0, 0.0, theta)
     total = all_of(moved(lying, pose))
     near(total, moved(all_of(lying), pose), 1e-2)  # the law to rounding is above
@@ -248,15 +253,15 @@ def test_seams(theta):
 
 def test_two_far_apart_tell_the_direction_of_their_wall():
     """The parallel-axis theorem: 1 cm at 2 m says more than 3 degrees."""
-    total = all_of(pieces_at([[0, -1], [0, 1]], np.radians([3, 3])))
+    total = all_of(segments_at([[0, -1], [0, 1]], np.radians([3, 3])))
     assert abs(total.theta[0]) < np.radians(0.2)
-    assert total.info_theta[0] == pytest.approx(2 * SIGMA_THETA**-2 + 2 * SIGMA_OFFSET**-2, rel=0.01)
+    assert total.info_theta[0] == pytest.approx(2 * NOISE.theta_sd**-2 + 2 * NOISE.offset_sd**-2, rel=0.01)
 
 
 def test_far_from_the_origin_nothing_is_lost():
-    pieces = one_wall(np.random.default_rng(1), 9)
-    far = all_of(moved(pieces, (1e4, -1e4, 0.0)))
-    near(moved(far, (-1e4, 1e4, 0.0)), all_of(pieces), 1e-9)
+    segments = one_wall(np.random.default_rng(1), 9)
+    far = all_of(moved(segments, (1e4, -1e4, 0.0)))
+    near(moved(far, (-1e4, 1e4, 0.0)), all_of(segments), 1e-9)
 
 
 # --- collections ---
@@ -266,26 +271,26 @@ def test_far_from_the_origin_nothing_is_lost():
 @given(SEEDS, st.integers(1, 12))
 def test_what_is_taken_apart_can_be_joined_again(seed, count):
     rng = np.random.default_rng(seed)
-    pieces, order = one_wall(rng, count), rng.permutation(count)
+    segments, order = one_wall(rng, count), rng.permutation(count)
     cut = int(rng.integers(0, count + 1))
-    parts = [pieces.take(order[:cut]), pieces.take(order[cut:])]
+    parts = [segments.take(order[:cut]), segments.take(order[cut:])]
     assert [len(part) for part in parts] == [cut, count - cut]
-    assert same(join(parts), pieces.take(order))
-    assert same(join(parts).take(np.argsort(order)), pieces)
+    assert same(concatenate(parts), segments.take(order))
+    assert same(concatenate(parts).take(np.argsort(order)), segments)
 
 
 @SOME
 @given(SEEDS, st.integers(1, 12))
 def test_taking_by_number_and_by_mask(seed, count):
     rng = np.random.default_rng(seed)
-    pieces, mask = one_wall(rng, count), rng.random(count) < 0.5
-    some = pieces.take(mask)
-    assert same(some, pieces.take(np.flatnonzero(mask)))
-    assert some.scan_lists() == tuple(pieces.scan_lists()[k] for k in np.flatnonzero(mask))
-    assert same(pieces.take(np.ones(count, bool)), pieces)
-    assert some.length == pytest.approx(np.linalg.norm(some.segments[:, 1] - some.segments[:, 0], axis=-1))
+    segments, mask = one_wall(rng, count), rng.random(count) < 0.5
+    some = segments.take(mask)
+    assert same(some, segments.take(np.flatnonzero(mask)))
+    assert some.scan_lists() == tuple(segments.scan_lists()[k] for k in np.flatnonzero(mask))
+    assert same(segments.take(np.ones(count, bool)), segments)
+    assert some.length == pytest.approx(np.linalg.norm(some.endpoints[:, 1] - some.endpoints[:, 0], axis=-1))
 
 
 def test_a_row_taken_twice_is_there_twice():
-    pieces = one_wall(np.random.default_rng(1), 3)
-    assert pieces.take(np.array([1, 1])).scan_lists() == (pieces.scan_lists()[1],) * 2
+    segments = one_wall(np.random.default_rng(1), 3)
+    assert segments.take(np.array([1, 1])).scan_lists() == (segments.scan_lists()[1],) * 2

@@ -9,8 +9,9 @@ import pytest
 import shapely
 
 from jaxsonar import Log, Ring, random_pose, random_room, simulate
-from jaxsonar.floor_plans.room import Room, point_to_walls
+from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import rotation
+from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import build_map
 from jaxsonar.occupancy.nav2_map import grid_image_path, save_nav2
@@ -78,7 +79,7 @@ def way(rng, room, *, step=0.1, clearance=0.35):
         count = 2 + int(np.linalg.norm((end - start)[:2]) / step)
         legs.append(start + np.linspace(0, 1, count)[:, None] * (end - start))
     poses = np.concatenate(legs)
-    clear = point_to_walls(poses[:, :2], room.walls).min(axis=1) > clearance
+    clear = point_to_segments(poses[:, :2], room.walls).min(axis=1) > clearance
     for pole in room.poles:
         clear &= np.linalg.norm(poses[:, :2] - pole, axis=-1) > clearance
     return poses[clear]
@@ -131,6 +132,7 @@ def test_the_world_turned_by_a_quarter_gives_the_grid_turned_by_a_quarter(office
     assert np.mean(image == np.rot90(straight)) > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("errors", [{}, {"clutter": 0.2, "dropout": 0.3}], ids=["clean", "clutter and loss"])
 def test_free_is_free_and_near_the_robot_most_is_known(faw_ring, seed, errors):
@@ -144,13 +146,14 @@ def test_free_is_free_and_near_the_robot_most_is_known(faw_ring, seed, errors):
     free = image == FREE
     assert inside[free].mean() >= 0.99
     assert not free[~inside].any()  # behind walls that are known nothing is free
-    clear = point_to_walls(points.reshape(-1, 2), room.walls).min(axis=1).reshape(inside.shape) > 0.1
+    clear = point_to_segments(points.reshape(-1, 2), room.walls).min(axis=1).reshape(inside.shape) > 0.1
     for pole in room.poles:
         clear &= np.linalg.norm(points - pole, axis=-1) > 0.3
     near = np.linalg.norm(points[:, :, None] - poses[:, :2], axis=-1).min(axis=2) < 1.0
     assert free[inside & clear & near].mean() > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_walls_that_nobody_told_are_not_driven_through(faw_ring, seed):
     rng = np.random.default_rng(seed)
@@ -160,7 +163,7 @@ def test_walls_that_nobody_told_are_not_driven_through(faw_ring, seed):
     grid = occupancy(faw_ring, log)
     image, points = grid.classify(), centres(grid)
     assert truly_free(room, points)[image == FREE].mean() > 0.85
-    gap = point_to_walls(points.reshape(-1, 2), room.walls).min(axis=1).reshape(image.shape)
+    gap = point_to_segments(points.reshape(-1, 2), room.walls).min(axis=1).reshape(image.shape)
     assert np.mean(gap[image == OCCUPIED] < 0.15) > 0.6
 
 
@@ -240,6 +243,7 @@ def test_a_wall_hides_what_a_sensor_that_misses_it_obliquely_looks_at(faw_ring):
     assert np.abs(behind[False][:, 0]).min() > 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_walls_of_a_map_that_end_too_early_let_nothing_out(faw_ring, seed):
     rng = np.random.default_rng(1000 + seed)
@@ -250,7 +254,7 @@ def test_walls_of_a_map_that_end_too_early_let_nothing_out(faw_ring, seed):
     image, points = grid.classify(), centres(grid)
     inside = truly_free(room, points)
     assert inside[image == FREE].mean() >= 0.98
-    clear = point_to_walls(points.reshape(-1, 2), room.walls).min(axis=1).reshape(inside.shape) > 0.1
+    clear = point_to_segments(points.reshape(-1, 2), room.walls).min(axis=1).reshape(inside.shape) > 0.1
     near = np.linalg.norm(points[:, :, None] - poses[:, :2], axis=-1).min(axis=2) < 1.0
     assert (image == FREE)[inside & clear & near].mean() > 0.9
 

@@ -4,9 +4,12 @@ import re
 import runpy
 from pathlib import Path
 
+import pytest
+
 EXAMPLE = Path(__file__).parents[2] / "docs" / "temperature_per_scan.py"
 
 
+@pytest.mark.slow
 def test_the_temperature_of_every_scan_is_found(capsys):
     runpy.run_path(str(EXAMPLE))
     out = capsys.readouterr().out

@@ -30,6 +30,7 @@ def test_the_two_commands_stand_there_once_each():
     assert [("bin/jaxsonar demo" in text, "bin/pytest" in text) for text in setups] == [(True, False), (False, True)]
 
 
+@pytest.mark.slow
 def test_the_python_example_runs(folder, capsys):
     (example,) = blocks("python", "import jaxsonar")
     with contextlib.chdir(folder):
@@ -40,6 +41,7 @@ def test_the_python_example_runs(folder, capsys):
     assert world == "8 walls, 10.4 m"
 
 
+@pytest.mark.slow
 def test_the_commands_run(folder):
     pytest.importorskip("pyarrow")
     *elsewhere, commands = blocks("bash", "jaxsonar simulate")

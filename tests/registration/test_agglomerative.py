@@ -1,24 +1,26 @@
-"""Scans are placed by their ranges where that is sure: rightly, wherever the world lies; what is open stays open."""
+"""Agglomerative registration by ranges: unambiguous scans are registered correctly, ambiguous ones stay separate."""
 
 import jax
 import numpy as np
 import pytest
 
 from jaxsonar import Ring, Room, kernels, local_models, simulate
-from jaxsonar.geometry.se2 import composed, inverse, relative, wrap_angle
-from jaxsonar.kernels import measurement_model as reflectors
-from jaxsonar.registration.agglomerative import place_ranges
-from jaxsonar.registration.cluster_adjustment import merged, settled, single
-from jaxsonar.registration.echo_targets import OF_KIND, Views, expected
-from jaxsonar.registration.negative_evidence import against
+from jaxsonar.geometry.se2 import compose, inverse, relative, wrap_angle
+from jaxsonar.kernels import measurement_model
+from jaxsonar.registration.agglomerative import register_by_ranges
+from jaxsonar.registration.cluster_adjustment import adjust, single_scan
+from jaxsonar.registration.cluster_negative_evidence import cluster_negative_evidence
+from jaxsonar.registration.echo_clusters import ScanObservations
+from jaxsonar.registration.range_models import RANGE_OF_KIND, predict_ranges
+from jaxsonar.registration.scan_cluster import merge_clusters
 from jaxsonar.simulation.office import load_office
 
 SIGMA = 0.005
 """Metres; of a thresholded sensor, the hard case."""
-EXACT = {kernels.PLANE: reflectors.plane, kernels.CORNER: reflectors.corner, kernels.EDGE: reflectors.edge}
+EXACT = {kernels.PLANE: measurement_model.plane_echo, kernels.CORNER: measurement_model.corner_echo, kernels.EDGE: measurement_model.edge_echo}
 
 
-def heard(ring, room, poses, *, sigma=SIGMA, seed=0):
+def simulated_log(ring, room, poses, *, sigma=SIGMA, seed=0):
     """A log without odometry, and its local models."""
     log = simulate(ring, room, poses, sigma=sigma, seed=seed).as_log(ring, np.full(poses.shape, np.nan))
     return log, list(local_models(ring, log))
@@ -26,99 +28,109 @@ def heard(ring, room, poses, *, sigma=SIGMA, seed=0):
 
 @pytest.fixture(scope="module")
 def office():
-    """Five scans around the bend of the office's way."""
+    """Five scans around the bend of the trajectory through the office."""
     place = load_office()
     poses = place.poses[11:16]
-    return place.ring, poses, *heard(place.ring, place.room, poses)
+    return place.ring, poses, *simulated_log(place.ring, place.room, poses)
 
 
 @pytest.fixture(scope="module")
-def views(office):
+def observations(office):
     ring, _, log, models = office
-    return Views.of(ring, log, models, SIGMA)
+    return ScanObservations.of(ring, log, models, SIGMA)
 
 
-@pytest.mark.parametrize("kind", list(OF_KIND))
-def test_ranges_are_those_of_the_kernels(kind, rng):
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(RANGE_OF_KIND))
+def test_range_models_agree_with_the_kernels(kind, rng):
     paths = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), Ring.circular().echo_paths)
-    place = np.array([1.3, 0.4])
+    parameters, range_of = np.array([1.3, 0.4]), RANGE_OF_KIND[kind]
     with jax.enable_x64(True):
-        exact = jax.vmap(EXACT[kind], in_axes=(None, 0))(jax.numpy.asarray(place), paths)
-    found = OF_KIND[kind](place[None], paths.midpoint, paths.half_baseline)
-    np.testing.assert_allclose(found.reach, exact.range, rtol=1e-12)
-    np.testing.assert_allclose(found.own, exact.slope, atol=1e-12)
-    np.testing.assert_allclose(found.leaving, exact.departure, atol=1e-12)
-    np.testing.assert_allclose(found.arriving, exact.arrival, atol=1e-12)
+        exact = jax.vmap(EXACT[kind], in_axes=(None, 0))(jax.numpy.asarray(parameters), paths)
+    found = range_of(parameters[None], paths.midpoint, paths.half_baseline)
+    np.testing.assert_allclose(found.range, exact.range, rtol=1e-12)
+    np.testing.assert_allclose(found.by_landmark, exact.slope, atol=1e-12)
+    np.testing.assert_allclose(found.departure, exact.departure, atol=1e-12)
+    np.testing.assert_allclose(found.arrival, exact.arrival, atol=1e-12)
     step = 1e-6 * rng.normal(size=(2, 2))
-    moved = OF_KIND[kind](place[None], paths.midpoint + step[0], paths.half_baseline + step[1])
-    slope = found.middle @ step[0] + found.base @ step[1]
-    np.testing.assert_allclose(moved.reach - found.reach, slope, atol=1e-10)
+    moved = range_of(parameters[None], paths.midpoint + step[0], paths.half_baseline + step[1])
+    change = found.by_midpoint @ step[0] + found.by_half_baseline @ step[1]
+    np.testing.assert_allclose(moved.range - found.range, change, atol=1e-10)
 
 
-def test_kinds_may_be_mixed(rng):
+def test_mixed_kinds_give_the_ranges_of_each_kind(rng):
     kind = np.array([0, 2, 1, 0], dtype=np.int32)
-    place, middle, base = rng.uniform(0.5, 1.5, (4, 1, 2)), rng.normal(size=(1, 5, 2)), rng.normal(size=(1, 5, 2)) / 9
-    found = expected(kind, place, middle, base)
+    parameters = rng.uniform(0.5, 1.5, (4, 1, 2))
+    midpoint, base = rng.normal(size=(1, 5, 2)), rng.normal(size=(1, 5, 2)) / 9
+    found = predict_ranges(kind, parameters, midpoint, base)
     for row, one in enumerate(kind.tolist()):
-        np.testing.assert_array_equal(found.reach[row], OF_KIND[one](place[row], middle[0], base[0]).reach)
+        expected = RANGE_OF_KIND[one](parameters[row], midpoint[0], base[0]).range
+        np.testing.assert_array_equal(found.range[row], expected)
 
 
-def test_every_echo_is_of_a_target_or_loose(office, views):
+def test_every_echo_is_clustered_or_unassigned(office, observations):
     _, _, log, _ = office
-    assert len(views.echoes.scan) + len(views.loose.scan) == sum(len(log[row].range) for row in range(len(log)))
-    assert len(views.echoes.scan) > 0.9 * (len(views.echoes.scan) + len(views.loose.scan))
-    np.testing.assert_array_equal(views.targets.scan[views.echoes.target], views.echoes.scan)
+    clustered, unassigned = len(observations.clustered.scan), len(observations.unassigned.scan)
+    assert clustered + unassigned == sum(len(log[row].range) for row in range(len(log)))
+    assert clustered > 0.9 * (clustered + unassigned)
+    np.testing.assert_array_equal(
+        observations.clusters.scan[observations.clustered.cluster], observations.clustered.scan
+    )
 
 
-def test_a_part_may_lie_anywhere(views, rng):
-    """Moved and moved back it is the same, and what is against it does not depend on its frame."""
-    part, frame = single(views, 2), rng.uniform(-2, 2, 3)
-    back = part.moved(frame).moved(inverse(frame))
-    np.testing.assert_allclose(back.places, part.places, atol=1e-9)
-    np.testing.assert_allclose(back.cov, part.cov, atol=1e-9)
-    np.testing.assert_allclose(back.extent, part.extent, atol=1e-9)
-    assert against(views, part.moved(frame)) == against(views, part)
+def test_a_change_of_frame_is_undone_by_its_inverse(observations, rng):
+    """The negative evidence does not depend on the frame."""
+    cluster, frame = single_scan(observations, 2), rng.uniform(-2, 2, 3)
+    back = cluster.transform(frame).transform(inverse(frame))
+    np.testing.assert_allclose(back.parameters_by_kind, cluster.parameters_by_kind, atol=1e-9)
+    np.testing.assert_allclose(back.covariance, cluster.covariance, atol=1e-9)
+    np.testing.assert_allclose(back.extent, cluster.extent, atol=1e-9)
+    moved = cluster_negative_evidence(observations, cluster.transform(frame))
+    assert moved == cluster_negative_evidence(observations, cluster)
 
 
-def test_what_is_the_same_is_likelier_as_one(office, views):
-    """Two scans at their true poses: with walls in common the evidence is more than that of both alone."""
+def test_common_reflectors_increase_the_evidence(office, observations):
+    """Two scans at their true poses: with walls in common the evidence is larger than that of both alone."""
     _, poses, _, _ = office
-    a, b = single(views, 0), single(views, 1)
-    b = b.moved(relative(poses[0], poses[1]))
-    near = np.abs(wrap_angle(a.places[:, None, 0, 1] - b.places[:, 0, 1])) < 0.1
-    near &= np.abs(a.places[:, None, 0, 0] - b.places[:, 0, 0]) < 0.1
+    a, b = single_scan(observations, 0), single_scan(observations, 1)
+    b = b.transform(relative(poses[0], poses[1]))
+    first, second = a.parameters_by_kind[:, None, 0], b.parameters_by_kind[:, 0]
+    near = (np.abs(wrap_angle(first[..., 1] - second[:, 1])) < 0.1) & (np.abs(first[..., 0] - second[:, 0]) < 0.1)
     near &= (a.kind[:, None] == kernels.PLANE) & (b.kind == kernels.PLANE)
-    together = settled(views, merged(a, b, [(int(i), int(j)) for i, j in np.argwhere(near)]))
+    together = adjust(observations, merge_clusters(a, b, [(int(i), int(j)) for i, j in np.argwhere(near)]))
     assert near.sum() >= 2
     assert together.evidence > a.evidence + b.evidence
     np.testing.assert_allclose(relative(together.poses[0], together.poses[1])[:2], relative(*poses[:2])[:2], atol=0.05)
 
 
-def test_the_office_is_placed_rightly(office):
+@pytest.mark.slow
+def test_the_office_is_registered_correctly(office):
     ring, poses, log, models = office
-    said = []
-    parts = [part.poses for part in place_ranges(ring, log, models, progress=lambda *done: said.append(done))]
-    assert np.isfinite(parts[0]).all()
-    np.testing.assert_allclose(parts[0][0], 0.0, atol=1e-12)
-    off = parts[0] - relative(np.broadcast_to(poses[0], poses.shape), poses)
+    calls = []
+    clusters = register_by_ranges(ring, log, models, progress=lambda *done: calls.append(done))
+    found = clusters[0].poses
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found[0], 0.0, atol=1e-12)
+    off = found - relative(np.broadcast_to(poses[0], poses.shape), poses)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.08
     assert np.abs(wrap_angle(off[:, 2])).max() < np.radians(6)
-    assert said[0] == (0, len(poses))
-    assert said == sorted(said)
+    assert calls[0] == (0, len(poses))
+    assert calls == sorted(calls)
 
 
-def test_a_corridor_leaves_scans_open():
-    """Along two walls nothing tells how far the robot went: every scan stays alone."""
+@pytest.mark.slow
+def test_scans_in_a_bare_corridor_stay_separate():
+    """Two parallel walls do not determine the position along the corridor."""
     walls = np.array([[[-9.0, -1.0], [9.0, -1.0]], [[9.0, 1.0], [-9.0, 1.0]]])
     poses = np.stack([np.linspace(-0.5, 0.5, 4), np.zeros(4), np.zeros(4)], axis=-1)
     ring = Ring.circular()
-    parts = [part.poses for part in place_ranges(ring, *heard(ring, Room(walls), poses))]
-    assert [int(np.isfinite(part[:, 0]).sum()) for part in parts] == [1] * 4
+    clusters = register_by_ranges(ring, *simulated_log(ring, Room(walls), poses))
+    assert [len(one.rows) for one in clusters] == [1] * 4
 
 
-def test_scans_without_echoes_stay_alone():
+def test_scans_without_echoes_stay_separate():
     ring, poses = Ring.circular(), np.zeros((3, 3))
     nothing = Room(np.array([[[50.0, 0.0], [50.0, 1.0]]]))
-    parts = [part.poses for part in place_ranges(ring, *heard(ring, nothing, poses))]
-    assert [int(np.isfinite(part[:, 0]).sum()) for part in parts] == [1] * 3
-    assert composed(np.zeros(3), parts[0]).shape == (3, 3)
+    clusters = register_by_ranges(ring, *simulated_log(ring, nothing, poses))
+    assert [len(one.rows) for one in clusters] == [1] * 3
+    assert compose(np.zeros(3), clusters[0].poses).shape == (3, 3)

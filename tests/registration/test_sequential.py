@@ -1,12 +1,12 @@
-"""Poses from local models alone: exact models give exact poses, wherever the world lies; what is open stays open."""
+"""Sequential registration by local models: exact models give exact poses, and ambiguous scans stay unregistered."""
 
 import numpy as np
 import pytest
 
 from jaxsonar import LocalModel, SonarError, local_models, simulate
-from jaxsonar.detection.extract import Line, Point
-from jaxsonar.geometry.se2 import composed, inverse, relative, to_world, wrap_angle
-from jaxsonar.registration.sequential import place, place_parts
+from jaxsonar.detection.local_map import Line, Point
+from jaxsonar.geometry.se2 import compose, inverse, relative, transform_points, wrap_angle
+from jaxsonar.registration.sequential import register_scans
 from jaxsonar.simulation.office import load_office
 
 CORNERS = np.array([[0.0, 0.0], [4.1, 0.0], [4.6, 2.2], [2.6, 3.9], [-0.5, 2.9]])
@@ -16,9 +16,9 @@ OTHER = np.array([[0.0, 0.0], [3.6, 0.7], [3.1, 3.5], [-0.3, 3.1]])
 NO_PATHS = np.zeros((0, 2), dtype=int)
 
 
-def wall_seen(pose, start, end, reach):
+def visible_line(pose, start, end, reach):
     """The exact line of a wall in the robot frame, or None where its foot is not on the wall or too far."""
-    start, end = (to_world(inverse(pose), point) for point in (start, end))
+    start, end = (transform_points(inverse(pose), point) for point in (start, end))
     along = (end - start) / np.linalg.norm(end - start)
     foot = start - (start @ along) * along
     share = (foot - start) @ (end - start) / ((end - start) @ (end - start))
@@ -32,14 +32,20 @@ def wall_seen(pose, start, end, reach):
 
 def model_at(pose, *, corners=CORNERS, reach=2.5, poles=()):
     walls = zip(corners, np.roll(corners, -1, axis=0), strict=True)
-    lines = [line for start, end in walls if (line := wall_seen(pose, start, end, reach)) is not None]
-    points = [to_world(inverse(pose), np.array(pole)) for pole in poles]
+    lines = [line for start, end in walls if (line := visible_line(pose, start, end, reach)) is not None]
+    points = [transform_points(inverse(pose), np.array(pole)) for pole in poles]
     points = [Point(float(x), float(y), "edge", 1e-6 * np.eye(2), 8, NO_PATHS, 1.0) for x, y in points]
     return LocalModel(0, 0.0, tuple(lines), points=tuple(points))
 
 
-def way(count=24):
-    """Around the middle of the room, turning as it goes."""
+def largest(models, odometry=None, **choices):
+    """Poses of the largest cluster; NaN for all scans if there is none."""
+    clusters = register_scans(models, odometry, **choices)
+    return clusters[0] if clusters else np.full((len(models), 3), np.nan)
+
+
+def trajectory(count=24):
+    """A loop around the middle of the room."""
     angle = np.linspace(0, 2 * np.pi, count)
     x, y = 1.9 + 0.8 * np.cos(angle), 1.6 + 0.7 * np.sin(angle)
     return np.stack([x, y, wrap_angle(angle + np.pi / 2)], axis=-1)
@@ -49,117 +55,107 @@ def from_first(poses):
     return relative(np.broadcast_to(poses[0], poses.shape), poses)
 
 
-def assert_same(found, poses, *, place, turn):
+def assert_same(found, poses, *, position, turn):
     found, poses = from_first(found), from_first(poses)
-    np.testing.assert_allclose(found[:, :2], poses[:, :2], atol=place)
+    np.testing.assert_allclose(found[:, :2], poses[:, :2], atol=position)
     np.testing.assert_allclose(wrap_angle(found[:, 2] - poses[:, 2]), 0.0, atol=turn)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poles", [(), ((1.0, 0.9), (2.9, 2.4))])
 def test_exact_models_give_exact_poses(poles):
-    poses = way()
-    found = place([model_at(pose, poles=poles) for pose in poses])
+    poses = trajectory()
+    found = largest([model_at(pose, poles=poles) for pose in poses])
     np.testing.assert_array_equal(found[0], 0.0)
-    assert_same(found, poses, place=1e-6, turn=1e-6)
+    assert_same(found, poses, position=1e-6, turn=1e-6)
 
 
-def test_with_exact_odometry_the_first_pose_is_the_odometrys():
-    poses = way()
-    found = place([model_at(pose) for pose in poses], poses)
+@pytest.mark.slow
+def test_the_first_pose_is_that_of_the_odometry():
+    poses = trajectory()
+    found = largest([model_at(pose) for pose in poses], poses)
     np.testing.assert_allclose(found[0], poses[0], atol=1e-12)
-    assert_same(found, poses, place=1e-6, turn=1e-6)
+    assert_same(found, poses, position=1e-6, turn=1e-6)
 
 
-def test_the_world_may_lie_anywhere():
+@pytest.mark.slow
+def test_poses_move_with_the_frame_of_the_odometry():
     """Odometry moved rigidly moves the poses with it."""
-    poses = way()
+    poses = trajectory()
     models = [model_at(pose) for pose in poses]
-    moved = np.concatenate([to_world(np.array([3.0, -7.0, 2.0]), poses[:, :2]), wrap_angle(poses[:, 2:] + 2.0)], axis=1)
-    here, there = place(models, poses), place(models, moved)
+    moved = np.concatenate(
+        [transform_points(np.array([3.0, -7.0, 2.0]), poses[:, :2]), wrap_angle(poses[:, 2:] + 2.0)], axis=1
+    )
+    here, there = largest(models, poses), largest(models, moved)
     np.testing.assert_allclose(there[0], moved[0], atol=1e-9)
     np.testing.assert_allclose(from_first(there), from_first(here), atol=1e-9)
 
 
-def test_scans_without_anything_stay_open_and_harm_nothing():
-    poses = way()
+@pytest.mark.slow
+def test_scans_without_features_are_left_out_and_do_not_disturb_others():
+    poses = trajectory()
     models = [model_at(pose) for pose in poses]
     empty = [0, 7, 15]
     for k in empty:
         models[k] = LocalModel(k, 0.0, (), "no echo")
     for odometry in (None, poses):
-        found = place(models, odometry)
+        found = largest(models, odometry)
         assert np.isnan(found[empty]).all()
         left = np.setdiff1d(np.arange(len(poses)), empty)
         assert np.isfinite(found[left]).all()
-        assert_same(found[left], poses[left], place=1e-6, turn=1e-6)
+        assert_same(found[left], poses[left], position=1e-6, turn=1e-6)
 
 
-def test_a_corridor_needs_odometry():
+def test_a_bare_corridor_needs_odometry():
     """Along two parallel walls nothing but odometry tells how far the robot went."""
     corridor = np.array([[-9.0, -1.0], [9.0, -1.0], [9.0, 1.0], [-9.0, 1.0]])
     poses = np.stack([np.linspace(-3, 3, 16), np.zeros(16), np.zeros(16)], axis=-1)
     models = [model_at(pose, corners=corridor) for pose in poses]
     assert all(len(model.lines) == 2 for model in models)
-    assert np.isnan(place(models)).all()
+    assert np.isnan(largest(models)).all()
     drifting = poses * np.array([1.02, 1.0, 1.0])
-    found = place(models, drifting)
-    assert_same(found, drifting, place=1e-6, turn=1e-6)
+    found = largest(models, drifting)
+    assert_same(found, drifting, position=1e-6, turn=1e-6)
 
 
-def test_nothing_comes_of_nothing():
-    assert place([]).shape == (0, 3)
-    assert np.isnan(place([LocalModel(k, 0.0, (), "no echo") for k in range(3)])).all()
+def test_empty_input_gives_no_poses():
+    assert largest([]).shape == (0, 3)
+    assert np.isnan(largest([LocalModel(k, 0.0, (), "no echo") for k in range(3)])).all()
 
 
+@pytest.mark.slow
 def test_a_gap_in_odometry_is_bridged_by_the_walls():
     """The frame of odometry may jump where it starts anew."""
-    poses = way()
+    poses = trajectory()
     odometry = poses.copy()
     odometry[12:] += np.array([5.0, 5.0, 0.0])
     odometry[12] = np.nan
-    found = place([model_at(pose) for pose in poses], odometry)
-    assert_same(found, poses, place=1e-6, turn=1e-6)
+    found = largest([model_at(pose) for pose in poses], odometry)
+    assert_same(found, poses, position=1e-6, turn=1e-6)
 
 
-def test_odometry_of_another_shape_is_refused():
+def test_odometry_of_another_shape_is_an_error():
     with pytest.raises(SonarError, match=r"odometry of shape \(3, 3\); allowed is \(2, 3\)"):
-        place([model_at(pose) for pose in way(2)], np.zeros((3, 3)))
+        largest([model_at(pose) for pose in trajectory(2)], np.zeros((3, 3)))
 
 
 def test_progress_reaches_the_end():
     said = []
-    place([model_at(pose) for pose in way(6)], progress=lambda done, all_of_them: said.append((done, all_of_them)))
+    largest([model_at(pose) for pose in trajectory(6)], progress=lambda done, all_of_them: said.append((done, all_of_them)))
     assert said[-1] == (6, 6)
     assert said == sorted(said)
 
 
-def test_two_rooms_are_two_parts():
+@pytest.mark.slow
+def test_two_rooms_are_two_clusters():
     """Without odometry nothing tells how two rooms lie; no scan is in both, and each is right in itself."""
-    poses = way()
+    poses = trajectory()
     rooms = (CORNERS, OTHER)
-    parts = place_parts([model_at(pose, corners=corners, reach=3.5) for corners in rooms for pose in poses])
+    parts = register_scans([model_at(pose, corners=corners, reach=3.5) for corners in rooms for pose in poses])
     placed = np.isfinite([part[:, 0] for part in parts])
     np.testing.assert_array_equal(sorted(placed.tolist()), np.kron(np.eye(2), np.ones(len(poses)))[::-1])
     for part in parts:
-        assert_same(part[np.isfinite(part[:, 0])], poses, place=1e-3, turn=1e-3)
-
-
-def test_poses_are_a_group(rng):
-    """Composition is associative and undone by the inverse; relative is the inverse, composed."""
-    a, b, c = rng.uniform(-4, 4, (3, 3))
-    many = rng.uniform(-4, 4, (2, 5, 3))
-    assert_equal(composed(a, composed(b, many)), composed(composed(a, b), many))
-    assert_equal(composed(inverse(a), composed(a, many)), many)
-    assert_equal(composed(c, inverse(c)), np.zeros(3))
-    assert_equal(inverse(inverse(many)), many)
-    assert_equal(composed(inverse(a), b), relative(a, b))
-    point = rng.uniform(-4, 4, (7, 2))
-    np.testing.assert_allclose(to_world(composed(a, b), point), to_world(a, to_world(b, point)), atol=1e-12)
-
-
-def assert_equal(poses, expected):
-    np.testing.assert_allclose(poses[..., :2], expected[..., :2], atol=1e-12)
-    np.testing.assert_allclose(wrap_angle(poses[..., 2] - expected[..., 2]), 0.0, atol=1e-12)
+        assert_same(part[np.isfinite(part[:, 0])], poses, position=1e-3, turn=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -177,38 +173,40 @@ def drifting(poses, share, rng):
     motion += share * rng.normal(size=motion.shape) * np.concatenate([size[0], size[0], size[0] + size[1]], axis=1)
     odometry = [poses[0]]
     for step in motion:
-        odometry.append(composed(odometry[-1], step))
+        odometry.append(compose(odometry[-1], step))
     return np.array(odometry)
 
 
-def assert_aligned(found, poses, *, place, turn):
+def assert_aligned(found, poses, *, position, turn):
     """The same after the rigid motion of least squares."""
     centred, expected = (xy - xy.mean(axis=0) for xy in (found[:, :2], poses[:, :2]))
     # Kabsch in the complex plane.
     angle = np.angle((np.conj(centred @ [1, 1j]) * (expected @ [1, 1j])).sum())
-    moved = to_world(np.array([0.0, 0.0, angle]), centred)
-    assert np.linalg.norm(moved - expected, axis=1).max() < place
+    moved = transform_points(np.array([0.0, 0.0, angle]), centred)
+    assert np.linalg.norm(moved - expected, axis=1).max() < position
     assert np.abs(wrap_angle(found[:, 2] + angle - poses[:, 2])).max() < turn
 
 
+@pytest.mark.slow
 def test_the_office_with_odometry(office, rng):
     poses, models = office
-    found = place(models, drifting(poses, 0.02, rng))
+    found = largest(models, drifting(poses, 0.02, rng))
     assert np.isfinite(found).all()
-    assert_aligned(found, poses, place=0.06, turn=np.radians(3))
+    assert_aligned(found, poses, position=0.06, turn=np.radians(3))
 
 
+@pytest.mark.slow
 def test_the_office_without_odometry(office):
     """Some scans stay open, but none is wrong. With less of a margin more are placed, and may be wrong."""
     poses, models = office
-    parts = place_parts(models)
+    parts = register_scans(models)
     placed = np.isfinite([part[:, 0] for part in parts])
     assert (placed.sum(axis=0) <= 1).all()
     large = [part for part, those in zip(parts, placed, strict=True) if those.sum() > 2]
     assert large
     for part in large:
         those = np.isfinite(part[:, 0])
-        assert_aligned(part[those], poses[those], place=0.1, turn=np.radians(5))
-    bold = np.isfinite([part[:, 0] for part in place_parts(models, margin=0.5)])
+        assert_aligned(part[those], poses[those], position=0.1, turn=np.radians(5))
+    bold = np.isfinite([part[:, 0] for part in register_scans(models, margin=0.5)])
     assert (bold.sum(axis=0) <= 1).all()
     assert bold.sum() > placed.sum()

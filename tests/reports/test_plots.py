@@ -157,6 +157,7 @@ def case(request):
     return CASES[request.param]()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", DRAW.values(), ids=DRAW)
 def test_every_figure_draws_whatever_there_is(case, draw):
     """Warnings are errors here, and the canvas draws everything once."""
@@ -217,6 +218,7 @@ def test_outermost_reflection_lines_end_where_the_segment_ends():
         np.testing.assert_allclose((rays[:, 1] - rays[:, 0]) @ along, 0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_place_leaves_out_what_is_farther_away():
     """Around one corner of the office: two walls, from three positions."""
     shipped = load_office()

@@ -1,4 +1,4 @@
-"""Packing: every echo once, in rooms of few shapes; what a scan gives depends on neither its room nor its company."""
+"""Packing: every echo appears once, and the result of a scan depends on neither padding nor the rest of its batch."""
 
 import dataclasses
 
@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxsonar import HoughSettings, Ring, extract_lines, kernels, random_pose, random_room, simulate
-from jaxsonar.detection.hough_detector import arcs_of, pieces_of
-from jaxsonar.scans.echo_batches import FlatEchoes, in_order
+from jaxsonar.detection.arc_tables import arc_tables
+from jaxsonar.scans.echo_batches import FAST_SCANS, SLOW_SCANS, pack, restore_order
+from jaxsonar.scans.flat_echoes import FlatEchoes
 
 RING, SETTINGS = Ring.circular(), HoughSettings()
 PATHS = len(RING.paths)
@@ -29,45 +30,47 @@ def some_ranges(count, *, slots=2):
 
 
 @settings(max_examples=40)
-@given(st.integers(0, 10_000), st.integers(0, 400), st.booleans(), st.booleans())
-def test_steps_hold_every_echo_of_every_scan_once(seed, scans, dear, cut):
+@given(st.integers(0, 10_000), st.integers(0, 400), st.sampled_from([FAST_SCANS, SLOW_SCANS]), st.booleans())
+def test_batches_contain_every_echo_of_every_scan_once(seed, scans, policy, cut):
     rng = np.random.default_rng(seed)
     scan = np.sort(rng.integers(0, max(scans, 1), 30 * scans))
     path, reported = rng.integers(0, PATHS, len(scan)), rng.uniform(0.3, 1.9, len(scan))
     flat = FlatEchoes(scans, scan, path, reported)
-    pieces = pieces_of(RING, SETTINGS) if cut else None
+    pieces = arc_tables(RING, SETTINGS).pieces if cut else None
     seen, echoes = [], []
-    for step in flat.steps(SETTINGS.cells, pieces=pieces, dear=dear):
-        seen += step.scans.tolist()
-        real = np.isfinite(step.reported)
-        assert not real[len(step.scans) :].any()
-        echoes += step.echo[real].tolist()
-        np.testing.assert_array_equal(scan[step.echo[real]], step.scans[np.nonzero(real)[0]])
-        np.testing.assert_array_equal(step.path[real], path[step.echo[real]])
-        np.testing.assert_array_equal(step.reported[real], reported[step.echo[real]].astype(np.float32))
+    for batch in pack(flat, SETTINGS.cells, pieces=pieces, policy=policy):
+        seen += batch.scans.tolist()
+        real = np.isfinite(batch.reported)
+        assert not real[len(batch.scans) :].any()
+        echoes += batch.echo[real].tolist()
+        np.testing.assert_array_equal(scan[batch.echo[real]], batch.scans[np.nonzero(real)[0]])
+        np.testing.assert_array_equal(batch.path[real], path[batch.echo[real]])
+        np.testing.assert_array_equal(batch.reported[real], reported[batch.echo[real]].astype(np.float32))
         if pieces is None:
-            assert step.piece is None
+            assert batch.piece is None
             continue
-        assert step.piece is not None
-        assert step.owner is not None
-        row, at = np.nonzero(step.piece >= 0)
-        owned = [(r, step.owner[r, c], step.piece[r, c]) for r, c in zip(row, at, strict=True)]
-        wanted = [(r, c, k) for r, c in np.argwhere(real) for k in range(pieces[step.path[r, c]])]
+        assert batch.piece is not None
+        assert batch.owner is not None
+        row, at = np.nonzero(batch.piece >= 0)
+        owned = [(r, batch.owner[r, c], batch.piece[r, c]) for r, c in zip(row, at, strict=True)]
+        wanted = [(r, c, k) for r, c in np.argwhere(real) for k in range(pieces[batch.path[r, c]])]
         assert sorted(owned) == sorted(wanted)
     assert sorted(seen) == list(range(scans))
     assert sorted(echoes) == list(range(len(scan)))
 
 
-def test_pieces_vote_as_whole_arcs_do():
-    arcs, flat = arcs_of(RING, SETTINGS), FlatEchoes.from_dense(RING, some_ranges(20))
-    for step in flat.steps(SETTINGS.cells, pieces=pieces_of(RING, SETTINGS)):
-        whole = step.packed._replace(piece=None, owner=None)
-        cut, uncut = (kernels.accumulators(arcs, one, settings=SETTINGS) for one in (step.packed, whole))
+@pytest.mark.slow
+def test_arc_pieces_give_the_same_votes_as_whole_arcs():
+    arcs, flat = arc_tables(RING, SETTINGS).arcs, FlatEchoes.from_dense(RING, some_ranges(20))
+    for batch in pack(flat, SETTINGS.cells, pieces=arc_tables(RING, SETTINGS).pieces):
+        whole = batch.packed._replace(piece=None, owner=None)
+        cut, uncut = (kernels.accumulators(arcs, one, settings=SETTINGS) for one in (batch.packed, whole))
         jax.tree.map(np.testing.assert_array_equal, cut, uncut)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["hough", "ml"])
-def test_a_scan_gives_the_same_bits_alone_and_in_any_company(method):
+def test_lines_of_a_scan_are_bit_identical_in_every_batch(method):
     ranges = some_ranges(80 if method == "hough" else 36)
     among = extract_lines(RING, ranges, method=method)
     assert np.isfinite(among.rho).any()
@@ -80,5 +83,5 @@ def test_a_scan_gives_the_same_bits_alone_and_in_any_company(method):
 
 
 @given(st.permutations(range(12)))
-def test_what_came_in_any_order_is_told_in_order(order):
-    assert list(in_order((k, str(k)) for k in order)) == [str(k) for k in range(12)]
+def test_restore_order_sorts_any_permutation(order):
+    assert list(restore_order((k, str(k)) for k in order)) == [str(k) for k in range(12)]

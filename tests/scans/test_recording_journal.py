@@ -17,39 +17,39 @@ import pytest
 from support.fake_devices import Given, messages
 
 from jaxsonar import Log, Ring, SonarError, load_log, save_log
-from jaxsonar.hardware.drop_oldest_queue import NewestQueue
+from jaxsonar.hardware.drop_oldest_queue import DropOldestQueue
 from jaxsonar.hardware.mcap_recorder import EVENTS, MESSAGES, read_mcap
 from jaxsonar.hardware.messages import ECHO, Group, Message
-from jaxsonar.hardware.protocol import Decoder, encode, frame
-from jaxsonar.hardware.reader_thread import Reader
-from jaxsonar.hardware.recorder import open_recorder, scan_rows
-from jaxsonar.hardware.recorder_base import Recorder, mark_of
-from jaxsonar.hardware.scan_assembler import Assembler, RawScan
-from jaxsonar.hardware.transport_base import EndOfStream, Event, Source, open_source, parse_url
+from jaxsonar.hardware.protocol import Decoder, encode, encode_frame
+from jaxsonar.hardware.reader_thread import ReaderThread
+from jaxsonar.hardware.recorder import csv_rows, open_recorder
+from jaxsonar.hardware.recorder_base import Recorder, recording_marker
+from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler
+from jaxsonar.hardware.transport_base import EndOfStream, LinkEvent, Source, open_source, parse_url
 from jaxsonar.live.replay import messages_of
 from jaxsonar.scans.recording_journal import CutShort, journal_of, open_record
 
 SUFFIXES = (".csv", ".parquet", ".mcap")
 
 
-def read_all(source: Source, recorder: Recorder | None = None, **choices) -> tuple[list[RawScan], Reader]:
-    queue: NewestQueue[RawScan] = NewestQueue()
-    reader = Reader(source, queue, recorder=recorder, sensors=24, **choices)
+def read_all(source: Source, recorder: Recorder | None = None, **choices) -> tuple[list[RawScan], ReaderThread]:
+    queue: DropOldestQueue[RawScan] = DropOldestQueue()
+    reader = ReaderThread(source, queue, recorder=recorder, sensors=24, **choices)
     reader.start()
     scans = []
     while not queue.ended:
-        scans += queue.get(1.0, most=100)
+        scans += queue.get(1.0, max_items=100)
     reader.stop()
     return scans, reader
 
 
 def as_log(scans):
-    text = "scan,stamp,x,y,theta,tx,rx,range,amplitude\n" + "".join(map(scan_rows, scans))
+    text = "scan,stamp,x,y,theta,tx,rx,range,amplitude\n" + "".join(map(csv_rows, scans))
     return text
 
 
 def assembled(sent: list[Message]) -> list[RawScan]:
-    assembler = Assembler(sensors=24)
+    assembler = ScanAssembler(sensors=24)
     return [scan for message in sent for scan in assembler.push(message, 0.0)] + assembler.flush()
 
 
@@ -79,8 +79,8 @@ def test_a_raw_record_holds_every_bit_and_both_clocks(tmp_path):
     before = time.time()
     for message in sent[:100]:
         recorder.message(message, time.time())
-    recorder.event(Event("lost", "the cable", 12.5))
-    recorder.event(Event("back", "the cable again", 17.5))
+    recorder.event(LinkEvent("lost", "the cable", 12.5))
+    recorder.event(LinkEvent("back", "the cable again", 17.5))
     for message in sent[100:]:
         recorder.message(message, time.time())
     recorder.close()
@@ -129,6 +129,7 @@ def test_a_raw_record_is_played_as_it_came(speed, tmp_path):
         assert np.median(late) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_log_that_was_cut_anywhere_opens(suffix, tmp_path):
     """Killed within any write: all scans that were written whole, and no part of another one."""
@@ -141,7 +142,7 @@ def test_a_log_that_was_cut_anywhere_opens(suffix, tmp_path):
     recorder = open_record(path)
     for scan in scans:
         recorder.scan(scan)
-    mark, journal = mark_of(path), path if suffix == ".csv" else journal_of(path)
+    mark, journal = recording_marker(path), path if suffix == ".csv" else journal_of(path)
     assert journal.read_bytes() == text
     assert int(mark.read_text()) == len(text)
     lengths = {*range(ends[0], len(text) + 1, 29), *(end + k for end in ends[1:] for k in (-1, 0, 1))}
@@ -177,7 +178,7 @@ def test_a_finished_parquet_file_wins_over_what_is_left_of_its_journal(tmp_path)
     path = tmp_path / "log.parquet"
     journal_of(path).write_text(as_log(assembled(list(messages(2)))))
     os.utime(journal_of(path), (1, 1))
-    mark_of(path).touch()
+    recording_marker(path).touch()
     save_log(Log.from_scans([]), path)
     assert len(load_log(path)) == 0
 
@@ -208,10 +209,10 @@ def test_a_raw_record_that_was_cut_anywhere_opens(tmp_path):
 def test_errors_of_the_reading_thread_reach_the_consumer(tmp_path):
     """After everything that came before them, and with the record closed."""
     sent = [encode(message) for message in messages(3)]
-    queue: NewestQueue[RawScan] = NewestQueue()
+    queue: DropOldestQueue[RawScan] = DropOldestQueue()
     path = tmp_path / "log.csv"
     source = Given([*sent, ValueError("the driver broke")])
-    reader = Reader(source, queue, recorder=open_record(path))
+    reader = ReaderThread(source, queue, recorder=open_record(path))
     reader.start()
     scans, errors = [], []
     while not queue.ended:
@@ -223,7 +224,7 @@ def test_errors_of_the_reading_thread_reach_the_consumer(tmp_path):
     assert [str(failure) for failure in errors] == ["the driver broke"]
     assert source.closed
     assert queue.ended
-    assert not mark_of(path).exists()
+    assert not recording_marker(path).exists()
 
 
 def test_a_full_disk_is_told_in_one_line(tmp_path):
@@ -241,7 +242,7 @@ def test_frames_and_groups_that_cannot_be_are_counted_together():
     echoes = np.zeros(1, ECHO)
     echoes["time_us"] = 1000.0
     many = encode(Group(9, 2_000_000, 1, 0, 500, 20.0, echoes))  # of so many groups makes nobody a scan
-    hot = frame(struct.pack("<BBBBIQIHHfHH", 1, 0, 1, 0, 10, 2_000_000, 1, 0, 4, 1e9, 0, 0))
+    hot = encode_frame(struct.pack("<BBBBIQIHHfHH", 1, 0, 1, 0, 10, 2_000_000, 1, 0, 4, 1e9, 0, 0))
     scans, reader = read_all(Given([*map(encode, messages(1)), many, hot, hot]))
     assert len(scans) == 1
     assert (reader.counts["impossible"], reader.counts["rejected"]) == (3, 3)
@@ -290,8 +291,8 @@ def test_what_no_device_said_is_refused_before_anybody_listens(faw_ring, tmp_pat
 def test_a_reader_that_is_stopped_has_written_everything(tmp_path):
     path = tmp_path / "log.csv"
     endless = (encode(message) for message in messages(100_000))
-    queue: NewestQueue[RawScan] = NewestQueue(16)
-    reader = Reader(Given(endless), queue, recorder=open_record(path))
+    queue: DropOldestQueue[RawScan] = DropOldestQueue(16)
+    reader = ReaderThread(Given(endless), queue, recorder=open_record(path))
     reader.start()
     while not queue.dropped:
         time.sleep(0.01)
@@ -304,17 +305,18 @@ def test_a_reader_that_is_stopped_has_written_everything(tmp_path):
 
 
 def test_a_patient_reader_drops_nothing_and_ends_after_so_many_scans():
-    queue: NewestQueue[RawScan] = NewestQueue(4)
-    reader = Reader(Given(encode(m) for m in messages(300)), queue, patient=True, scans=200)
+    queue: DropOldestQueue[RawScan] = DropOldestQueue(4)
+    reader = ReaderThread(Given(encode(m) for m in messages(300)), queue, patient=True, scans=200)
     reader.start()
     scans = []
     while not queue.ended:
-        scans += queue.get(1.0, most=3)
+        scans += queue.get(1.0, max_items=3)
         time.sleep(0.001)
     assert [scan.scan for scan in scans] == list(range(200))
     assert queue.dropped == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("played_back", [True, False])
 def test_a_device_that_runs_ahead_of_its_clock_is_waited_for_and_a_live_one_is_not(played_back):
     """Also once it has been made to wait for longer than its own clock is ahead."""
@@ -322,13 +324,13 @@ def test_a_device_that_runs_ahead_of_its_clock_is_waited_for_and_a_live_one_is_n
     sent = list(messages(scans, groups=1))
     for message in sent:  # a scan is 0.1 s, or as long as it takes to come
         object.__setattr__(message, "time_us", message.time_us * (9 if played_back else 0) + message.sequence * 100)
-    queue: NewestQueue[RawScan] = NewestQueue(16)
-    reader = Reader(Given(map(encode, sent), pause=0.0002), queue, patient=None)
+    queue: DropOldestQueue[RawScan] = DropOldestQueue(16)
+    reader = ReaderThread(Given(map(encode, sent), pause=0.0002), queue, patient=None)
     reader.start()
     time.sleep(2.0)
     taken = []
     while not queue.ended:
-        taken += queue.get(0.2, most=1)
+        taken += queue.get(0.2, max_items=1)
         time.sleep(0.002)
     assert (queue.dropped == 0) == played_back
     assert len(taken) == scans - queue.dropped
@@ -339,8 +341,8 @@ import sys, time
 sys.path.insert(0, {tests!r})
 from support.fake_devices import Given, messages
 from jaxsonar.hardware.protocol import encode
-from jaxsonar.hardware.drop_oldest_queue import NewestQueue
-from jaxsonar.hardware.reader_thread import Reader
+from jaxsonar.hardware.drop_oldest_queue import DropOldestQueue
+from jaxsonar.hardware.reader_thread import ReaderThread
 from jaxsonar.hardware.recorder_base import Recorder
 from jaxsonar.scans.recording_journal import open_record
 
@@ -356,7 +358,7 @@ class All(Recorder):
         return every
 
 frames = (encode(message) for message in messages(1_000_000, groups=8, echoes=8))
-reader = Reader(Given(frames, pause={pause}), NewestQueue(8), recorder=All())
+reader = ReaderThread(Given(frames, pause={pause}), DropOldestQueue(8), recorder=All())
 reader.start()
 reader._thread.join()
 """
@@ -377,6 +379,7 @@ def killed(stem, pause, after):
         return lines + process.communicate()[0], when
 
 
+@pytest.mark.slow
 def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
     """Twenty processes, four at a time, killed at random moments: every file opens, with what came a second before."""
     rng = random.Random(7)

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from support import oracles
 
 from jaxsonar import HoughSettings, Log, Ring, SonarError, kernels, local_models
-from jaxsonar.detection.extract import arcs_of
-from jaxsonar.geometry.se2 import relative, to_world, wrap_angle
-from jaxsonar.scans.echo_batches import FlatEchoes
+from jaxsonar.detection.arc_tables import arc_tables
+from jaxsonar.geometry.se2 import relative, transform_points, wrap_angle
+from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Scan
-from jaxsonar.scans.sliding_windows import LEAST_GAP, SAME_HEADING, SAME_PLACE, Stretch, gather, moved, renewed
+from jaxsonar.scans.sliding_windows import SETTINGS as WINDOWS
+from jaxsonar.scans.sliding_windows import WindowBuffer, gather_windows, has_moved, is_fresh_reading
 
 RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # no point on a cell's border
 FOUR = Ring.circular(count=4, beam=1.0, neighbors=0)
@@ -58,9 +59,10 @@ def composed(world_from_a, a_from_b):
 # gathered echoes
 
 
+@pytest.mark.slow
 def test_echoes_that_all_carry_the_identity_are_those_of_one_scan(rng):
     echoes = mixed_echoes(rng)
-    arcs = arcs_of(RING, SETTINGS)
+    arcs = arc_tables(RING, SETTINGS).arcs
     plain = lines_of_scan(arcs, one_scan(packed(echoes, poses=False)), settings=SETTINGS)
     posed = lines_of_scan(arcs, one_scan(packed(echoes)), settings=SETTINGS)
     jax.tree.map(np.testing.assert_array_equal, posed, plain)
@@ -73,7 +75,7 @@ def test_a_motion_of_all_poses_moves_the_lines(x, y, turn, seed):
     poses = rng.uniform(-0.3, 0.3, (3, 3))
     echoes = mixed_echoes(rng, poses=poses)
     motion = np.array([x, y, turn])
-    arcs = arcs_of(RING, SETTINGS)
+    arcs = arc_tables(RING, SETTINGS).arcs
     turned = [(composed(motion, pose), path, reach) for pose, path, reach in echoes]
     both = [one_scan(packed(seen)) for seen in (echoes, turned)]
     here, there = (lines_of_scan(arcs, seen, settings=SETTINGS) for seen in both)
@@ -94,13 +96,13 @@ def test_a_motion_of_line_and_sensors_moves_the_segment(x, y, turn, theta, seed)
     motion, involved = np.array([x, y, turn]), np.arange(9) % 3 > 0
     here = extent(jnp.float32(2), jnp.float32(theta), sensors, involved)
     rho = 2 + x * math.cos(theta + turn) + y * math.sin(theta + turn)
-    moved_sensors = to_world(motion, sensors.astype(float)).astype(np.float32)
+    moved_sensors = transform_points(motion, sensors.astype(float)).astype(np.float32)
     there = extent(jnp.float32(rho), jnp.float32(theta + turn), moved_sensors, involved)
-    np.testing.assert_allclose(there, to_world(motion, np.asarray(here, float)), atol=1e-5)
+    np.testing.assert_allclose(there, transform_points(motion, np.asarray(here, float)), atol=1e-5)
 
 
 def test_turning_the_frame_by_whole_cells_turns_the_cells(rng):
-    arcs = arcs_of(RING, SETTINGS)
+    arcs = arc_tables(RING, SETTINGS).arcs
     echoes = mixed_echoes(rng, poses=rng.uniform(-0.3, 0.3, (2, 3)))
     results = []
     for step in (0, 7, 50):
@@ -124,7 +126,7 @@ def test_scans_of_a_moving_robot_vote_for_the_wall_in_the_frame_of_the_last_pose
         SETTINGS,
     )
     gathered = packed([(relative(last, pose), path, reach) for pose, path, reach in echoes], gathered=5.0)
-    votes, _ = kernels.accumulators(arcs_of(RING, SETTINGS), gathered, settings=SETTINGS)
+    votes, _ = kernels.accumulators(arc_tables(RING, SETTINGS).arcs, gathered, settings=SETTINGS)
     votes = np.asarray(votes[0])
     assert votes.sum() == wanted.sum()
     assert np.abs(votes - wanted).sum() <= 0.01 * wanted.sum()  # points on the border of two cells
@@ -137,7 +139,7 @@ def test_scans_of_a_moving_robot_vote_for_the_wall_in_the_frame_of_the_last_pose
 @pytest.mark.parametrize("times", [1, 2, 4])
 def test_the_same_echoes_several_times_over_and_gathered_so_often_are_the_same_cells(rng, times):
     echoes = [*mixed_echoes(rng)][: ROOM // 4]
-    arcs = arcs_of(RING, SETTINGS)
+    arcs = arc_tables(RING, SETTINGS).arcs
     once = kernels.vote(arcs, packed(echoes, gathered=1.0), settings=SETTINGS).occupied
     often = kernels.vote(arcs, packed(echoes * times, gathered=float(times)), settings=SETTINGS).occupied
     assert once.any()
@@ -146,7 +148,7 @@ def test_the_same_echoes_several_times_over_and_gathered_so_often_are_the_same_c
 
 @pytest.mark.parametrize("gathered", [0.5, 1.0, 3.25])
 def test_gathered_is_a_factor_of_the_threshold(rng, gathered):
-    echoes, arcs = mixed_echoes(rng), arcs_of(RING, SETTINGS)
+    echoes, arcs = mixed_echoes(rng), arc_tables(RING, SETTINGS).arcs
     _, smooth = kernels.accumulators(arcs, packed(echoes, gathered=gathered), settings=SETTINGS)
     came = kernels.vote(arcs, packed(echoes, gathered=gathered), settings=SETTINGS).occupied
     np.testing.assert_array_equal(came, np.asarray(smooth) > np.float32(arcs.level) * np.float32(gathered))
@@ -236,16 +238,16 @@ def test_a_log_of_no_scans():
 @given(st.integers(0, 10_000), st.sampled_from([0.3, 1.0, 2.5, 50.0]), st.sampled_from([0.0, 0.05, 0.4]))
 def test_windows_hold_the_new_echoes_of_their_stretch_in_the_frame_of_its_end(seed, length, missing):
     log = a_log(seed, missing=missing)
-    windows, left_out = gather(FOUR, log, length=length)
+    windows, left_out = gather_windows(FOUR, log, length=length)
     scans = heard(FOUR, log)
     assert left_out == len(log.tx) - sum(len(scan) for scan in scans)
-    waits = oracles.moved(log.pose, SAME_PLACE, SAME_HEADING)
+    waits = oracles.moved(log.pose, WINDOWS.place_distance, WINDOWS.place_rotation)
     fresh = [[new and here for new in scan] for scan, here in zip(oracles.renewed(scans), waits, strict=True)]
     spans = oracles.windows(log.pose, length)
     np.testing.assert_array_equal(windows.last, [last for _, last in spans])
-    assert windows.gap == max(LEAST_GAP, length / 4)
+    assert windows.gap == max(WINDOWS.min_gap, length / 4)
     flat = windows.echoes
-    assert flat.scans == len(spans)
+    assert flat.scan_count == len(spans)
     assert flat.pose is not None
     assert flat.gathered is not None
     for k, span in enumerate(spans):
@@ -265,7 +267,7 @@ def test_windows_hold_the_new_echoes_of_their_stretch_in_the_frame_of_its_end(se
 @given(st.integers(0, 10_000), st.sampled_from([0.3, 1.0, 2.5]))
 def test_windows_cover_the_path_reach_back_by_their_length_and_across_no_gap(seed, length):
     log = a_log(seed, missing=0.1)
-    windows, _ = gather(FOUR, log, length=length)
+    windows, _ = gather_windows(FOUR, log, length=length)
     known = np.array([bool(np.isfinite(pose).all()) for pose in log.pose])
     covered = np.zeros(len(log), bool)
     assert (np.diff(windows.last) > 0).all()
@@ -284,25 +286,26 @@ def test_windows_cover_the_path_reach_back_by_their_length_and_across_no_gap(see
 
 def test_every_echo_is_in_two_windows_of_an_even_path():
     log = log_of([[(0, 0, 1 + k / 100)] for k in range(65)], straight([0.0625] * 64))
-    windows, _ = gather(FOUR, log, length=1.0)
+    windows, _ = gather_windows(FOUR, log, length=1.0)
     assert windows.last.tolist() == [8, 16, 24, 32, 40, 48, 56, 64]
     times = np.bincount(windows.scan, minlength=65)
     assert (times[1:56] >= 2).all()
     assert times.max() == 3  # at the ends of windows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [0.1, 0.05, 0.025])
 def test_scan_by_scan_windows_of_decimal_steps_end_where_those_of_the_log_do(step):
     """A pose may come to lie just on the end of a window; both ways must round alike."""
     log = log_of([[(0, 0, 1 + k / 100)] for k in range(120)], np.arange(120)[:, None] * [step, 0.0, 0.0])
     for length in (0.2, 0.3, 0.4, 0.6, 1.0, 1.4):
-        whole, _ = gather(FOUR, log, length=length)
+        whole, _ = gather_windows(FOUR, log, length=length)
         assert [windows.last[0] for windows in scan_by_scan(FOUR, log, length)] == whole.last.tolist(), length
 
 
 def test_a_short_window_on_a_long_path_is_as_many_windows_as_scans():
     log = log_of([[(0, 0, 1.0)], [(0, 0, 1.1)], [(0, 0, 1.2)]], straight([10.0, 10.0]))
-    windows, _ = gather(FOUR, log, length=0.01)
+    windows, _ = gather_windows(FOUR, log, length=0.01)
     assert windows.last.tolist() == [1, 2]
 
 
@@ -310,10 +313,10 @@ def test_a_short_window_on_a_long_path_is_as_many_windows_as_scans():
 
 
 def kept_of(readings, poses=None, ring=FOUR):
-    """(scan, path, range) of the readings that ``renewed`` keeps."""
+    """(scan, path, range) of the readings that ``is_fresh_reading`` keeps."""
     poses = straight([0.1] * (len(readings) - 1)) if poses is None else poses
     flat, _ = FlatEchoes.from_log(ring, log_of(readings, poses))
-    fresh = renewed(flat)
+    fresh = is_fresh_reading(flat)
     return list(zip(flat.scan[fresh].tolist(), flat.path[fresh].tolist(), flat.reported[fresh].tolist(), strict=True))
 
 
@@ -334,7 +337,7 @@ def test_new_readings_are_those_of_the_slow_oracle(seed):
     log = a_log(seed, strangers=False)
     flat, _ = FlatEchoes.from_log(FOUR, log)
     wanted = [new for scan in oracles.renewed(heard(FOUR, log)) for new in scan]
-    assert renewed(flat).tolist() == wanted
+    assert is_fresh_reading(flat).tolist() == wanted
 
 
 @pytest.mark.parametrize("times", [1, 2, 5])
@@ -348,29 +351,29 @@ def test_a_reading_that_comes_twice_in_a_scan_is_renewed_as_one_that_comes_once(
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.3, 1.0]))
 def test_places_are_those_of_the_slow_oracle(seed, missing):
     log = a_log(seed, missing=missing)
-    assert moved(log.pose).tolist() == oracles.moved(log.pose, SAME_PLACE, SAME_HEADING)
+    assert has_moved(log.pose).tolist() == oracles.moved(log.pose, WINDOWS.place_distance, WINDOWS.place_rotation)
 
 
 def test_a_waiting_robot_counts_once_and_one_that_turns_in_place_goes_on():
     waiting = np.tile([[1.0, 2.0, 0.5]], (6, 1))
-    assert moved(waiting).tolist() == [True] + [False] * 5
+    assert has_moved(waiting).tolist() == [True] + [False] * 5
     turning = np.column_stack([np.ones((6, 2)), np.radians([170, 175, 180, -175, -170, -165])])
-    assert moved(turning).all()
-    slow = straight([SAME_PLACE / 4] * 40)
-    assert moved(slow).sum() == pytest.approx(11, abs=1)
+    assert has_moved(turning).all()
+    slow = straight([WINDOWS.place_distance / 4] * 40)
+    assert has_moved(slow).sum() == pytest.approx(11, abs=1)
 
 
 @pytest.mark.parametrize(
     "poses", [np.zeros((0, 3)), np.full((4, 3), np.nan), np.full((1, 3), np.nan), np.zeros((1, 3))]
 )
 def test_places_of_hardly_any_scans(poses):
-    assert moved(poses).tolist() == np.isfinite(poses).all(axis=1).tolist()
+    assert has_moved(poses).tolist() == np.isfinite(poses).all(axis=1).tolist()
 
 
 def test_a_waiting_robot_adds_one_scan_to_its_window():
     readings = [[(0, 0, 1 + k / 50)] for k in range(12)]
     poses = straight([0.2] * 3 + [0.0] * 5 + [0.2] * 3)
-    windows, _ = gather(FOUR, log_of(readings, poses), length=2.0)
+    windows, _ = gather_windows(FOUR, log_of(readings, poses), length=2.0)
     assert sorted(set(windows.scan.tolist()) & set(range(9))) == [0, 1, 2, 3]
 
 
@@ -389,7 +392,7 @@ def test_a_waiting_robot_adds_one_scan_to_its_window():
 )
 def test_hardly_anything_to_gather(readings, poses, last):
     log = log_of(readings, poses)
-    windows, left_out = gather(FOUR, log, length=1.0)
+    windows, left_out = gather_windows(FOUR, log, length=1.0)
     assert windows.last.tolist() == last
     assert left_out == 0
 
@@ -398,7 +401,7 @@ def test_hardly_anything_to_gather(readings, poses, last):
 def test_windows_that_are_no_length_are_refused(length):
     log = a_log(1)
     with pytest.raises(SonarError, match=r"window = .* m; allowed is 0.01 to 100 m"):
-        gather(FOUR, log, length=length)
+        gather_windows(FOUR, log, length=length)
     with pytest.raises(SonarError, match=r"window = .* m; allowed is 0.01 to 100 m"):
         local_models(FOUR, log, window=length)
 
@@ -413,8 +416,8 @@ def test_sensors_that_the_ring_does_not_have_are_refused():
     log = log_of([[(0, 0, 1.0)], [(1, 7, 1.0)]], straight([0.5]))
     message = "tx 1, rx 7; allowed are 0 to 3"
     with pytest.raises(SonarError, match=message):
-        gather(FOUR, log, length=1.0)
-    stretch = Stretch()
+        gather_windows(FOUR, log, length=1.0)
+    stretch = WindowBuffer()
     for scan in log:
         stretch, _ = stretch.including(scan, length=1.0)
     with pytest.raises(SonarError, match=message):
@@ -423,7 +426,7 @@ def test_sensors_that_the_ring_does_not_have_are_refused():
 
 def test_pairs_that_the_ring_does_not_listen_to_are_counted_and_left_out():
     log = log_of([[(0, 0, 1.0), (0, 1, 1.0)], [(2, 3, 1.0), (1, 1, 0.7)]], straight([0.5]))
-    windows, left_out = gather(FOUR, log, length=5.0)
+    windows, left_out = gather_windows(FOUR, log, length=5.0)
     assert left_out == 2
     assert windows.echoes.path.tolist() == [0, 1]
     told = []
@@ -435,7 +438,7 @@ def test_scan_numbers_name_scans_and_do_not_order_them():
     readings = [[(k % 4, k % 4, 1 + k / 50)] for k in range(20)]
     poses = straight([0.1] * 19)
     plain, shuffled = log_of(readings, poses), log_of(readings, poses, scan=np.arange(20)[::-1] * 7 + 100)
-    one, other = (gather(FOUR, log, length=1.0)[0] for log in (plain, shuffled))
+    one, other = (gather_windows(FOUR, log, length=1.0)[0] for log in (plain, shuffled))
     np.testing.assert_array_equal(one.last, other.last)
     np.testing.assert_array_equal(one.scan, other.scan)
     np.testing.assert_array_equal(one.echoes.pose, other.echoes.pose)
@@ -446,7 +449,7 @@ def test_scan_numbers_name_scans_and_do_not_order_them():
 
 def scan_by_scan(ring, log, length):
     """Windows of a log as a robot gathers them, with rows as in the log."""
-    stretch, ended, row, found = Stretch(), True, {int(number): k for k, number in enumerate(log.scan)}, []
+    stretch, ended, row, found = WindowBuffer(), True, {int(number): k for k, number in enumerate(log.scan)}, []
 
     def close(stretch):
         part, windows = stretch.window(ring, length=length)
@@ -466,7 +469,7 @@ def scan_by_scan(ring, log, length):
 
 
 def assert_same_windows(ring, log, length):
-    whole, _ = gather(ring, log, length=length)
+    whole, _ = gather_windows(ring, log, length=length)
     single = scan_by_scan(ring, log, length)
     assert [int(windows.last[0]) for windows in single] == whole.last.tolist()
     flat = whole.echoes
@@ -482,6 +485,7 @@ def assert_same_windows(ring, log, length):
         assert windows.gap == whole.gap
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(st.integers(0, 10_000), st.sampled_from([0.25, 0.7, 2.0, 50.0]), st.sampled_from([0.0, 0.05, 0.5]))
 def test_windows_gathered_scan_by_scan_are_those_of_the_whole_log(seed, length, missing):
@@ -495,7 +499,7 @@ def test_a_reading_that_comes_twice_in_a_scan_is_the_same_scan_by_scan():
 
 def test_the_stretch_given_is_left_as_it_was():
     log = a_log(5, missing=0.0)
-    stretch, _ = Stretch().including(log[0], length=1.0)
+    stretch, _ = WindowBuffer().including(log[0], length=1.0)
     before = (stretch.scans, stretch.way, stretch.new, dict(stretch.runs), stretch.place)
     stretch.including(log[1], length=1.0)
     assert (stretch.scans, stretch.way, stretch.new, dict(stretch.runs), stretch.place) == before
@@ -503,7 +507,10 @@ def test_the_stretch_given_is_left_as_it_was():
 
 def test_a_stretch_forgets_what_lies_farther_back_than_a_window():
     nobody = np.zeros(0, int)
-    stretch, step = Stretch(), partial(Scan, stamp=0.0, tx=nobody, rx=nobody, range=np.zeros(0), amplitude=np.zeros(0))
+    stretch, step = (
+        WindowBuffer(),
+        partial(Scan, stamp=0.0, tx=nobody, rx=nobody, range=np.zeros(0), amplitude=np.zeros(0)),
+    )
     for k in range(200):
         stretch, _ = stretch.including(step(scan=k, pose=np.array([k / 8, 0.0, 0.0])), length=1.0)
         assert len(stretch.scans) <= 9

@@ -51,6 +51,7 @@ def test_detection_ranges_of_section_3(beam, neighbors, widths):
     np.testing.assert_allclose(np.cos((first + last) / 2 - centre), 1, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ring",
     [

@@ -108,6 +108,7 @@ beams = st.floats(0.01, np.pi)
 common = {"max_range": st.floats(0.1, 50), "speed_of_sound": st.floats(1, 5000), "name": st.text(max_size=8)}
 
 
+@pytest.mark.slow
 @given(
     st.fixed_dictionaries(
         {"count": st.integers(4, 40), "radius": st.floats(0, 3), "beam": beams, "first_heading": st.floats(-7, 7)}

@@ -113,6 +113,7 @@ def test_the_robot_fits_everywhere(office):
         assert all(math.dist((x, y), pole) > 0.3 for pole in office.room.poles)
 
 
+@pytest.mark.slow
 def test_the_robot_crosses_no_wall(office):
     way = np.stack([office.poses[:-1, :2], office.poses[1:, :2]], axis=1)
     along = np.linspace(0, 1, 11)[:, None]
@@ -201,6 +202,7 @@ def written(short_demo):
     return folder / "demo", tables, said
 
 
+@pytest.mark.slow
 def test_the_demo_writes_what_it_promises(written):
     folder, _, said = written
     assert {path.name for path in folder.iterdir()} == FILES
@@ -209,6 +211,7 @@ def test_the_demo_writes_what_it_promises(written):
     assert any("10 random poses in 2 random rooms" in step for step in said)
 
 
+@pytest.mark.slow
 def test_the_table_holds_numbers(written):
     def refuse(constant):
         raise ValueError(f"{constant} is no JSON")
@@ -243,6 +246,7 @@ def test_the_table_holds_numbers(written):
         assert table[full]["false_per_scan"] < table[paper]["false_per_scan"] / 2
 
 
+@pytest.mark.slow
 def test_the_map_has_one_segment_for_every_wall_in_reach(written, office):
     """The chair back-rest included, and nothing else; nearer to the truth than the segments it is made of."""
     folder, (_, maps), _ = written
@@ -256,6 +260,7 @@ def test_the_map_has_one_segment_for_every_wall_in_reach(written, office):
     assert any(shapely.LineString(segment).hausdorff_distance(chair) < 0.1 for segment in segments)
 
 
+@pytest.mark.slow
 def test_the_demos_files_give_its_map_again(written, tmp_path, capsys):
     folder, _, _ = written
     again = tmp_path / "again.geojson"
@@ -271,6 +276,7 @@ def test_a_folder_that_is_not_there_is_made(tmp_path):
     assert (tmp_path / "new" / "folder").is_dir()
 
 
+@pytest.mark.slow
 def test_the_page_shows_everything(written):
     folder, _, _ = written
     page = (folder / "index.html").read_text()
@@ -279,6 +285,7 @@ def test_the_page_shows_everything(written):
     assert "http" not in page.replace("http-equiv", "")
 
 
+@pytest.mark.slow
 def test_the_demos_files_give_its_lines_again(written, tmp_path, capsys):
     folder, _, _ = written
     again = tmp_path / "again.jsonl"
@@ -289,6 +296,7 @@ def test_the_demos_files_give_its_lines_again(written, tmp_path, capsys):
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_the_demos_files_give_its_log_again(written, tmp_path, office, capsys):
     folder, _, _ = written
     path = tmp_path / "path.csv"
@@ -301,6 +309,7 @@ def test_the_demos_files_give_its_log_again(written, tmp_path, office, capsys):
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_the_demos_files_load(written, office):
     folder, _, _ = written
     assert len(load_log(folder / "office.csv")) == 17

@@ -313,6 +313,7 @@ def test_length_of_a_plane_echo(xi, xj, yi, yj, angle):
     assert len(plane) == 1
 
 
+@pytest.mark.slow
 @given(
     xi=st.floats(0.05, 2), xj=st.floats(0.05, 2), yi=st.floats(0.05, 2), yj=st.floats(0.05, 2), angle=st.floats(-9, 9),
     off=st.sampled_from([0.0, 0.009, -0.009]),
@@ -352,6 +353,7 @@ def test_a_corner_ends_where_its_walls_end():
     assert Kind.CORNER not in reflections(room, tx, np.array([[1.0, 0.2]])).kind  # would meet it at 0.67 m
 
 
+@pytest.mark.slow
 @given(tx=st.tuples(coordinate, coordinate), rx=st.tuples(coordinate, coordinate))
 def test_length_of_echoes_of_poles_and_free_ends(tx, rx):
     pole, wall = np.array([[3.0, 1.0]]), np.array([[[2.0, 2.0], [2.0, 3.0]]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsonar import SonarError
-from jaxsonar.geometry.se2 import composed, relative, wrap_angle
+from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.simulation.wheel_odometry import ACROSS, drifted, step_sd
 
 
@@ -37,8 +37,8 @@ def test_it_begins_at_the_truth_and_is_the_same_again(rng):
 
 def test_it_does_not_hang_on_the_frame(rng):
     poses, motion = round_trip(rng), np.array([1.0, 2.0, 3.0])
-    moved = drifted(composed(motion, poses), distance=0.02, turn=0.02)
-    there = composed(motion, drifted(poses, distance=0.02, turn=0.02))
+    moved = drifted(compose(motion, poses), distance=0.02, turn=0.02)
+    there = compose(motion, drifted(poses, distance=0.02, turn=0.02))
     np.testing.assert_allclose(relative(there, moved), 0, atol=1e-9)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.maps import wall_and_corner
 
-from jaxsonar.estimation.landmark_map import surroundings
+from jaxsonar.estimation.landmark_map import landmark_map_of
 from jaxsonar.smoothing.covisibility import NEAR, Passages
 
 SCANS = 4  # of each stretch
@@ -74,11 +74,11 @@ def test_stretches_that_follow_one_another_share_their_walls(world):
 
 def test_scans_look_only_for_what_they_may_hear(world):
     two = passages((0.3, 0.3, 0.03)).parted(world, ROWS)
-    around = surroundings([two], tied=False)
+    around = landmark_map_of([two], tie_corners=False)
     poses, here = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.zeros(2, dtype=np.int64)
-    both = around.near(poses, here, 2.0)
+    both = around.candidates_in_range(poses, here, 2.0)
     assert all(set(row[row >= 0].tolist()) == {0, 1, 2, 3} for row in both)
     heard = np.zeros((2, len(around.world)), dtype=bool)
     heard[0, [0, 2]] = heard[1, [1, 3]] = True
-    own = around._replace(heard_by=heard).near(poses, here, 2.0)
+    own = around._replace(visible=heard).candidates_in_range(poses, here, 2.0)
     assert [set(row[row >= 0].tolist()) for row in own] == [{0, 2}, {1, 3}]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.maps import wall_and_corner
 
-from jaxsonar.geometry.se2 import composed
+from jaxsonar.geometry.se2 import compose
 from jaxsonar.smoothing.odometry_outliers import RARE, Breaks, broken_steps
 
 SD = np.array([0.008, 0.004, 0.007])
@@ -15,7 +15,7 @@ def driven(steps):
     """Poses of a path by its steps."""
     out = [np.zeros(3)]
     for step in steps:
-        out.append(composed(out[-1], step))
+        out.append(compose(out[-1], step))
     return np.array(out)
 
 
@@ -25,6 +25,7 @@ def walk(seed, share=1.0):
     return told, told + share * SD * np.random.default_rng(seed).standard_normal(told.shape)
 
 
+@pytest.mark.slow
 def test_by_chance_as_many_steps_are_broken_as_is_said():
     linked = np.tile(1 / SD**2, (STEPS, 1))
     found = sum(len(broken_steps(driven(true), told, linked)) for told, true in map(walk, range(40)))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxsonar import Log, Room, SonarError, kernels, simulate
-from jaxsonar.estimation.odometry_noise import Share, Slip
-from jaxsonar.geometry.se2 import composed, relative, wrap_angle
+from jaxsonar.estimation.odometry_noise import OdometryNoise, ProportionalNoise
+from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.kernels.block_arrowhead import Arrow, covariances, eliminated, solved
 from jaxsonar.simulation.office import load_office
 from jaxsonar.smoothing.smoother import Smoothed, smooth
@@ -51,6 +51,7 @@ def arrow(rng):
         )
 
 
+@pytest.mark.slow
 def test_an_arrow_is_solved_as_the_whole_matrix(arrow):
     parts, whole, side = arrow
     for damping in (0.0, 0.1):
@@ -60,6 +61,7 @@ def test_an_arrow_is_solved_as_the_whole_matrix(arrow):
         np.testing.assert_allclose(shared, expected[3 * POSES :], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_covariances_are_blocks_of_the_inverse(arrow):
     parts, whole, _ = arrow
     shared, poses = covariances(parts)
@@ -70,6 +72,7 @@ def test_covariances_are_blocks_of_the_inverse(arrow):
         np.testing.assert_allclose(found, inverse[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_chain_alone_spreads_as_a_random_walk():
     """No echo, odometry only: the covariance of a pose is the sum of those of the steps."""
     with jax.enable_x64(True):
@@ -94,7 +97,7 @@ def test_halving_the_steps_changes_no_drift(rng):
     walk = np.cumsum(rng.uniform(-0.2, 0.2, (40, 3)), axis=0)
     walk[:, 0] = np.abs(walk[:, 0]).cumsum()
     walk[:, 1:] = 0, 0.3  # on a line, so that steps divide
-    noise = Slip(standing=(1e-9, 1e-9))
+    noise = OdometryNoise(minimum=(1e-9, 1e-9))
     fine = noise(walk, np.arange(40))
     coarse = noise(walk, np.arange(1, 40, 2))
     np.testing.assert_allclose((fine[1:] ** 2).reshape(-1, 2, 3).sum(axis=1), coarse**2, rtol=1e-9)
@@ -103,20 +106,20 @@ def test_halving_the_steps_changes_no_drift(rng):
 def test_odometry_may_have_gaps():
     walk = np.column_stack([np.arange(5.0), np.zeros(5), np.zeros(5)])
     walk[2] = np.nan
-    found = Slip(place=0.1, heading=0.2, standing=(1e-9, 1e-9))(walk, np.array([0, 1, 3, 4]))
+    found = OdometryNoise(position_per_meter=0.1, heading_per_meter=0.2, minimum=(1e-9, 1e-9))(walk, np.array([0, 1, 3, 4]))
     np.testing.assert_allclose(found**2, np.outer([1, 2, 1], [0.01, 0.0025, 0.04]), rtol=1e-9)
 
 
 def test_a_share_is_of_the_way_and_the_turn():
     walk = np.array([[0, 0, 0], [2.0, 0, 0.5]])
     place, turn = 0.02 * 2 + 0.0005, 0.02 * (0.5 + 0.5 * 2) + 0.001
-    np.testing.assert_allclose(Share(0.02)(walk, np.arange(2)), [[place, place, turn]])
+    np.testing.assert_allclose(ProportionalNoise(0.02)(walk, np.arange(2)), [[place, place, turn]])
 
 
 @pytest.mark.parametrize("wrong", [{"place": -1.0}, {"heading": float("nan")}, {"standing": (0.0, 0.1)}])
 def test_noise_that_is_none_is_refused(wrong):
     with pytest.raises(SonarError, match="slip"):
-        Slip(**wrong)
+        OdometryNoise(**wrong)
 
 
 # The office
@@ -129,7 +132,7 @@ def drift(poses, rng, place=0.02, heading=0.0175):
     steps = steps + root * np.array([place, place, heading]) * rng.standard_normal(steps.shape)
     out = [poses[0]]
     for step in steps:
-        out.append(composed(out[-1], step))
+        out.append(compose(out[-1], step))
     return np.array(out)
 
 
@@ -145,7 +148,7 @@ def found(heard):
     ring, log, odometry = heard
     start = odometry.copy()
     start[12] = np.nan  # led on by odometry
-    return smooth(ring, log, start, odometry=odometry, scale=True, slip=Slip(place=0.02, heading=0.0175))
+    return smooth(ring, log, start, odometry=odometry, scale=True, slip=OdometryNoise(position_per_meter=0.02, heading_per_meter=0.0175))
 
 
 def error(found: Smoothed, log: Log):
@@ -153,6 +156,7 @@ def error(found: Smoothed, log: Log):
     return np.column_stack([off[:, :2], wrap_angle(off[:, 2])])
 
 
+@pytest.mark.slow
 def test_poses_and_walls_are_better_than_odometry_and_within_what_is_said(heard, found):
     _, log, odometry = heard
     assert len(found.left_out) == 0
@@ -193,6 +197,7 @@ def corridor(heard):
     return log, smooth(ring, log, poses)
 
 
+@pytest.mark.slow
 def test_without_echoes_in_one_direction_the_covariance_says_so(corridor):
     """Decimetres, not 30 m: two walls as they are estimated are no exact parallels, and a wedge has places along it."""
     log, found = corridor
@@ -204,12 +209,14 @@ def test_without_echoes_in_one_direction_the_covariance_says_so(corridor):
     assert (np.abs(error(found, log)[:, 1:]) < 5 * sd[:, 1:] + 1e-4).all()
 
 
+@pytest.mark.slow
 def test_along_a_bare_corridor_the_truth_is_within_what_is_said(corridor):
     log, found = corridor
     sd = np.sqrt(np.diagonal(found.pose_cov, axis1=1, axis2=2))
     assert (np.abs(error(found, log)[1:, 0]) < 3 * sd[1:, 0]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -227,6 +234,7 @@ def test_what_cannot_be_is_named(heard, change, message):
         smooth(ring, log, **({"poses": log.pose} | change))
 
 
+@pytest.mark.slow
 def test_the_poses_covariance_is_that_of_all_equations(heard):
     """Against a dense inverse of the Hessian of the cost, by automatic differentiation."""
     ring, log, odometry = heard
@@ -235,36 +243,36 @@ def test_the_poses_covariance_is_that_of_all_equations(heard):
         count, scans = 24, 4
         kind = np.zeros((scans, count), np.int32)
         first = rng.integers(0, 3, (scans, count)).astype(np.int32)
-        scene = kernels.Scene(
+        scene = kernels.Landmarks(
             kind=jnp.asarray(np.zeros(3, np.int32)),
             parameters=jnp.asarray(np.column_stack([np.zeros(3), [0.1, 1.6, -2.2]])),
             anchor=jnp.asarray([[1.4, 0.1], [0.0, 1.5], [-0.9, -1.2]]),
-            ends=jnp.asarray(np.tile([-1.0, 1.0], (3, 1))),
+            extent=jnp.asarray(np.tile([-1.0, 1.0], (3, 1))),
         )
         columns = np.zeros((3 * ring.count + 3, 2))
         columns[-2:] = 0.05 * np.eye(2)
         poses = jnp.asarray(log.pose[:scans])
-        problem = kernels.Problem(
+        problem = kernels.LeastSquaresProblem(
             sensors=jax.tree.map(jnp.asarray, ring.sensors),
-            modes=jnp.asarray(columns),
-            scene=scene,
-            heard=kernels.Heard(
+            basis=jnp.asarray(columns),
+            landmarks=scene,
+            factors=kernels.EchoFactors(
                 path=jnp.asarray(rng.integers(0, len(ring.paths), (scans, count)).astype(np.int32)),
                 reported=jnp.zeros((scans, count)),
                 reflection=kernels.Reflection(*(jnp.asarray(x) for x in (kind, first, first))),
                 weight=jnp.full((scans, count), 1 / SIGMA**2),
             ),
-            poses=poses,
-            anchored=jnp.asarray(np.r_[[[1e6] * 3], np.ones((scans - 1, 3))]),
+            prior_poses=poses,
+            prior_information=jnp.asarray(np.r_[[[1e6] * 3], np.ones((scans - 1, 3))]),
             odometry=jnp.asarray(np.r_[relative(odometry[: scans - 1], odometry[1:scans]), np.zeros((1, 3))]),
-            linked=jnp.full((scans, 3), 1e4),
-            reach=5.0,
+            odometry_information=jnp.full((scans, 3), 1e4),
+            landmark_prior_sd=5.0,
         )
         unknowns = kernels.Unknowns(jnp.zeros(2), poses, jnp.asarray(scene.parameters))
         exact = -kernels.residuals(problem, unknowns)
-        problem = replace(problem, heard=replace(problem.heard, reported=exact))  # no residual: Gauss-Newton is exact
+        problem = replace(problem, factors=replace(problem.factors, reported=exact))  # no residual: Gauss-Newton is exact
         found = kernels.adjust(problem, unknowns, poses_free=True, most=30)
-        problem = replace(problem, heard=replace(problem.heard, reported=exact), poses=found.unknowns.poses)
+        problem = replace(problem, factors=replace(problem.factors, reported=exact), prior_poses=found.unknowns.poses)
         got = kernels.pose_covariances(problem, found.unknowns)
 
         def flat(values):
@@ -273,10 +281,10 @@ def test_the_poses_covariance_is_that_of_all_equations(heard):
 
         def squares(values):
             now = flat(values)
-            out = [jnp.sqrt(problem.heard.weight).ravel() * kernels.residuals(problem, now).ravel()]
-            out += [now.modes, (now.scene - scene.parameters).ravel() / 5.0]
-            out += [(jnp.sqrt(problem.anchored) * (now.poses - problem.poses)).ravel()]
-            told = jnp.exp(-0.05 * now.modes)
+            out = [jnp.sqrt(problem.factors.weight).ravel() * kernels.residuals(problem, now).ravel()]
+            out += [now.coordinates, (now.landmarks - scene.parameters).ravel() / 5.0]
+            out += [(jnp.sqrt(problem.prior_information) * (now.poses - problem.prior_poses)).ravel()]
+            told = jnp.exp(-0.05 * now.coordinates)
             for k in range(scans - 1):
                 way, heading = (now.poses[k + 1] - now.poses[k])[:2], now.poses[k, 2]
                 cos, sin = jnp.cos(heading), jnp.sin(heading)

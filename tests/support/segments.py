@@ -5,12 +5,13 @@ from dataclasses import fields
 import numpy as np
 
 from jaxsonar.geometry.se2 import rotation, wrap_angle
-from jaxsonar.mapping.wall_segments import SIGMA_OFFSET, SIGMA_THETA, Pieces
+from jaxsonar.mapping.settings import SETTINGS
+from jaxsonar.mapping.wall_segments import WallSegments
 
-COLUMNS = [field.name for field in fields(Pieces) if field.name != "scans"]
+COLUMNS = [field.name for field in fields(WallSegments) if field.name != "scans"]
 
 
-def pieces_at(centre, theta, *, length: np.ndarray | float = 0.5, **columns):
+def segments_at(centre, theta, *, length: np.ndarray | float = 0.5, **columns):
     """Pieces as single lines of local models leave them, a scan each; any column may be given."""
     theta = wrap_angle(np.asarray(theta, float).reshape(-1))
     count = len(theta)
@@ -18,24 +19,24 @@ def pieces_at(centre, theta, *, length: np.ndarray | float = 0.5, **columns):
     known = {
         "centre": np.array(centre, float).reshape(-1, 2),
         "theta": theta,
-        "ends": np.stack([-half, half], axis=-1),
-        "info_offset": np.full(count, SIGMA_OFFSET**-2),
-        "info_theta": np.full(count, SIGMA_THETA**-2),
-        "misfit": np.zeros(count),
+        "extent": np.stack([-half, half], axis=-1),
+        "info_offset": np.full(count, SETTINGS.segments.offset_sd**-2),
+        "info_theta": np.full(count, SETTINGS.segments.theta_sd**-2),
+        "chi_squared": np.zeros(count),
         "count": np.ones(count, np.int64),
         "echoes": np.arange(count) + 3,
-        "distance": 1 + np.arange(count) / 8,
-        "latest": np.arange(count) / 4,
+        "viewing_distance": 1 + np.arange(count) / 8,
+        "last_seen": np.arange(count) / 4,
         "scans": (np.arange(count), np.arange(count)),
     }
-    return Pieces(**(known | columns))
+    return WallSegments(**(known | columns))
 
 
-def moved(pieces, pose):
+def moved(segments, pose):
     """The same pieces in a world that was turned by pose[2] and then shifted."""
-    columns = {name: getattr(pieces, name) for name in COLUMNS}
-    columns["centre"] = pieces.centre @ rotation(pose[2]).T + pose[:2]
-    return Pieces(**columns | {"theta": wrap_angle(pieces.theta + pose[2])}, scans=pieces.scans)
+    columns = {name: getattr(segments, name) for name in COLUMNS}
+    columns["centre"] = segments.centre @ rotation(pose[2]).T + pose[:2]
+    return WallSegments(**columns | {"theta": wrap_angle(segments.theta + pose[2])}, scans=segments.scans)
 
 
 def same(one, two):

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 from jaxsonar import Ring, Room, simulate
-from jaxsonar.estimation.odometry_noise import Slip
+from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.simulation.wheel_odometry import drifted
 
@@ -13,7 +13,7 @@ RING = Ring.circular()
 
 SIGMA = 0.002
 
-SLIP = Slip(place=0.04, heading=float(np.radians(2.0)), turn=0.04)
+SLIP = OdometryNoise(position_per_meter=0.04, heading_per_meter=float(np.radians(2.0)), heading_per_radian=0.04)
 
 COUNT = 48
 
