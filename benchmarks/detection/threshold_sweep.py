@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxsonar import Ring, local_models, random_pose, random_room, simulate
-from jaxsonar.detection.extract import settings_for
+from jaxsonar.detection.settings import hough_settings
 from jaxsonar.evaluation.line_accuracy import compare, pooled
 
 SIGMA = 0.003
@@ -33,7 +33,7 @@ def main() -> None:
     for column in ("threshold", "recall", "false/scan", "RMS Δρ (mm)", "RMS Δθ (deg)"):
         table.add_column(column, justify="right")
     for threshold in (0.10, 0.15, 0.20, 0.25, 0.30, 0.40):
-        settings = replace(settings_for(ring, None), threshold=threshold)
+        settings = replace(hough_settings(ring, None), threshold=threshold)
         row = pooled(
             [
                 compare(

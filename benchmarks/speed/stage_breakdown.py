@@ -18,38 +18,44 @@ from benchmarks.speed.baselines import FusedPeer
 from benchmarks.speed.scan_fixtures import batch, single_scans
 from benchmarks.speed.timing import Contestant
 from jaxsonar import HoughSettings, Ring, extract_lines, kernels, local_model
-from jaxsonar.detection.component_centroids import centres_of_gravity
+from jaxsonar.detection.arc_tables import arc_tables
+from jaxsonar.detection.component_centroids import component_centroids
 from jaxsonar.detection.connected_components import label_components
-from jaxsonar.detection.extract import models_of
-from jaxsonar.detection.hough_detector import arcs_of, extract, pieces_of
-from jaxsonar.detection.ml_detector import explained
-from jaxsonar.scans.echo_batches import FlatEchoes, Step
+from jaxsonar.detection.hough_detector import hough_detections
+from jaxsonar.detection.local_map_builder import hough_models
+from jaxsonar.detection.ml_detector import ml_detections
+from jaxsonar.scans.echo_batches import FAST_SCANS, SLOW_SCANS, BatchPolicy, EchoBatch, pack
+from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.sliding_windows import Windows
 
 Stages = dict[str, Callable[[], object]]
 WHOLE = "whole"
 
 
-def _steps(ring: Ring, echoes: FlatEchoes, settings: HoughSettings, *, dear: bool = False) -> list[Step]:
-    return list(echoes.steps(settings.cells, pieces=pieces_of(ring, settings), dear=dear))
+def _batches(
+    ring: Ring, echoes: FlatEchoes, settings: HoughSettings, policy: BatchPolicy = FAST_SCANS
+) -> list[EchoBatch]:
+    return list(pack(echoes, settings.cells, pieces=arc_tables(ring, settings).pieces, policy=policy))
 
 
 def hough_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = None) -> Stages:
     """A batch by the paper's method; ``votes`` is the jitted step up to the threshold."""
     settings = settings or HoughSettings()
-    arcs = arcs_of(ring, settings)
+    tables = arc_tables(ring, settings)
+    arcs = tables.arcs
     echoes = FlatEchoes.from_dense(ring, ranges)
-    steps = _steps(ring, echoes, settings)
+    steps = _batches(ring, echoes, settings)
     voted = [kernels.vote(arcs, step.packed, settings=settings) for step in steps]
     masks = [np.asarray(one.occupied) for one in voted]
     labelled = [label_components(mask) for mask in masks]
     return {
         WHOLE: lambda: extract_lines(ring, ranges, method="hough", settings=settings),
-        "pack": lambda: _steps(ring, FlatEchoes.from_dense(ring, ranges), settings),
+        "pack": lambda: _batches(ring, FlatEchoes.from_dense(ring, ranges), settings),
         "votes": lambda: jax.block_until_ready([kernels.vote(arcs, step.packed, settings=settings) for step in steps]),
         "components": lambda: [label_components(mask) for mask in masks],
         "centres": lambda: [
-            centres_of_gravity(arcs, step, one, *found) for step, one, found in zip(steps, voted, labelled, strict=True)
+            component_centroids(tables, step, one, *found)
+            for step, one, found in zip(steps, voted, labelled, strict=True)
         ],
     }
 
@@ -57,17 +63,17 @@ def hough_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None 
 def ml_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = None) -> Stages:
     """A batch by maximum likelihood."""
     settings = settings or HoughSettings()
-    arcs, expected = arcs_of(ring, settings), kernels.Expectations()
-    packed = [step.packed for step in _steps(ring, FlatEchoes.from_dense(ring, ranges), settings, dear=True)]
+    arcs, expected = arc_tables(ring, settings).arcs, kernels.Expectations()
+    packed = [step.packed for step in _batches(ring, FlatEchoes.from_dense(ring, ranges), settings, SLOW_SCANS)]
     noise = jnp.asarray(np.nan, jnp.float32)
-    found = list(explained(ring, FlatEchoes.from_dense(ring, ranges), settings, None))
+    found = list(ml_detections(ring, FlatEchoes.from_dense(ring, ranges), settings, None))
 
     def explain() -> Any:
         return [kernels.explain(arcs, one, noise, settings=settings, expected=expected) for one in packed]
 
     return {
         WHOLE: lambda: extract_lines(ring, ranges, method="ml", settings=settings),
-        "pack": lambda: _steps(ring, FlatEchoes.from_dense(ring, ranges), settings, dear=True),
+        "pack": lambda: _batches(ring, FlatEchoes.from_dense(ring, ranges), settings, SLOW_SCANS),
         "explain": lambda: jax.block_until_ready(explain()),
         "lines": lambda: [one.lines for one in found],
     }
@@ -78,14 +84,15 @@ def single_stages(ring: Ring, ranges: np.ndarray) -> Stages:
     settings = HoughSettings()
     logs = [scan.as_log() for scan in single_scans(ring, ranges)]
     scans = single_scans(ring, ranges)
-    arcs = arcs_of(ring, settings)
+    tables = arc_tables(ring, settings)
     echoes = [FlatEchoes.from_log(ring, log)[0] for log in logs]
     return {
         WHOLE: lambda: [local_model(ring, scan, method="hough") for scan in scans],
         "convert": lambda: [FlatEchoes.from_log(ring, scan.as_log()) for scan in scans],
-        "extract": lambda: [list(extract(ring, one, settings, arcs)) for one in echoes],
+        "extract": lambda: [list(hough_detections(ring, one, settings, tables)) for one in echoes],
         "extract and model": lambda: [
-            list(models_of(ring, log, Windows.of_scans(one), settings)) for log, one in zip(logs, echoes, strict=True)
+            list(hough_models(ring, log, Windows.of_scans(one), settings))
+            for log, one in zip(logs, echoes, strict=True)
         ],
     }
 

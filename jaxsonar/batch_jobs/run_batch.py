@@ -13,9 +13,7 @@ from jaxsonar.batch_jobs.parquet_staging import check_extras
 from jaxsonar.batch_jobs.parquet_tables import check_parquet
 from jaxsonar.batch_jobs.shards import SHARD_SCANS, Shard, shards_of
 from jaxsonar.batch_jobs.worker import Result, job_of
-from jaxsonar.detection.extract import check_method
-from jaxsonar.detection.hough_detector import settings_for
-from jaxsonar.detection.ml_detector import check_sigma
+from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.kernels import HoughSettings
@@ -100,7 +98,7 @@ def batch(
     check_method(method)
     check_sigma(sigma)
     check_parquet()
-    settings = settings_for(ring, settings)
+    settings = hough_settings(ring, settings)
     job = job_of(ring, method=method, settings=settings, sigma=sigma)
     logs = find_inputs(inputs)
     check_extras(logs)

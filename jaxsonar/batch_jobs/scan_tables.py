@@ -7,10 +7,12 @@ from jaxtyping import Int
 
 from jaxsonar import kernels
 from jaxsonar.batch_jobs.parquet_tables import PROBABILITY, SCAN, TABLES, Columns
-from jaxsonar.detection.hough_detector import Extracted, extract
-from jaxsonar.detection.ml_detector import KINDS, Explained, explained
+from jaxsonar.detection.hough_detector import HoughBatch, hough_detections
+from jaxsonar.detection.local_map import KIND_NAMES
+from jaxsonar.detection.local_map_builder import no_line_reason, no_wall_reason
+from jaxsonar.detection.ml_detector import DetectionBatch, ml_detections
 from jaxsonar.geometry.se2 import wrap_angle
-from jaxsonar.scans.echo_batches import FlatEchoes
+from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -52,9 +54,9 @@ def tables(
     in_range = np.bincount(echoes.scan[near], minlength=len(log))
 
     if method == "hough":
-        steps = [_of_extracted(step) for step in extract(ring, echoes, settings)]
+        steps = [_of_extracted(step) for step in hough_detections(ring, echoes, settings)]
     else:
-        steps = [_of_explained(step) for step in explained(ring, echoes, settings, sigma)]
+        steps = [_of_explained(step) for step in ml_detections(ring, echoes, settings, sigma)]
     scans, lines, points = (_joined([getattr(step, name) for step in steps], name) for name in TABLES)
 
     counts = {
@@ -79,9 +81,9 @@ def tables(
     return {"scans": told(whole), "lines": told(lines), "points": told(points)}
 
 
-def _of_extracted(extracted: Extracted) -> _Found:
+def _of_extracted(extracted: HoughBatch) -> _Found:
     """What the paper's method found in the scans of one step."""
-    scans, lines = extracted.step.scans, extracted.lines
+    scans, lines = extracted.batch.scans, extracted.lines
     row, k = np.nonzero(lines.echoes)
     segment = lines.segments[row, k]
     none = np.full(len(row), np.nan)
@@ -101,9 +103,9 @@ def _of_extracted(extracted: Extracted) -> _Found:
     return _Found(found, _nothing("points"), whole)
 
 
-def _of_explained(found: Explained) -> _Found:
+def _of_explained(found: DetectionBatch) -> _Found:
     """What maximum likelihood found in the scans of one step, reflectors in the order of their evidence."""
-    scans, all_ = found.step.scans, found.found
+    scans, all_ = found.batch.scans, found.found
     row, k = np.nonzero(np.asarray(all_.kind) >= 0)
     decided = found.decided[row, k]
     first, second = np.asarray(all_.parameters)[row, k].astype(np.float64).T
@@ -133,7 +135,7 @@ def _of_explained(found: Explained) -> _Found:
     covariance = {"cov_x": cov[:, 0, 0], "cov_xy": cov[:, 0, 1], "cov_y": cov[:, 1, 1]}
     points = {
         "row": scans[row],
-        "kind": np.where(sure, np.array(KINDS, object)[decided], "undecided"),
+        "kind": np.where(sure, np.array(KIND_NAMES, object)[decided], "undecided"),
         "x": np.where(plane, middle[:, 0], first),
         "y": np.where(plane, middle[:, 1], second),
         **{name: np.where(sure, values, np.nan) for name, values in covariance.items()},
@@ -168,15 +170,13 @@ def _joined(parts: list[Columns], table: str) -> Columns:
 
 
 def _why_empty(counts: Columns, components: np.ndarray, method: str, settings: kernels.HoughSettings) -> np.ndarray:
-    """For each scan why it has no line, in the words of ``LocalModel.empty``; None where it has one."""
-    heard, least = counts["in_range"], settings.min_echoes
-    if method == "hough":
-        why = np.full(len(heard), f"no component with {least} echoes", object)
-        why[components == 0] = "no cell above the threshold"
-        why[heard < least] = f"fewer than {least} echoes within the maximum range"
-    else:
-        why = np.full(len(heard), "no reflector explains the echoes", object)
-        why[counts["points"] + counts["undecided"] > 0] = "no wall, only corners, edges and what is undecided"
-    why[heard == 0] = "no echo within the maximum range"
-    why[counts["lines"] > 0] = None
-    return why
+    """Reason why a scan has no line, as in ``LocalModel.empty``; None for scans with lines."""
+    reasons = np.full(len(counts["lines"]), None, object)
+    others = counts["points"] + counts["undecided"]
+    for k in np.flatnonzero(counts["lines"] == 0):
+        in_range = counts["in_range"][k]
+        if method == "hough":
+            reasons[k] = no_line_reason(in_range, components[k], settings.min_echoes)
+        else:
+            reasons[k] = no_wall_reason(in_range, others[k])
+    return reasons

@@ -15,10 +15,10 @@ from jaxtyping import Array, Float
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.kernels.array_geometry import Sensors
-from jaxsonar.kernels.autofocus import ring_sharpness
+from jaxsonar.kernels.autofocus import ring_focus_measure
 from jaxsonar.kernels.hough_accumulator import HoughSettings
 from jaxsonar.kernels.shape_buckets import bucket_size
-from jaxsonar.scans.echo_batches import FlatEchoes
+from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import SPEED_SD
@@ -36,7 +36,7 @@ _STRIDES = (0.1, 0.03)  # of each width, in standard deviations of the prior
 _BEYOND = 1.05  # echoes near the maximum range stay when offsets and speed move
 
 
-def focus(ring: Ring, log: Log, *, poses: bool, speed: bool, scans: int = 40) -> Ring:
+def autofocus_ring(ring: Ring, log: Log, *, poses: bool, speed: bool, scans: int = 40) -> Ring:
     """The ring with the relative range offsets, and the speed of sound, that make its echoes meet most sharply.
 
     The mean range offset stays as given. Without poses each scan is looked at alone, and offsets that look like a move
@@ -65,7 +65,7 @@ def focus(ring: Ring, log: Log, *, poses: bool, speed: bool, scans: int = 40) ->
     points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
     whole = ring.sensors
     sensors = dataclasses.replace(whole, max_range=whole.max_range * _BEYOND)
-    moved, gain = _climb(sensors, echoes, settings=settings, points=points, speed=speed)
+    moved, gain = _momentum_ascent(sensors, echoes, settings=settings, points=points, speed=speed)
     if not float(gain) > ring.count - 1 + speed:  # False for NaN
         return ring
     move = np.asarray(moved, dtype=np.float64)
@@ -115,7 +115,7 @@ def _chosen(ring: Ring, log: Log, poses: bool, most: int) -> tuple[kernels.Echoe
 
 
 @partial(jax.jit, static_argnames=("settings", "points", "speed"))
-def _climb(
+def _momentum_ascent(
     sensors: Sensors, echoes: kernels.Echoes, *, settings: HoughSettings, points: int, speed: bool
 ) -> tuple[Float[Array, " parameters"], Float[Array, ""]]:
     """Momentum steps of falling length on sharpness and prior, coarse to fine, in standard deviations of the prior.
@@ -137,7 +137,7 @@ def _climb(
         offset = sensors.range_offset + OFFSET_SD * move[:count]
         scale = sensors.range_scale * jnp.exp(SPEED_SD * move[count])
         changed = dataclasses.replace(sensors, range_offset=offset, range_scale=scale)
-        return ring_sharpness(changed, echoes, width, settings=settings, points=points)
+        return ring_focus_measure(changed, echoes, width, settings=settings, points=points)
 
     def slope(move: Float[Array, " parameters"], width: Float[Array, ""]) -> Float[Array, " parameters"]:
         raw = jax.grad(sharp)(move, width) - move  # the prior's is the move itself, in its standard deviations

@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """``jaxsonar lines``."""
     from jaxsonar.detection.extract import local_models
-    from jaxsonar.detection.hough_detector import settings_for
     from jaxsonar.detection.local_map import save_models
+    from jaxsonar.detection.settings import hough_settings
     from jaxsonar.detection.settings_toml import load_settings, save_settings
     from jaxsonar.fileio.atomic_files import check_outputs, shown
     from jaxsonar.hardware.errors import SonarError
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
         raise SonarError(f"--scan {options.scan} came alone; allowed is --scan with --figure, to which it belongs")
     check_sigma_is_used(options.sigma, options.method, None)
     ring, log = load_ring(options.ring), load_log(options.log)
-    settings = settings_for(ring, load_settings(options.settings) if options.settings else None)
+    settings = hough_settings(ring, load_settings(options.settings) if options.settings else None)
     if options.scan is not None and options.scan not in log.scan:
         held = f"numbers from {log.scan.min()} to {log.scan.max()}" if len(log) else "none"
         raise SonarError(f"--scan {options.scan}: no such scan in {shown(options.log)}; it holds {len(log)}, {held}")

@@ -73,11 +73,12 @@ def run(options: argparse.Namespace) -> None:
     import numpy as np
 
     from jaxsonar.detection.extract import local_models
-    from jaxsonar.detection.hough_detector import settings_for
+    from jaxsonar.detection.settings import hough_settings
     from jaxsonar.detection.settings_toml import load_settings
     from jaxsonar.fileio.atomic_files import check_outputs, shown, write_toml
     from jaxsonar.hardware.errors import SonarError
-    from jaxsonar.mapping.build_map import CONFIRMED, assemble, check_poses, gather_evidence
+    from jaxsonar.mapping.build_map import assemble_map, check_poses, required_scans
+    from jaxsonar.mapping.map_evidence import gather_evidence
     from jaxsonar.mapping.map_geojson import save_map
     from jaxsonar.scans.log_file import load_log
     from jaxsonar.scans.sliding_windows import check_window
@@ -107,7 +108,7 @@ def run(options: argparse.Namespace) -> None:
     check_sigma_is_used(options.sigma, options.method, options.window)
     ring, log = load_ring(options.ring), load_log(options.log)
     given = None if options.settings is None else load_settings(options.settings)
-    settings = settings_for(ring, given, window=options.window)
+    settings = hough_settings(ring, given, window=options.window)
     left_out: list[int] = []
     try:
         check_poses(log)
@@ -125,7 +126,7 @@ def run(options: argparse.Namespace) -> None:
     points = None if options.laser is None else _laser_points(options.laser)
     models = list(with_progress(models, len(log) if options.window is None else None, "local models"))
     evidence = gather_evidence(ring, log, models)
-    world = assemble(evidence, merging=options.merging, confirmed=1 if options.window else CONFIRMED)
+    world = assemble_map(evidence, merging=options.merging, min_scans=required_scans(options.window))
 
     # Everything is made before anything is written.
     grid = figure = None
@@ -144,7 +145,7 @@ def run(options: argparse.Namespace) -> None:
         placed = log.pose[np.all(np.isfinite(log.pose), axis=1)]
         figure = figures_map.map_figure(
             world,
-            aggregated=evidence.pieces.segments,
+            aggregated=evidence.segments.endpoints,
             poses=placed,
             laser_points=points,
             title=f"{count(len(world), 'wall')} from {plain_name(options.log)}",
@@ -175,7 +176,7 @@ def run(options: argparse.Namespace) -> None:
     without = f"; {count(homeless, 'scan')} without a pose left out" if homeless else ""
     print_status(
         f"{count(len(log), 'scan')}, {count(len(models), 'local model')}, "
-        f"{count(len(evidence.pieces), 'segment')}, {count(len(world), 'wall')}, {world.length.sum():.1f} m{without}"
+        f"{count(len(evidence.segments), 'segment')}, {count(len(world), 'wall')}, {world.length.sum():.1f} m{without}"
     )
 
 

@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> None:
                 log,
                 sigma=options.sigma,
                 window=options.window,
-                slip=odometry_noise_of(options.odometry),
+                odometry_noise=odometry_noise_of(options.odometry),
                 smooth=options.smoothing,
                 speed=options.speed,
                 scale=options.scale,

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxsonar.detection.extract import LocalModel
+from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.evaluation.laser_segments import polygonal_model
 from jaxsonar.floor_plans.room import ranges_in
-from jaxsonar.geometry.se2 import to_world, unit
+from jaxsonar.geometry.se2 import transform_points, unit
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.occupancy.occupancy_grid import OccupancyGrid
 from jaxsonar.reports import plot_map as figures_map
@@ -48,7 +48,7 @@ def draw(
     first = poses[0]
     bearing = np.arange(BEAMS) * (2 * np.pi / BEAMS) - np.pi
     ranges = ranges_in(room, first, bearing)
-    seen = to_world(first, (ranges[:, None] * unit(bearing))[np.isfinite(ranges)])
+    seen = transform_points(first, (ranges[:, None] * unit(bearing))[np.isfinite(ranges)])
     laser = polygonal_model(bearing, ranges).moved(first)
     return {
         "1-ring": figures_scan.ring_figure(ring),

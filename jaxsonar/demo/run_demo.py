@@ -10,15 +10,17 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxsonar.demo.demo_page import draw, write_page
-from jaxsonar.detection.extract import LocalModel, local_models, settings_for
-from jaxsonar.detection.local_map_jsonl import save_models
+from jaxsonar.detection.extract import local_models
+from jaxsonar.detection.local_map import LocalModel, save_models
+from jaxsonar.detection.settings import hough_settings
 from jaxsonar.detection.settings_toml import save_settings
 from jaxsonar.evaluation.line_accuracy import CLEAR_ECHOES, GATE_RHO, GATE_THETA, Deviations, compare, pooled
 from jaxsonar.evaluation.map_accuracy import Evaluation, evaluate, largest, rms
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.floor_plans.room_geojson import save_room
-from jaxsonar.mapping.build_map import assemble, gather_evidence
+from jaxsonar.mapping.build_map import assemble_map
+from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.mapping.map_geojson import save_map
 from jaxsonar.occupancy.nav2_map import save_nav2
 from jaxsonar.occupancy.occupancy_grid import occupancy
@@ -75,16 +77,16 @@ def run_demo(
     on_step("the map of the office")
     evidence = gather_evidence(office.ring, log, models)
     paper_evidence = gather_evidence(office.ring, log, paper_models)
-    world = assemble(evidence)
+    world = assemble_map(evidence)
     grid = occupancy(office.ring, log, walls=world.segments)
     in_reach = walls_in_reach(simulation, office.room, len(office.poses))
     maps = [
         {"what": name}
         | map_summary(evaluate(segments, office.room.walls, gate_distance=GATE_RHO, gate_angle=GATE_THETA), in_reach)
         for name, segments in (
-            (f"lines of 17 scans, {PAPERS}", paper_evidence.pieces.segments),
-            (f"merged, {PAPERS}", assemble(paper_evidence, merging="paper").segments),
-            ("lines of 17 scans", evidence.pieces.segments),
+            (f"lines of 17 scans, {PAPERS}", paper_evidence.segments.endpoints),
+            (f"merged, {PAPERS}", assemble_map(paper_evidence, merging="paper").segments),
+            ("lines of 17 scans", evidence.segments.endpoints),
             ("the map", world.segments),
         )
     ]
@@ -105,7 +107,7 @@ def run_demo(
     save_path(office.poses, office.stamps, output / "path.csv")
     save_log(log, output / "office.csv")
     save_models(models, output / "lines.jsonl")
-    save_settings(settings_for(office.ring, None), output / "lines.settings.toml")
+    save_settings(hough_settings(office.ring, None), output / "lines.settings.toml")
     save_map(world, output / "map.geojson")
     save_nav2(grid, output / "map.yaml")
     line_rows = [{"what": name, **summary(row)} for name, row in rows]

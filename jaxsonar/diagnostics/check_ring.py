@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.detection.ml_detector import check_sigma
+from jaxsonar.detection.settings import check_sigma
 from jaxsonar.diagnostics.beam_width import cones, each_cone, fitted_cone
 from jaxsonar.diagnostics.echo_residuals import Look, explained_share, looked
 from jaxsonar.diagnostics.findings import findings_of
@@ -19,7 +19,7 @@ from jaxsonar.diagnostics.range_offsets import offsets_of
 from jaxsonar.diagnostics.reference_scene import Scene, evenly, scene_of_map, scene_of_scans, thinned
 from jaxsonar.diagnostics.swapped_sensors import exchanged
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.scans.echo_batches import FlatEchoes
+from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import check_air

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.diagnostics.reference_scene import BLOCK, Scene, outlook_of
-from jaxsonar.scans.echo_batches import FlatEchoes
+from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
-from jaxsonar.scans.sliding_windows import renewed
+from jaxsonar.scans.sliding_windows import is_fresh_reading
 from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
 
 MARGIN = 0.25
@@ -51,7 +51,7 @@ class Look(NamedTuple):
 def looked(ring: Ring, scene: Scene, log: Log) -> Look:
     """What each path should hear of each wall, and the echo nearest to it."""
     flat, _ = FlatEchoes.from_log(ring, log)
-    fresh = renewed(flat) if scene.fixed else np.ones(len(flat.scan), bool)
+    fresh = is_fresh_reading(flat) if scene.fixed else np.ones(len(flat.scan), bool)
     number = np.cumsum(scene.solid).reshape(scene.solid.shape) - 1
     blocks = [slice(first, min(first + BLOCK, len(log))) for first in range(0, max(1, len(log)), BLOCK)]
     parts = [_looked_at(ring, scene, block, *_dense(flat, block, fresh, len(ring.paths)), number) for block in blocks]
@@ -73,18 +73,18 @@ def _looked_at(
     # Each echo belongs to the reflector nearest to it; each wall gets the nearest echo of each path.
     away = reported[:, None] - wanted[..., None]
     away = np.where(seen.exists[..., None] & np.isfinite(away), away, np.inf)
-    heard = np.where((seen.share > 0)[..., None], np.abs(away), np.inf)
+    heard = np.where((seen.visibility > 0)[..., None], np.abs(away), np.inf)
     nearest = np.abs(away).argmin(axis=-1)[..., None]
     residual = np.take_along_axis(away, nearest, axis=-1)[..., 0]
     best = np.broadcast_to(heard.argmin(axis=1)[:, None], away.shape)
     owner = np.take_along_axis(best, nearest, axis=-1)[..., 0]
     low, high = np.moveaxis(scene.ends[block], -1, 0)
-    beyond = np.maximum(low[..., None] - seen.foot, seen.foot - high[..., None])
-    clear = ~_behind(scene, block, seen.foot) & new[:, None]
+    beyond = np.maximum(low[..., None] - seen.footpoint, seen.footpoint - high[..., None])
+    clear = ~_behind(scene, block, seen.footpoint) & new[:, None]
     if scene.fixed:
-        clear &= ~_hidden(np.asarray(ring.echo_paths.midpoint, np.float64), scene, block, seen.foot)
+        clear &= ~_hidden(np.asarray(ring.echo_paths.midpoint, np.float64), scene, block, seen.footpoint)
     kept = solid[..., None] & seen.exists & (seen.range < ring.max_range - 0.02)
-    kept &= (seen.share > 0) | (tx == rx)
+    kept &= (seen.visibility > 0) | (tx == rx)
     row = s, r, p = np.nonzero(kept)
     alone = np.where(tx[p] == rx[p], scene.own[block][s, r, tx[p]], 2)
     scale = REFERENCE_SPEED_OF_SOUND / float(ring.speed_of_sound)
@@ -95,9 +95,9 @@ def _looked_at(
         rx=rx[p],
         residual=residual[row],
         mine=np.equal(owner[row], r),
-        slope=seen.slope[row] * scale * (not scene.fixed),
-        share=seen.share[row],
-        angle=seen.angle[row],
+        slope=seen.d_range_d_reflector[row] * scale * (not scene.fixed),
+        share=seen.visibility[row],
+        angle=seen.departure_angle[row],
         beyond=np.maximum(beyond, 0)[row],
         open=clear[row],
         others=scene.support[block][s, r] - alone,

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.hough_detector import settings_for
-from jaxsonar.detection.ml_detector import explained
-from jaxsonar.kernels.health import outlook
+from jaxsonar.detection.ml_detector import ml_detections
+from jaxsonar.detection.settings import hough_settings
+from jaxsonar.kernels.measurement_model import predict_all_echoes
 from jaxsonar.mapping.build_map import build_map
-from jaxsonar.scans.echo_batches import FlatEchoes
+from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
 
@@ -63,11 +63,11 @@ def scene_of_scans(ring: Ring, log: Log, sigma: float | None, progress: Callable
     """What explains each scan for itself."""
     flat, _ = FlatEchoes.from_log(ring, log)
     parts, order = [], []
-    for found in explained(ring, flat, settings_for(ring, None), sigma) if len(flat.scan) else ():
+    for found in ml_detections(ring, flat, hough_settings(ring, None), sigma) if len(flat.scan) else ():
         best: Any = found.found  # NumPy arrays by now
         kind, involved = best.kind, best.involved
         scan, row, echo = np.nonzero(involved & (kind >= 0)[..., None])
-        tx, rx = ring.paths[found.step.path[scan, echo]].T
+        tx, rx = ring.paths[found.batch.path[scan, echo]].T
         own = np.zeros((*kind.shape, ring.count), np.int64)
         np.add.at(own, (scan, row, tx), 1)
         np.add.at(own, (scan, row, rx), tx != rx)
@@ -76,7 +76,7 @@ def scene_of_scans(ring: Ring, log: Log, sigma: float | None, progress: Callable
         solid = (found.decided == kernels.PLANE) & (support >= SUPPORT) & ((own > 0).sum(axis=-1) >= 3)
         ends = _along(theta, best.segment)
         parts.append(Scene(kind, best.parameters, solid, ends, support, own, best.sigma, False))
-        order.append(found.step.scans)
+        order.append(found.batch.scans)
         if progress is not None:
             progress(sum(map(len, order)), len(log))
     if not parts:
@@ -152,7 +152,7 @@ def outlook_of(ring: Ring, scene: Scene, block: slice) -> tuple[Any, Float[np.nd
     pad = ((0, BLOCK - size), (0, 0))
     kind = np.pad(scene.kind[block], pad, constant_values=-1)
     parameters = np.pad(scene.parameters[block], (*pad, (0, 0)))
-    seen = outlook(ring.echo_paths, kind.astype(np.int32), parameters.astype(np.float32))
+    seen = predict_all_echoes(ring.echo_paths, kind.astype(np.int32), parameters.astype(np.float32))
     seen = jax.tree.map(lambda leaf: np.asarray(leaf)[:size], seen)
     scale = REFERENCE_SPEED_OF_SOUND / float(ring.speed_of_sound)
     return seen, seen.range * scale + np.asarray(ring.echo_paths.range_offset, np.float64)

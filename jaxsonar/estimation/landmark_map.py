@@ -8,12 +8,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.extract import LocalModel, local_models
+from jaxsonar.detection.extract import local_models
+from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
-from jaxsonar.mapping.build_map import assemble, build_map, gather_evidence
+from jaxsonar.mapping.build_map import assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.mapping.point_landmarks import cluster, condense
+from jaxsonar.mapping.map_evidence import gather_evidence
+from jaxsonar.mapping.observations import merge_cells
+from jaxsonar.mapping.point_landmarks import cluster_points
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -24,7 +27,7 @@ _TWICE = 2  # scans that see a point
 _ROOM = 16
 
 
-def seen_world(ring: Ring, log: Log, *, window: float | None, models: Sequence[LocalModel] | None = None) -> GlobalMap:
+def map_with_tentative_points(ring: Ring, log: Log, *, window: float | None, models: Sequence[LocalModel] | None = None) -> GlobalMap:
     """The map of a log, with every corner and edge that two scans saw, however little they agree where.
 
     A map keeps only points that stand still; before ring and poses are adjusted they do not.
@@ -38,31 +41,31 @@ def seen_world(ring: Ring, log: Log, *, window: float | None, models: Sequence[L
     if window is not None:
         return build_map(ring, log, window=window)
     evidence = gather_evidence(ring, log, local_models(ring, log) if models is None else models)
-    world = assemble(evidence)
-    found, _ = cluster(condense(evidence.points))
-    apart = np.linalg.norm(found.place[:, None] - world.points[None], axis=-1).min(axis=1, initial=np.inf)
-    more = found.take((found.times >= _TWICE) & (apart > _OF_CORNER))
+    world = assemble_map(evidence)
+    found, _ = cluster_points(merge_cells(evidence.points))
+    apart = np.linalg.norm(found.position[:, None] - world.points[None], axis=-1).min(axis=1, initial=np.inf)
+    more = found.take((found.scan_counts() >= _TWICE) & (apart > _OF_CORNER))
     return replace(
         world,
-        points=np.concatenate([world.points, more.place]),
+        points=np.concatenate([world.points, more.position]),
         point_kinds=(*world.point_kinds, *more.kinds),
-        point_cov=np.concatenate([world.point_cov, more.honest_cov]),
+        point_cov=np.concatenate([world.point_cov, more.inflated_cov]),
         point_echoes=np.concatenate([world.point_echoes, more.echoes]),
         point_scans=(*world.point_scans, *more.scan_lists()),
     )
 
 
-class Surroundings(NamedTuple):
+class LandmarkMap(NamedTuple):
     """Reflectors of one or more worlds, and the reflections that may be heard of them; NumPy arrays, padded."""
 
-    scene: kernels.Scene
+    landmarks: kernels.Landmarks
     world: Int[np.ndarray, " reflectors"]
     """Which map each reflector is from; -1 for padding."""
-    candidates: kernels.Candidates
-    heard_by: Bool[np.ndarray, "scans reflectors"] | None = None
+    candidates: kernels.CandidateReflections
+    visible: Bool[np.ndarray, "scans reflectors"] | None = None
     """Which scans may hear each reflector; None: all."""
 
-    def near(
+    def candidates_in_range(
         self, poses: Float[np.ndarray, "scans 3"], world: Int[np.ndarray, " scans"], reach: float
     ) -> Int[np.ndarray, "scans near"]:
         """Rows of the candidates that scans may hear, -1 for none: those of their world of which a part is in reach.
@@ -72,9 +75,9 @@ class Surroundings(NamedTuple):
             world: of each scan.
             reach: how far off an echo may come from, metres.
         """
-        scene, reflection = self.scene, self.candidates.reflection
+        scene, reflection = self.landmarks, self.candidates.reflection
         wall = np.asarray(scene.kind) == kernels.PLANE
-        parameters, anchor, ends = (np.asarray(leaf) for leaf in (scene.parameters, scene.anchor, scene.ends))
+        parameters, anchor, ends = (np.asarray(leaf) for leaf in (scene.parameters, scene.anchor, scene.extent))
         offset = poses[:, None, :2] - anchor
         theta = np.where(wall, parameters[:, 1], 0.0)
         along = (offset * unit(theta + np.pi / 2)).sum(axis=-1)
@@ -84,14 +87,14 @@ class Surroundings(NamedTuple):
         either = np.minimum(distance[:, np.asarray(reflection.first)], distance[:, np.asarray(reflection.second)])
         heard = (either < reach) & (np.asarray(self.candidates.world) == world[:, None]) & (world >= 0)[:, None]
         heard &= np.asarray(reflection.kind) >= 0
-        if self.heard_by is not None:
-            heard &= self.heard_by[:, np.asarray(reflection.first)]
+        if self.visible is not None:
+            heard &= self.visible[:, np.asarray(reflection.first)]
         room = min(next_power_of_two(int(heard.sum(axis=1).max(initial=1)), least=_ROOM), heard.shape[1])
         order = np.argsort(~heard, axis=1, kind="stable")[:, :room]
         return np.where(np.take_along_axis(heard, order, axis=1), order, -1).astype(np.int32)
 
 
-def surroundings(worlds: Sequence[GlobalMap], *, tied: bool) -> Surroundings:
+def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> LandmarkMap:
     """The reflectors of maps.
 
     Args:
@@ -102,13 +105,13 @@ def surroundings(worlds: Sequence[GlobalMap], *, tied: bool) -> Surroundings:
     none = np.zeros((0, 2))
     kind, parameters, anchor, ends, world = [np.zeros(0, int)], [none], [none], [none], [np.zeros(0, int)]
     meetings: list[tuple[int, int, int]] = []  # first wall, second wall, world
-    for number, map_ in enumerate(worlds):
-        meet, own = _meetings(map_)
+    for number, map_ in enumerate(maps):
+        meet, own = _wall_intersections(map_)
         first = sum(len(part) for part in kind)
         middle = map_.segments.mean(axis=1)
         half = np.linalg.norm(map_.segments[:, 1] - map_.segments[:, 0], axis=1) / 2
         normal = unit(map_.theta)
-        kept = ~own if tied else np.ones(len(own), bool)
+        kept = ~own if tie_corners else np.ones(len(own), bool)
         points = map_.points[kept]
         of_points = np.array([name == "corner" for name in map_.point_kinds], dtype=bool)[kept]
         kind += [np.full(len(middle), kernels.PLANE), np.where(of_points, kernels.CORNER, kernels.EDGE)]
@@ -117,13 +120,13 @@ def surroundings(worlds: Sequence[GlobalMap], *, tied: bool) -> Surroundings:
         anchor += [middle, points]
         ends += [np.stack([-half, half], axis=-1), np.zeros_like(points)]
         world.append(np.full(len(middle) + len(points), number))
-        if tied:
+        if tie_corners:
             meetings += [(first + a, first + b, number) for a, b in meet]
-    scene = kernels.Scene(*(np.concatenate(part) for part in (kind, parameters, anchor, ends)))
+    scene = kernels.Landmarks(*(np.concatenate(part) for part in (kind, parameters, anchor, ends)))
     return _padded(scene, np.concatenate(world), meetings)
 
 
-def _meetings(map_: GlobalMap) -> tuple[list[tuple[int, int]], Bool[np.ndarray, " points"]]:
+def _wall_intersections(map_: GlobalMap) -> tuple[list[tuple[int, int]], Bool[np.ndarray, " points"]]:
     """Pairs of walls that end where they meet at about a right angle, and which corners of the map are these."""
     count = len(map_)
     a, b = np.triu_indices(count, k=1)
@@ -143,26 +146,26 @@ def _meetings(map_: GlobalMap) -> tuple[list[tuple[int, int]], Bool[np.ndarray, 
 
 
 def _padded(
-    scene: kernels.Scene, world: Int[np.ndarray, " reflectors"], meetings: Sequence[tuple[int, int, int]]
-) -> Surroundings:
+    scene: kernels.Landmarks, world: Int[np.ndarray, " reflectors"], meetings: Sequence[tuple[int, int, int]]
+) -> LandmarkMap:
     """With room for a power of two of reflectors, and of candidates, so that few shapes are compiled."""
     count = len(world)
     room = next_power_of_two(count, least=_ROOM)
-    scene = kernels.Scene(
+    scene = kernels.Landmarks(
         kind=pad_rows(np.asarray(scene.kind, np.int32), room, fill=-1),
         parameters=pad_rows(np.asarray(scene.parameters, np.float64), room),
         anchor=pad_rows(np.asarray(scene.anchor, np.float64), room),
-        ends=pad_rows(np.asarray(scene.ends, np.float64), room),
+        extent=pad_rows(np.asarray(scene.extent, np.float64), room),
     )
     first, second, of_world = np.array(meetings, dtype=np.int32).reshape(-1, 3).T
     pairs = len(first)
     size = next_power_of_two(count + 2 * pairs, least=_ROOM)
     rest = size - count - 2 * pairs
     alone = np.arange(count, dtype=np.int32)
-    candidates = kernels.Candidates(
+    candidates = kernels.CandidateReflections(
         reflection=kernels.Reflection(
             kind=np.concatenate(
-                [scene.kind[:count], np.full(2 * pairs, kernels.SECOND, np.int32), np.full(rest, -1, np.int32)]
+                [scene.kind[:count], np.full(2 * pairs, kernels.SECOND_ORDER, np.int32), np.full(rest, -1, np.int32)]
             ),
             first=np.concatenate([alone, first, second, np.zeros(rest, np.int32)]),
             second=np.concatenate([alone, second, first, np.zeros(rest, np.int32)]),
@@ -172,4 +175,4 @@ def _padded(
             [alone, count + np.tile(np.arange(pairs), 2), np.full(rest, -1)], dtype=np.int32, casting="unsafe"
         ),
     )
-    return Surroundings(scene, pad_rows(world.astype(np.int32), room, fill=-1), candidates)
+    return LandmarkMap(scene, pad_rows(world.astype(np.int32), room, fill=-1), candidates)

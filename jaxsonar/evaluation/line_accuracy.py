@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from jaxsonar.detection.extract import LocalModel
+from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.floor_plans.room import Room, lines_in
 from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.sensors.range_models import plane_range
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.simulator import Kind, Simulation
 
@@ -152,12 +153,7 @@ def line_bound(
         rx: receivers of the echoes, metres.
         sigma: independent noise of each range, metres.
     """
-    n = np.array([np.cos(line[1]), np.sin(line[1])])
-    t = np.array([-n[1], n[0]])
-    middle, half = (tx + rx) / 2, (rx - tx) / 2
-    height, across = line[0] - middle @ n, half @ t
-    reach = np.hypot(height, across)
-    jacobian = np.stack([height, -height * (middle @ t) - across * (half @ n)], axis=-1) / reach[:, None]
+    jacobian = plane_range(line, (tx + rx) / 2, (rx - tx) / 2).by_landmark
     information = jacobian.T @ jacobian
     if np.linalg.matrix_rank(information) < 2:
         return np.full(2, np.inf)

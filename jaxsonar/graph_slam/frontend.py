@@ -291,7 +291,7 @@ class _Echoes:
         near = off.min(axis=0) < GATE * noise
         return np.where(near, best, -1)
 
-    def tracked(self, known: Known, row: np.ndarray, noise: float) -> kernels.Tracked:
+    def tracked(self, known: Known, row: np.ndarray, noise: float) -> kernels.EkfUpdate:
         """The belief after echoes of these reflectors."""
         room = next_power_of_two(len(known), least=_ROOM)
         size, used = 3 + 2 * room, len(known.covariance)
@@ -303,11 +303,11 @@ class _Echoes:
             covariance,
         )
         rows = pad_rows(row.astype(np.int32), len(self.ranges), fill=-1)
-        return kernels.track(belief, self.path, self.ranges, rows, np.float64(noise**2))
+        return kernels.ekf_update(belief, self.path, self.ranges, rows, np.float64(noise**2))
 
-    def explained(self, found: kernels.Tracked, claimed: np.ndarray, noise: float) -> np.ndarray:
+    def explained(self, found: kernels.EkfUpdate, claimed: np.ndarray, noise: float) -> np.ndarray:
         """Reflector of every echo that one surely explains, and no other one nearly so; else what claims it."""
-        predicted = kernels.predict(found.belief, self.path)
+        predicted = kernels.predict_ranges(found.belief, self.path)
         expected, variance = (np.asarray(one)[:, : self.count] for one in (predicted.expected, predicted.variance))
         # Where the belief leaves room, anything may happen to fit.
         room = np.where(variance < (SURE * noise) ** 2, expected, np.inf)
@@ -320,14 +320,14 @@ class _Echoes:
         sure = near & (apart.min(axis=0, initial=np.inf) > DOUBT * noise)
         return np.where(sure, best, np.where(near, -1, claimed))
 
-    def known(self, before: Known, found: kernels.Tracked) -> Known:
+    def known(self, before: Known, found: kernels.EkfUpdate) -> Known:
         """The belief without padding."""
         count, size = len(before), len(before.covariance)
         belief = found.belief
         return replace(
             before,
             pose=np.asarray(belief.pose),
-            parameters=np.asarray(belief.scene.parameters)[:count],
+            parameters=np.asarray(belief.landmarks.parameters)[:count],
             covariance=np.asarray(belief.covariance)[:size, :size],
         )
 

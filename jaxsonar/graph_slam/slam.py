@@ -399,7 +399,7 @@ def passages_of(state: TrackerState) -> Passages | None:
     for number, one in enumerate(state.graph.submaps):
         part[one.rows] = number
     part = np.maximum(np.maximum.accumulate(part), 0)
-    return Passages(part, compose(state.start, state.graph.poses[nodes]), state.graph.graph.between(nodes))
+    return Passages(part, compose(state.start, state.graph.poses[nodes]), state.graph.graph.relative_covariances(nodes))
 
 
 def ties_of(graph: SubmapGraph) -> tuple[Tie, ...]:

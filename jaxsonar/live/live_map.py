@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.extract import LocalModel, check_method, local_model, local_models
-from jaxsonar.detection.hough_detector import pieces_of, settings_for
-from jaxsonar.detection.ml_detector import check_sigma
-from jaxsonar.estimation.odometry_noise import Slip
+from jaxsonar.detection.arc_tables import arc_tables
+from jaxsonar.detection.extract import local_model, local_models
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
+from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.trajectory import Trajectory
 from jaxsonar.geometry.se2 import relative
 from jaxsonar.graph_slam.incremental_mapper import Mapper
@@ -53,7 +54,7 @@ class LiveMap:
         settings: kernels.HoughSettings | None = None,
         sigma: float | None = None,
         mapping: bool = True,
-        slip: Slip | None = None,
+        odometry_noise: OdometryNoise | None = None,
     ):
         """Nothing is known yet.
 
@@ -76,9 +77,9 @@ class LiveMap:
         """Echoes of pairs of sensors that the ring does not listen to."""
         self.unplaced = 0
         """Scans without a pose, which are not in the map."""
-        self._choices = {"method": method, "settings": settings_for(ring, settings), "sigma": sigma}
-        self.slam = slip is not None
-        self._mapper = Mapper(ring=ring, **self._choices, slip=slip) if mapping or self.slam else None
+        self._choices = {"method": method, "settings": hough_settings(ring, settings), "sigma": sigma}
+        self.slam = odometry_noise is not None
+        self._mapper = Mapper(ring=ring, **self._choices, odometry_noise=odometry_noise) if mapping or self.slam else None
         self._state = self._mapper.start() if self._mapper is not None else None
         self._waiting: list[LiveScan] = []
         self._stamps: list[float] = []
@@ -93,7 +94,7 @@ class LiveMap:
         method = str(self._choices["method"])
         rng = np.random.default_rng(0)
         settings = self._choices["settings"]
-        heard = np.repeat(self.ring.paths, pieces_of(self.ring, settings), axis=0)  # wide paths hear more often
+        heard = np.repeat(self.ring.paths, arc_tables(self.ring, settings).pieces, axis=0)  # wide paths hear more often
 
         def one(echoes: int) -> LiveScan:
             path = heard[rng.integers(len(heard), size=echoes)]

@@ -13,20 +13,20 @@ from jaxtyping import Float, Int
 from scipy.special import logsumexp
 
 from jaxsonar import kernels
-from jaxsonar.detection.extract import LocalModel, local_models
-from jaxsonar.detection.ml_detector import check_sigma
-from jaxsonar.estimation.motion_model import moved, step_variance
-from jaxsonar.estimation.odometry_noise import Slip
+from jaxsonar.detection.extract import local_models
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.settings import check_sigma
+from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
 from jaxsonar.estimation.trajectory import Trajectory, stamps_of
-from jaxsonar.geometry.se2 import relative, unit, wrap_angle
+from jaxsonar.geometry.se2 import propagate, relative, rotate, unit, wrap_angle
 from jaxsonar.graph_slam.frontend import Track, update
 from jaxsonar.graph_slam.joint_compatibility import Known, features_of
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.registration.feature_map import Places, Seen, seen_of, turned
-from jaxsonar.registration.pose_hypotheses import hypotheses, thinned
-from jaxsonar.registration.pose_likelihood import explained
-from jaxsonar.registration.sequential import place_parts
+from jaxsonar.registration.features import Features, scan_features
+from jaxsonar.registration.pose_hypotheses import pose_hypotheses, thin_poses
+from jaxsonar.registration.pose_likelihood import pose_log_likelihood, refine_poses
+from jaxsonar.registration.sequential import register_scans
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -105,7 +105,7 @@ def localize(
     *,
     start: Sequence[float] | None = None,
     sigma: float | None = None,
-    slip: Slip | None = None,
+    odometry_noise: OdometryNoise | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Localized:
     """Poses of scans in a map that is known.
@@ -134,7 +134,7 @@ def localize(
     for model in local_models(ring, log, sigma=sigma):
         models.append(model)
         say("local models", len(models), len(log))
-    path = _Path(ring, _Map.of(world), log, models, _odometry(log, models), sigma, slip or Slip())
+    path = _Path(ring, _Map.of(world), log, models, _odometry(log, models), sigma, odometry_noise or OdometryNoise())
     if not len(path.rows):
         raise SonarError(
             "localize: no scan could be laid on another; allowed are scans with odometry, or near each other"
@@ -172,7 +172,7 @@ def _odometry(log: Log, models: Sequence[LocalModel]) -> Float[np.ndarray, "scan
     known = np.asarray(np.isfinite(log.pose).all(axis=1))
     if known.any():
         return np.where(known[:, None], log.pose, np.nan)
-    parts = place_parts(models, None, blur=_BLUR) if len(models) > 1 else []
+    parts = register_scans(models, None, noise_scale=_BLUR) if len(models) > 1 else []
     if parts and np.isfinite(parts[0][:, 0]).sum() > 1:
         return parts[0]
     alone = np.full((len(log), 3), np.nan)  # the scan that sees most must do
@@ -335,7 +335,7 @@ class _Path:
     models: Sequence[LocalModel]
     odometry: Float[np.ndarray, "scans 3"]
     sigma: float | None
-    slip: Slip
+    odometry_noise: OdometryNoise
 
     @property
     def rows(self) -> Int[np.ndarray, " rows"]:
@@ -355,9 +355,10 @@ class _Path:
             rough: where the first scan was taken, about; anywhere if left out.
         """
         places, rows = _places(self.map), self.rows[:TRIED]
+        held = np.diag(np.array([*_FOUND[:1] * 2, _FOUND[1]]) ** -2.0)
         first = self.odometry[rows[0]]
         richest = sorted(rows, key=lambda row: -len(features_of(self.models[row]).kind))
-        views = {row: seen_of(self.models[row], blur=_BLUR) for row in richest[:_TOGETHER]}
+        views = {row: scan_features(self.models[row], noise_scale=_BLUR) for row in richest[:_TOGETHER]}
         steps = {row: relative(first, self.odometry[row]) for row in views}
         some = []
         for row in richest[:STARTS]:
@@ -365,23 +366,23 @@ class _Path:
             if len(seen.theta) + len(seen.point) < 2:
                 continue
             # Two features fix a pose; what one wall alone allows is a whole line of them.
-            found = hypotheses(seen, places, np.zeros(3))[1 + len(seen.theta) * len(places.theta) :]
+            found = pose_hypotheses(seen, places, np.zeros(3))[1 + len(seen.theta) * len(places.theta) :]
             if rough is not None:
                 away = _followed_by(found, back) - rough
                 near = np.hypot(away[:, 0], away[:, 1]) < _NEAR * ROUGH[0]
                 found = found[near & (np.abs(wrap_angle(away[:, 2])) < _NEAR * ROUGH[1])]
             if not len(found):
                 continue
-            found = thinned(found, _CELL)
+            found = thin_poses(found, _CELL)
             parts = np.array_split(found, -(-len(found) // 4096))
-            evidence = np.concatenate([explained(places, seen, part).evidence for part in parts])
+            evidence = np.concatenate([pose_log_likelihood(places, seen, part).log_likelihood for part in parts])
             best = found[np.argsort(-evidence, kind="stable")[: 4 * KEPT]]
-            some.append(_followed_by(_closer(places, seen, best), back))
+            some.append(_followed_by(refine_poses(places, seen, best, held, prior_mean=best, steps=_CLOSER), back))
         if not some:
             return []
         # What all of these scans say of them, as odometry has them.
-        poses = thinned(np.concatenate(some), _CELL)
-        evidence = sum(explained(places, views[row], _followed_by(poses, steps[row])).evidence for row in views)
+        poses = thin_poses(np.concatenate(some), _CELL)
+        evidence = sum(pose_log_likelihood(places, views[row], _followed_by(poses, steps[row])).log_likelihood for row in views)
         kept: list[Float[np.ndarray, 3]] = []
         for k in np.argsort(-np.asarray(evidence), kind="stable"):
             off = [poses[k] - one for one in kept]
@@ -463,7 +464,7 @@ class _Path:
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "unknowns unknowns"]]:
         """A pose and what hangs on it, by odometry, at a scan from the one before."""
         step = relative(self.odometry[self.rows[number - 1]], self.odometry[self.rows[number]])
-        return moved(pose, cov, step, step_variance(self.slip, step))
+        return propagate(pose, cov, step, np.diag(step_variance(self.odometry_noise, step)))
 
 
 def _different(runs: Sequence[_Run]) -> list[_Run]:
@@ -480,34 +481,23 @@ def _different(runs: Sequence[_Run]) -> list[_Run]:
 
 def _followed_by(poses: Float[np.ndarray, "poses 3"], step: Float[np.ndarray, "3"]) -> Float[np.ndarray, "poses 3"]:
     """All of them after the same step."""
-    place = poses[:, :2] + turned(np.broadcast_to(step[:2], (len(poses), 2)), poses[:, 2])
+    place = poses[:, :2] + rotate(np.broadcast_to(step[:2], (len(poses), 2)), poses[:, 2])
     return np.column_stack([place, wrap_angle(poses[:, 2] + step[2])])
 
 
-def _closer(places: Places, seen: Seen, poses: Float[np.ndarray, "poses 3"]) -> Float[np.ndarray, "poses 3"]:
-    """Poses where walls and points lie better on those that they lie on."""
-    held = np.diag(np.array([*_FOUND[:1] * 2, _FOUND[1]]) ** -2.0)
-    start = poses
-    for _ in range(_CLOSER):
-        result = explained(places, seen, poses)
-        away = poses - start
-        away[:, 2] = wrap_angle(away[:, 2])
-        gradient = result.gradient + away @ held
-        poses = poses - np.linalg.solve(result.information + held, gradient[..., None])[..., 0]
-    return poses
-
-
-def _places(known: _Map) -> Places:
+def _places(known: _Map) -> Features:
     """The map as what scans are laid on, every wall from both sides."""
     wall = np.flatnonzero(known.kind == kernels.PLANE)
     point = np.flatnonzero(known.kind != kernels.PLANE)
-    places = Places()
-    places.reference = np.tile(known.anchor[wall], (2, 1))
-    places.theta = np.concatenate([known.theta[wall], wrap_angle(known.theta[wall] + np.pi)])
-    places.offset = np.zeros(2 * len(wall))
-    places.extent = np.tile(known.half[wall, None] * [-1.0, 1.0], (2, 1))
-    places.cov = np.tile(known.cov[wall], (2, 1, 1))
-    places.sightings = np.full(2 * len(wall), 4.0)
-    places.point, places.kind = known.anchor[point], known.kind[point] == kernels.CORNER
-    places.spread = np.sqrt(np.trace(known.cov[point], axis1=1, axis2=2) / 2)
-    return places
+    return Features(
+        reference=np.tile(known.anchor[wall], (2, 1)),
+        theta=np.concatenate([known.theta[wall], wrap_angle(known.theta[wall] + np.pi)]),
+        offset=np.zeros(2 * len(wall)),
+        covariance=np.tile(known.cov[wall], (2, 1, 1)),
+        extent=np.tile(known.half[wall, None] * [-1.0, 1.0], (2, 1)),
+        weight=np.ones(2 * len(wall)),
+        scans=np.full(2 * len(wall), 4.0),
+        point=known.anchor[point],
+        is_corner=known.kind[point] == kernels.CORNER,
+        point_sd=np.sqrt(np.trace(known.cov[point], axis1=1, axis2=2) / 2),
+    )

@@ -1,209 +1,184 @@
-"""Corners and edges in the world frame, with what is known of each, and the law by which sightings of one add up."""
+"""Corners and edges in the world frame: their information, fusion and clustering."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from jaxsonar.detection.extract import LocalModel
-from jaxsonar.geometry.se2 import to_world
-from jaxsonar.mapping.observations import Sightings, latest_scans, unique_pairs
-from jaxsonar.mapping.observations import join as join
-from jaxsonar.mapping.segment_fusion import mutual
-
-CELL = 0.05
-"""Metres; sightings of one cell of the floor are kept as their sum."""
-GATE = 3.0
-"""Standard deviations by which sightings of one point may differ."""
-FLOOR = 0.02
-"""Metres; how well two sightings can agree at best: corners are not quite sharp, nor is odometry."""
-FARTHEST = 0.3
-"""Metres; sightings farther apart are of two points, however little is known of them."""
-RESTLESS = 2.0
-"""Mean square, in variances, by which the sightings of something that moves along with the robot differ."""
-NEAREST = 0.1
-"""Metres; nothing is nearer to the robot's centre."""
-SURE = 1e-4
-"""A single sighting leaves at least this probability to the other kind."""
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.geometry.se2 import perpendicular, transform_points
+from jaxsonar.mapping.observations import Observations, unique_pairs
+from jaxsonar.mapping.segment_fusion import mutual_best
+from jaxsonar.mapping.settings import SETTINGS
+from jaxsonar.mapping.wall_segments import observation_times
 
 
 @dataclass(frozen=True, eq=False)
-class Points(Sightings):
-    """Corners and edges, world frame, one row each; a corner is right-angled, thin poles are edges."""
+class PointLandmarks(Observations):
+    """Corners and edges, world frame, one per row. Corners are right-angled; thin poles count as edges."""
 
-    place: Float[np.ndarray, "points 2"]
-    """Metres."""
+    position: Float[np.ndarray, "points 2"]
+    """Position, metres."""
     information: Float[np.ndarray, "points 2 2"]
-    """Inverse covariance of ``place``, 1 / m^2: across the line of sight much less is known than along it."""
-    evidence: Float[np.ndarray, " points"]
-    """For a corner and against an edge: sum of log odds, nats."""
+    """Inverse covariance of ``position``, 1 / m^2; much smaller across the line of sight than along it."""
+    corner_log_odds: Float[np.ndarray, " points"]
+    """Sum of the log odds of corner against edge, nats."""
     cell: Int[np.ndarray, "points 2"]
-    """Cell of the floor that it was first sighted in; of a sum, that of one of its members."""
+    """Cell of the floor in which the point was first observed; for a fusion, that of one of its members."""
 
     @property
     def cov(self) -> Float[np.ndarray, "points 2 2"]:
-        """Covariance of ``place`` from ``information``, square metres."""
+        """Covariance of ``position``, square metres."""
         return np.linalg.inv(self.information)
 
     @property
-    def honest_cov(self) -> Float[np.ndarray, "points 2 2"]:
-        """The same, scaled by how much the sightings differ; what is expected of one counts as one more of them."""
-        cov = ((self.misfit + 2) / (2 * self.count))[:, None, None] * self.cov
+    def inflated_cov(self) -> Float[np.ndarray, "points 2 2"]:
+        """Covariance of ``position``, multiplied by the variance factor that the scatter of the observations shows.
+
+        The expected scatter enters as one more observation.
+        """
+        cov = ((self.chi_squared + 2) / (2 * self.count))[:, None, None] * self.cov
         return (cov + cov.swapaxes(1, 2)) / 2
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Which kind has more evidence, "corner" or "edge"."""
-        return tuple("corner" if e > 0 else "edge" for e in self.evidence.tolist())
+        """The more probable kind of each point, "corner" or "edge"."""
+        return tuple("corner" if odds > 0 else "edge" for odds in self.corner_log_odds.tolist())
 
-    @property
-    def times(self) -> Int[np.ndarray, " points"]:
-        """In how many scans each was seen."""
-        return np.bincount(self.scans[0], minlength=len(self))
+    def grid_cells(self) -> Int[np.ndarray, "points 2"]:
+        """Cell of the floor (5 cm)."""
+        return self.cell
+
+    def fuse(self, group: Int[np.ndarray, " points"]) -> "PointLandmarks":
+        """One point per group, the mean weighted by information; no group may be empty."""
+        groups = int(group.max(initial=-1)) + 1
+        if len(self) == groups:  # every group has one member
+            return self.take(np.argsort(group, kind="stable"))
+        # Positions relative to any member, which avoids cancellation far from the world's origin.
+        first = np.zeros(groups, dtype=np.int64)
+        first[group[::-1]] = np.arange(len(group))[::-1]
+        offset = self.position - self.position[first][group]
+        information = np.zeros((groups, 2, 2))
+        np.add.at(information, group, self.information)
+        weighted = np.zeros((groups, 2))
+        np.add.at(weighted, group, np.einsum("pij,pj->pi", self.information, offset))
+        mean = np.linalg.solve(information, weighted[..., None])[..., 0]
+        residual = offset - mean[group]
+        chi_squared = np.einsum("pi,pij,pj->p", residual, self.information, residual)
+
+        def total(values: np.ndarray) -> np.ndarray:
+            return np.bincount(group, values, groups)
+
+        last_seen = np.full(groups, -np.inf)
+        np.maximum.at(last_seen, group, self.last_seen)
+        cell = self.cell[np.lexsort((*self.cell.T, group))]
+        return PointLandmarks(
+            position=self.position[first] + mean,
+            information=information,
+            corner_log_odds=total(self.corner_log_odds),
+            chi_squared=total(self.chi_squared + chi_squared),
+            count=np.rint(total(self.count)).astype(np.int64),
+            echoes=np.rint(total(self.echoes)).astype(np.int64),
+            last_seen=last_seen,
+            cell=cell[np.searchsorted(np.sort(group), np.arange(groups))],
+            scans=unique_pairs(group[self.scans[0]], self.scans[1]),
+        )
 
 
-def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]) -> Points:
-    """The corners and edges of local models in the world frame; models without a pose are left out.
+def aggregate_points(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]) -> PointLandmarks:
+    """The corners and edges of local models in the world frame.
 
     Args:
         models: local models, robot frame.
-        poses: world_from_robot of each, x, y (m), theta (rad), NaN where there is none.
+        poses: world_from_robot of each: x, y (m), theta (rad). Models with a NaN pose are left out.
     """
-    known = np.all(np.isfinite(poses), axis=1)
-    found = [(k, point) for k, model in enumerate(models) if known[k] for point in model.points]
+    has_pose = np.all(np.isfinite(poses), axis=1)
+    found = [(k, point) for k, model in enumerate(models) if has_pose[k] for point in model.points]
     model = np.array([k for k, _ in found], dtype=np.int64)
-    place = np.array([to_world(poses[k], np.array([[p.x, p.y]]))[0] for k, p in found]).reshape(-1, 2)
+    position = np.array([transform_points(poses[k], np.array([[p.x, p.y]]))[0] for k, p in found]).reshape(-1, 2)
     c, s = np.cos(poses[model, 2]), np.sin(poses[model, 2])
-    turn = np.stack([c, -s, s, c], axis=-1).reshape(-1, 2, 2)
-    cov = turn @ np.array([p.cov for _, p in found], dtype=np.float64).reshape(-1, 2, 2) @ turn.swapaxes(1, 2)
-    # What is known is a piece of an arc around the robot: an error of its bearing is one of its range, too.
-    sight = place - poses[model, :2]
-    distance = np.maximum(np.linalg.norm(sight, axis=-1), NEAREST)
+    rotation = np.stack([c, -s, s, c], axis=-1).reshape(-1, 2, 2)
+    cov = rotation @ np.array([p.cov for _, p in found], dtype=np.float64).reshape(-1, 2, 2) @ rotation.swapaxes(1, 2)
+    # The true uncertainty region is an arc around the robot. Its curvature turns a bearing error into a range error.
+    sight = position - poses[model, :2]
+    distance = np.maximum(np.linalg.norm(sight, axis=-1), SETTINGS.points.min_range)
     ray = sight / distance[:, None]
-    aside = np.stack([-ray[:, 1], ray[:, 0]], axis=-1)
-    bend = np.einsum("pi,pij,pj->p", aside, cov, aside) / (2 * distance)
-    cov += 3 * bend[:, None, None] ** 2 * ray[:, :, None] * ray[:, None, :]
-    sure = np.clip([p.probability for _, p in found], SURE, 1 - SURE)
-    when = np.array([m.scan if np.isnan(m.stamp) else m.stamp for m in models], dtype=np.float64)
+    across = perpendicular(ray)
+    curvature = np.einsum("pi,pij,pj->p", across, cov, across) / (2 * distance)
+    cov += 3 * curvature[:, None, None] ** 2 * ray[:, :, None] * ray[:, None, :]
+    least = SETTINGS.points.min_kind_probability
+    probability = np.clip([p.probability for _, p in found], least, 1 - least)
+    sign = np.array([1.0 if p.kind == "corner" else -1.0 for _, p in found])
     seen = np.array([(row, models[k].scan) for row, (k, _) in enumerate(found)], dtype=np.int64).reshape(-1, 2)
-    return Points(
-        place=place,
+    return PointLandmarks(
+        position=position,
         information=np.linalg.inv(cov),
-        evidence=np.log(sure / (1 - sure)) * np.array([1.0 if p.kind == "corner" else -1.0 for _, p in found]),
-        misfit=np.zeros(len(found)),
+        corner_log_odds=np.log(probability / (1 - probability)) * sign,
+        chi_squared=np.zeros(len(found)),
         count=np.ones(len(found), dtype=np.int64),
         echoes=np.array([p.echoes for _, p in found], dtype=np.int64),
-        latest=when[model],
-        cell=np.floor(place / CELL).astype(np.int64),
+        last_seen=observation_times(models)[model],
+        cell=np.floor(position / SETTINGS.points.merge_cell).astype(np.int64),
         scans=unique_pairs(*seen.T),
     )
 
 
-def add_up(points: Points, group: Int[np.ndarray, " points"]) -> Points:
-    """Points that are one, one row a group: the mean weighed by information.
+def cluster_points(observations: PointLandmarks) -> tuple[PointLandmarks, Int[np.ndarray, " observations"]]:
+    """Corners and edges from their observations, by agglomerative clustering.
 
-    The sum of sums is the sum of all, in any order, to rounding.
-
-    Args:
-        points: sightings.
-        group: which of them are one, 0, 1, ...; none may be missing.
-    """
-    groups = int(group.max(initial=-1)) + 1
-    if len(points) == groups:  # nothing to add, only an order to keep
-        return points.take(np.argsort(group, kind="stable"))
-    first = np.zeros(groups, dtype=np.int64)
-    first[group[::-1]] = np.arange(len(group))[::-1]
-    offset = points.place - points.place[first][group]  # from nearby, for the digits
-    pull = np.einsum("pij,pj->pi", points.information, offset)
-    information = np.zeros((groups, 2, 2))
-    np.add.at(information, group, points.information)
-    middle = np.zeros((groups, 2))
-    np.add.at(middle, group, pull)
-    middle = np.linalg.solve(information, middle[..., None])[..., 0]
-    away = offset - middle[group]
-    least = np.einsum("pi,pij,pj->p", away, points.information, away)
-
-    def total(values: np.ndarray) -> np.ndarray:
-        return np.bincount(group, values, groups)
-
-    latest = np.full(groups, -np.inf)
-    np.maximum.at(latest, group, points.latest)
-    cell = points.cell[np.lexsort((*points.cell.T, group))]
-    return Points(
-        place=points.place[first] + middle,
-        information=information,
-        evidence=total(points.evidence),
-        misfit=total(points.misfit + least),
-        count=np.rint(total(points.count)).astype(np.int64),
-        echoes=np.rint(total(points.echoes)).astype(np.int64),
-        latest=latest,
-        cell=cell[np.searchsorted(np.sort(group), np.arange(groups))],
-        scans=unique_pairs(group[points.scans[0]], points.scans[1]),
-    )
-
-
-def condense(points: Points, *, scans: int | None = None) -> Points:
-    """Sightings of one cell as their sum; the order of the points does not matter.
-
-    Args:
-        points: sightings.
-        scans: keep the numbers of at most so many scans of each, the largest ones; all if left out.
-    """
-    if not len(points):
-        return points
-    group = np.unique(points.cell, axis=0, return_inverse=True)[1].ravel()
-    summed = add_up(points, group)
-    return replace(summed, scans=latest_scans(summed.scans, scans))
-
-
-def cluster(points: Points) -> tuple[Points, Int[np.ndarray, " points"]]:
-    """Corners and edges from sightings: in rounds, those that are each other's likeliest match add up.
-
-    Two match if they differ by at most ``GATE`` standard deviations, with a ``FLOOR``, and by ``FARTHEST``. The result
-    does not depend on the order of the points, and clustering it again changes nothing.
+    In each iteration, observations that are each other's most likely match are fused. Two observations match if their
+    Mahalanobis distance and their distance in metres pass the gates. The result does not depend on the order of the
+    observations, and clustering it again does not change it.
 
     Returns:
-        The points, and which of them each sighting belongs to.
+        The points, and the row of the point that each observation belongs to.
     """
-    point_of = np.arange(len(points))
+    settings = SETTINGS.points
+    points, point_of = observations, np.arange(len(observations))
     while len(points) > 1:
-        pairs = KDTree(points.place).query_pairs(FARTHEST, output_type="ndarray").reshape(-1, 2)
+        pairs = KDTree(points.position).query_pairs(settings.max_distance, output_type="ndarray").reshape(-1, 2)
         a, b = pairs.T
         cov = points.cov
-        spread = cov[a] + cov[b] + FLOOR**2 * np.eye(2)
-        squared = _squared(points.place[b] - points.place[a], spread)
-        near = squared <= GATE**2
-        if not near.any():
+        cov = cov[a] + cov[b] + settings.position_floor**2 * np.eye(2)
+        squared = _mahalanobis_squared(points.position[b] - points.position[a], cov)
+        match = squared <= settings.gate**2
+        if not match.any():
             break
-        unlikely = squared[near] + np.log(np.linalg.det(spread[near]))
-        group = mutual(pairs[near].astype(np.int64), unlikely, len(points))
-        points, point_of = add_up(points, group), group[point_of]
+        negative_log_likelihood = squared[match] + np.log(np.linalg.det(cov[match]))
+        group = mutual_best(pairs[match].astype(np.int64), negative_log_likelihood, len(points))
+        points, point_of = points.fuse(group), group[point_of]
     return points, point_of
 
 
-def steady(
-    points: Points, sightings: Points, point_of: Int[np.ndarray, " sightings"], *, floor: float
+def is_static(
+    points: PointLandmarks,
+    observations: PointLandmarks,
+    point_of: Int[np.ndarray, " observations"],
+    *,
+    systematic_error: float,
 ) -> Bool[np.ndarray, " points"]:
-    """Which points stay where they are while the robot moves.
+    """Which points keep their position while the robot moves.
 
-    Two walls that are not square mirror the robot, too, but the image moves along with it.
+    Two walls that do not meet at a right angle also reflect sound back to the robot, but that apparent point moves with
+    the robot.
 
     Args:
-        points: sums of the sightings.
-        sightings: what they were seen as.
-        point_of: which of the points each sighting belongs to.
-        floor: how far off noise a sighting may be because poses are, metres.
+        points: fusions of the observations.
+        observations: single observations.
+        point_of: row of the point that each observation belongs to.
+        systematic_error: standard deviation of an observed position due to pose errors, metres.
     """
-    offset = sightings.place - points.place[point_of]
-    squared = _squared(offset, sightings.cov + floor**2 * np.eye(2)) + sightings.misfit
-    freedom = 2 * np.maximum(points.count - 1, 1)
-    return np.bincount(point_of, squared, len(points)) <= RESTLESS * freedom
+    offset = observations.position - points.position[point_of]
+    cov = observations.cov + systematic_error**2 * np.eye(2)
+    squared = _mahalanobis_squared(offset, cov) + observations.chi_squared
+    degrees_of_freedom = 2 * np.maximum(points.count - 1, 1)
+    scatter = np.bincount(point_of, squared, len(points))
+    return scatter <= SETTINGS.points.max_normalized_misfit * degrees_of_freedom
 
 
-def _squared(
+def _mahalanobis_squared(
     offset: Float[np.ndarray, "points 2"], cov: Float[np.ndarray, "points 2 2"]
 ) -> Float[np.ndarray, " points"]:
-    """Squared offsets in standard deviations."""
     return (offset * np.linalg.solve(cov, offset[..., None])[..., 0]).sum(-1)

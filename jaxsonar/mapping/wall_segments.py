@@ -1,4 +1,4 @@
-"""Pieces of walls in the world frame, with what is known of each, and the law by which pieces of one wall add up."""
+"""Wall segments in the world frame, with the information about their lines, and the fusion of segments of one wall."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -7,199 +7,210 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.detection.extract import Line, LocalModel
-from jaxsonar.geometry.se2 import to_world, wrap_angle
-from jaxsonar.mapping.observations import Sightings, unique_pairs
-from jaxsonar.mapping.observations import join as join
-
-SIGMA_OFFSET, SIGMA_THETA = 0.01, float(np.radians(3.0))
-"""Standard deviations of a line of the Hough step, metres and radians: what cells and cut-off arcs leave."""
+from jaxsonar.detection.local_map import Line, LocalModel
+from jaxsonar.geometry.se2 import tangent_of, transform_points, unit, wrap_angle
+from jaxsonar.mapping.observations import Observations, unique_pairs
+from jaxsonar.mapping.settings import SETTINGS
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces(Sightings):
-    """Straight pieces of walls, world frame, one row each.
+class WallSegments(Observations):
+    """Straight wall segments, world frame, one per row.
 
-    A piece knows its line best at ``centre``: there the errors of its offset (across the line) and of its direction are
-    independent, and ``info_offset`` and ``info_theta`` are their inverse variances.
+    The line of a segment is parametrized at ``centre``, the point where the errors of its offset (perpendicular to the
+    line) and of its direction are uncorrelated.
     """
 
-    centre: Float[np.ndarray, "pieces 2"]
+    centre: Float[np.ndarray, "segments 2"]
     """Point on the line, metres."""
-    theta: Float[np.ndarray, " pieces"]
-    """Direction of the normal, away from the robot that saw it, radians, in [-pi, pi)."""
-    ends: Float[np.ndarray, "pieces 2"]
-    """Where the piece begins and ends, along its tangent from ``centre``, metres."""
-    info_offset: Float[np.ndarray, " pieces"]
-    """1 / m^2."""
-    info_theta: Float[np.ndarray, " pieces"]
-    """1 / rad^2."""
-    distance: Float[np.ndarray, " pieces"]
-    """From how far it was seen, the mean of the lines, metres."""
+    theta: Float[np.ndarray, " segments"]
+    """Direction of the normal, pointing away from the robot that observed it, radians, in [-pi, pi)."""
+    extent: Float[np.ndarray, "segments 2"]
+    """Start and end of the segment along its tangent, measured from ``centre``, metres."""
+    info_offset: Float[np.ndarray, " segments"]
+    """Inverse variance of the offset, 1 / m^2."""
+    info_theta: Float[np.ndarray, " segments"]
+    """Inverse variance of the direction, 1 / rad^2."""
+    viewing_distance: Float[np.ndarray, " segments"]
+    """Mean distance from which the line was observed, metres."""
 
     @property
-    def normal(self) -> Float[np.ndarray, "pieces 2"]:
+    def normal(self) -> Float[np.ndarray, "segments 2"]:
         """Unit normals."""
-        return np.stack([np.cos(self.theta), np.sin(self.theta)], axis=-1)
+        return unit(self.theta)
 
     @property
-    def tangent(self) -> Float[np.ndarray, "pieces 2"]:
-        """Unit tangents, the normals turned a quarter counter-clockwise."""
-        return np.stack([-np.sin(self.theta), np.cos(self.theta)], axis=-1)
+    def tangent(self) -> Float[np.ndarray, "segments 2"]:
+        """Unit tangents, the normals rotated by 90 degrees counter-clockwise."""
+        return tangent_of(self.theta)
 
     @property
-    def segments(self) -> Float[np.ndarray, "pieces 2 2"]:
-        """Endpoints, world frame, metres."""
-        return self.centre[:, None] + self.ends[..., None] * self.tangent[:, None]
+    def endpoints(self) -> Float[np.ndarray, "segments 2 2"]:
+        """Start and end points, world frame, metres."""
+        return self.centre[:, None] + self.extent[..., None] * self.tangent[:, None]
 
     @property
-    def length(self) -> Float[np.ndarray, " pieces"]:
-        """Metres."""
-        return self.ends[:, 1] - self.ends[:, 0]
+    def length(self) -> Float[np.ndarray, " segments"]:
+        """Length, metres."""
+        return self.extent[:, 1] - self.extent[:, 0]
+
+    def grid_cells(self) -> Int[np.ndarray, "segments 3"]:
+        """Cell of each segment in position (5 cm) and direction (6 degrees)."""
+        cell, angle = SETTINGS.segments.merge_cell, SETTINGS.segments.merge_angle
+        return np.column_stack([np.floor(self.centre / cell), np.floor(self.theta / angle)]).astype(np.int64)
+
+    def fuse(self, group: Int[np.ndarray, " segments"]) -> "WallSegments":
+        """One segment per group: the line that fits its members best, between their outermost projected ends.
+
+        A line through the common centre with normal n has the cost
+
+            sum of info_offset (d . n)^2 + info_theta (t . n)^2   =   n' M n,
+
+        where d is the centre of a member relative to the common centre and t its tangent. The minimum is the
+        eigenvector of M with the smaller eigenvalue: segments far apart along a wall determine its direction better
+        than any of them alone. Rotating the line by b raises the cost by (difference of the eigenvalues) sin(b)^2,
+        which is the information that the result stores. Therefore information adds up, to rounding; the ends differ by
+        up to 3 mm, because they are projected each time. A group with a single member is not changed.
+        """
+        groups = int(group.max(initial=-1)) + 1
+        members = np.bincount(group, minlength=groups)
+        if len(self) == groups:  # every group has one member
+            return self.take(np.argsort(group, kind="stable"))
+
+        def total(values: np.ndarray) -> np.ndarray:
+            return np.bincount(group, values, groups)
+
+        # The common centre, relative to any member, which avoids cancellation far from the world's origin.
+        first = np.zeros(groups, dtype=np.int64)
+        first[group] = np.arange(len(group))
+        origin = self.centre[first]
+        d, t, w, v = self.centre - origin[group], self.tangent, self.info_offset, self.info_theta
+        info = total(w)
+        middle = np.stack([total(w * d[:, 0]), total(w * d[:, 1])], axis=-1) / info[:, None]
+        d = d - middle[group]
+        # The matrix M, its eigenvalues and the direction of the line.
+        xx = total(w * d[:, 0] ** 2 + v * t[:, 0] ** 2)
+        yy = total(w * d[:, 1] ** 2 + v * t[:, 1] ** 2)
+        xy = total(w * d[:, 0] * d[:, 1] + v * t[:, 0] * t[:, 1])
+        info_theta = np.hypot(xx - yy, 2 * xy)
+        smaller_eigenvalue = 2 * np.maximum(xx * yy - xy * xy, 0) / (xx + yy + info_theta)
+        theta = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2
+        normal = unit(theta)
+        # The member with the best known direction determines which side the normal points to.
+        order = np.lexsort((self.count, v, group))
+        leader = order[np.searchsorted(group[order], np.arange(groups), side="right") - 1]
+        facing = (self.normal[leader] * normal).sum(-1)
+        theta = wrap_angle(theta + np.where(facing < 0, np.pi, 0.0))
+
+        centre = origin + middle
+        start, end = outermost_projections(self.endpoints, group, centre, tangent_of(theta))
+        last_seen = np.full(groups, -np.inf)
+        np.maximum.at(last_seen, group, self.last_seen)
+        count = total(self.count)
+        fused = WallSegments(
+            centre=centre,
+            theta=theta,
+            extent=np.stack([start, end], axis=-1),
+            info_offset=info,
+            info_theta=info_theta,
+            chi_squared=total(self.chi_squared) + smaller_eigenvalue,
+            count=np.rint(count).astype(np.int64),
+            echoes=np.rint(total(self.echoes)).astype(np.int64),
+            viewing_distance=total(self.viewing_distance * self.count) / count,
+            last_seen=last_seen,
+            scans=unique_pairs(group[self.scans[0]], self.scans[1]),
+        )
+        alone = members == 1
+        return replace_rows(fused, alone, self.take(first[alone]))
 
 
-def aggregate(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]) -> Pieces:
-    """The segments of local models in the world frame (paper, section 5, figure 6); models without a pose are left out.
+def aggregate_segments(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]) -> WallSegments:
+    """The lines of local models as segments in the world frame (paper, section 5, figure 6).
 
     Args:
         models: local models, robot frame.
-        poses: world_from_robot of each, x, y (m), theta (rad), NaN where there is none.
+        poses: world_from_robot of each: x, y (m), theta (rad). Models with a NaN pose are left out.
     """
-    known = np.all(np.isfinite(poses), axis=1)
-    lines = [(k, line) for k, model in enumerate(models) if known[k] for line in model.lines]
+    has_pose = np.all(np.isfinite(poses), axis=1)
+    lines = [(k, line) for k, model in enumerate(models) if has_pose[k] for line in model.lines]
     model = np.array([k for k, _ in lines], dtype=np.int64)
     theta = np.array([line.theta for _, line in lines]) + poses[model, 2]
-    segments = np.array([line.segment for _, line in lines], dtype=np.float64).reshape(-1, 2, 2)
-    ends = np.array([to_world(poses[k], segment) for k, segment in zip(model, segments, strict=True)]).reshape(-1, 2, 2)
-    centre, info_offset, info_theta = _known_best(lines, ends, theta)
-    tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
-    echoes = np.array([line.echoes for _, line in lines], dtype=np.int64)
-    along = np.sort(((ends - centre[:, None]) * tangent[:, None]).sum(-1), axis=1)
+    in_robot = np.array([line.segment for _, line in lines], dtype=np.float64).reshape(-1, 2, 2)
+    in_world = [transform_points(poses[k], ends) for k, ends in zip(model, in_robot, strict=True)]
+    endpoints = np.array(in_world).reshape(-1, 2, 2)
+    centre, info_offset, info_theta = _uncorrelated_centre(lines, endpoints, theta)
+    extent = ((endpoints - centre[:, None]) * tangent_of(theta)[:, None]).sum(-1)
     seen = np.array([(row, scan) for row, (_, line) in enumerate(lines) for scan in line.scans], dtype=np.int64)
-    when = np.array([m.scan if np.isnan(m.stamp) else m.stamp for m in models], dtype=np.float64)
-    return Pieces(
+    return WallSegments(
         centre=centre,
         theta=wrap_angle(theta),
-        ends=along,
+        extent=np.sort(extent, axis=1),
         info_offset=info_offset,
         info_theta=info_theta,
-        misfit=np.zeros(len(lines)),
+        chi_squared=np.zeros(len(lines)),
         count=np.ones(len(lines), dtype=np.int64),
-        echoes=echoes,
-        distance=np.array([line.rho for _, line in lines], dtype=np.float64),
-        latest=when[model],
+        echoes=np.array([line.echoes for _, line in lines], dtype=np.int64),
+        viewing_distance=np.array([line.rho for _, line in lines], dtype=np.float64),
+        last_seen=observation_times(models)[model],
         scans=unique_pairs(*seen.reshape(-1, 2).T),
     )
 
 
-def _known_best(
-    lines: Sequence[tuple[int, Line]], ends: Float[np.ndarray, "lines 2 2"], theta: Float[np.ndarray, " lines"]
-) -> tuple[Float[np.ndarray, "lines 2"], Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
-    """The point of each line where the errors of offset and direction are independent, and their inverse variances.
+def observation_times(models: Sequence[LocalModel]) -> Float[np.ndarray, " models"]:
+    """Time stamp of each local model, seconds; its scan number where it has none."""
+    return np.array([m.scan if np.isnan(m.stamp) else m.stamp for m in models], dtype=np.float64)
 
-    A line without covariance has it in the middle of its feet. With one, the offset at s along the line (from the foot
-    of the origin) errs by d_rho - s d_theta, and that is independent of d_theta at s = cov(rho, theta) / var(theta).
+
+def _uncorrelated_centre(
+    lines: Sequence[tuple[int, Line]], endpoints: Float[np.ndarray, "lines 2 2"], theta: Float[np.ndarray, " lines"]
+) -> tuple[Float[np.ndarray, "lines 2"], Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
+    """The point of each line where the errors of offset and direction are uncorrelated, and their inverse variances.
+
+    The offset at position s along the line, measured from the footpoint of the robot, has the error
+    d_rho - s d_theta. It is uncorrelated with d_theta at s = cov(rho, theta) / var(theta). A line without covariance
+    gets the default one at the middle of its footpoints.
     """
-    centre = ends.mean(axis=1)
-    info_offset, info_theta = np.full(len(lines), SIGMA_OFFSET**-2), np.full(len(lines), SIGMA_THETA**-2)
-    known = np.array([k for k, (_, line) in enumerate(lines) if line.cov is not None], dtype=np.int64)
-    if len(known):
-        chosen = [lines[k][1] for k in known]
+    centre = endpoints.mean(axis=1)
+    info_offset = np.full(len(lines), SETTINGS.segments.offset_sd**-2)
+    info_theta = np.full(len(lines), SETTINGS.segments.theta_sd**-2)
+    has_cov = np.array([k for k, (_, line) in enumerate(lines) if line.cov is not None], dtype=np.int64)
+    if len(has_cov):
+        chosen = [lines[k][1] for k in has_cov]
         cov = np.array([line.cov for line in chosen])
-        turn = theta[known] - [line.theta for line in chosen]  # the robot's heading
+        heading = theta[has_cov] - [line.theta for line in chosen]  # of the robot
         middle = np.array([line.segment.mean(axis=0) for line in chosen], dtype=np.float64)
         own = np.array([line.theta for line in chosen])
-        along = middle[:, 1] * np.cos(own) - middle[:, 0] * np.sin(own)  # of the middle of the feet
-        slide = cov[:, 0, 1] / cov[:, 1, 1] - along
-        tangent = np.stack([-np.sin(own + turn), np.cos(own + turn)], axis=-1)
-        centre[known] += slide[:, None] * tangent
-        info_offset[known] = 1 / (cov[:, 0, 0] - cov[:, 0, 1] ** 2 / cov[:, 1, 1])
-        info_theta[known] = 1 / cov[:, 1, 1]
+        middle_along = middle[:, 1] * np.cos(own) - middle[:, 0] * np.sin(own)
+        shift = cov[:, 0, 1] / cov[:, 1, 1] - middle_along
+        centre[has_cov] += shift[:, None] * tangent_of(own + heading)
+        info_offset[has_cov] = 1 / (cov[:, 0, 0] - cov[:, 0, 1] ** 2 / cov[:, 1, 1])
+        info_theta[has_cov] = 1 / cov[:, 1, 1]
     return centre, info_offset, info_theta
 
 
-def add_up(pieces: Pieces, group: Int[np.ndarray, " pieces"]) -> Pieces:
-    """One piece from all those of a group, for groups 0, 1, 2, ...: the line that fits all of them best.
-
-    With d a piece's centre from the common one and t its tangent, a line with the normal n costs
-
-        sum of info_offset (d . n)^2 + info_theta (t . n)^2   =   n' M n,
-
-    least for the eigenvector of M with the smaller eigenvalue: pieces far apart along the wall tell its direction
-    better than any of them alone. A line turned by b from there costs (difference of the eigenvalues) sin(b)^2 more,
-    which is what a piece keeps; so the sum of sums is the sum of all, in any order, to rounding (of the ends to 3 mm,
-    because they are projected each time). A group of one piece stays what it is.
-    """
-    groups = int(group.max(initial=-1)) + 1
-    members = np.bincount(group, minlength=groups)
-    if len(pieces) == groups:  # nothing to add, only an order to keep
-        return pieces.take(np.argsort(group, kind="stable"))
-
-    def total(values: np.ndarray) -> np.ndarray:
-        return np.bincount(group, values, groups)
-
-    first = np.zeros(groups, dtype=np.int64)
-    first[group] = np.arange(len(group))  # any member will do, to measure from nearby
-    origin = pieces.centre[first]
-    d, t, w, v = pieces.centre - origin[group], pieces.tangent, pieces.info_offset, pieces.info_theta
-    info = total(w)
-    middle = np.stack([total(w * d[:, 0]), total(w * d[:, 1])], axis=-1) / info[:, None]
-    d = d - middle[group]
-    xx = total(w * d[:, 0] ** 2 + v * t[:, 0] ** 2)
-    yy = total(w * d[:, 1] ** 2 + v * t[:, 1] ** 2)
-    xy = total(w * d[:, 0] * d[:, 1] + v * t[:, 0] * t[:, 1])
-    info_theta = np.hypot(xx - yy, 2 * xy)
-    least = 2 * np.maximum(xx * yy - xy * xy, 0) / (xx + yy + info_theta)
-    theta = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2
-    normal = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-    order = np.lexsort((pieces.count, v, group))  # which way it faces is said by the member that knows best
-    leader = order[np.searchsorted(group[order], np.arange(groups), side="right") - 1]
-    facing = (pieces.normal[leader] * normal).sum(-1)
-    theta = wrap_angle(theta + np.where(facing < 0, np.pi, 0.0))
-
-    centre = origin + middle
-    tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
-    low, high = outermost(pieces.segments, group, centre, tangent)
-    latest = np.full(groups, -np.inf)
-    np.maximum.at(latest, group, pieces.latest)
-    count = total(pieces.count)
-    summed = Pieces(
-        centre=centre,
-        theta=theta,
-        ends=np.stack([low, high], axis=-1),
-        info_offset=info,
-        info_theta=info_theta,
-        misfit=total(pieces.misfit) + least,
-        count=np.rint(count).astype(np.int64),
-        echoes=np.rint(total(pieces.echoes)).astype(np.int64),
-        distance=total(pieces.distance * pieces.count) / count,
-        latest=latest,
-        scans=unique_pairs(group[pieces.scans[0]], pieces.scans[1]),
-    )
-    alone = members == 1
-    return overwrite(summed, alone, pieces.take(first[alone]))
-
-
-def outermost(
-    segments: Float[np.ndarray, "pieces 2 2"],
-    group: Int[np.ndarray, " pieces"],
-    foot: Float[np.ndarray, "groups 2"],
+def outermost_projections(
+    endpoints: Float[np.ndarray, "segments 2 2"],
+    group: Int[np.ndarray, " segments"],
+    origin: Float[np.ndarray, "groups 2"],
     tangent: Float[np.ndarray, "groups 2"],
 ) -> tuple[Float[np.ndarray, " groups"], Float[np.ndarray, " groups"]]:
-    """First and last of the endpoints of each group, projected onto its line, metres from the foot (section 5)."""
-    ends = ((segments - foot[group][:, None]) * tangent[group][:, None]).sum(-1)
-    low, high = np.full(len(foot), np.inf), np.full(len(foot), -np.inf)
-    np.minimum.at(low, group, ends.min(axis=1))
-    np.maximum.at(high, group, ends.max(axis=1))
-    return low, high
+    """First and last projection of the endpoints of each group onto its line, metres from the line's origin.
+
+    This is how the paper bounds a merged wall (section 5).
+    """
+    along = ((endpoints - origin[group][:, None]) * tangent[group][:, None]).sum(-1)
+    first, last = np.full(len(origin), np.inf), np.full(len(origin), -np.inf)
+    np.minimum.at(first, group, along.min(axis=1))
+    np.maximum.at(last, group, along.max(axis=1))
+    return first, last
 
 
-def overwrite(pieces: Pieces, rows: Bool[np.ndarray, " pieces"], by: Pieces) -> Pieces:
-    """Some rows replaced, to the last bit, by what they were."""
+def replace_rows(segments: WallSegments, rows: Bool[np.ndarray, " segments"], by: WallSegments) -> WallSegments:
+    """The segments with some rows replaced, except for their scan numbers."""
     columns: dict[str, Any] = {}
-    for field in fields(Pieces):
+    for field in fields(WallSegments):
         if field.name != "scans":
-            values = getattr(pieces, field.name).copy()
+            values = getattr(segments, field.name).copy()
             values[rows] = getattr(by, field.name)
             columns[field.name] = values
-    return replace(pieces, **columns)
+    return replace(segments, **columns)

@@ -1,76 +1,54 @@
-"""Poses of the robot from local models alone: scan after scan is placed in the map of those before.
+"""Sequential registration: each scan is registered to the map of the scans before it, by walls, corners and edges.
 
-Every way to lay a scan on known walls, corners and edges is a hypothesis. What speaks for it is its evidence in nats
-(Laplace's approximation): densities of what agrees against chance, the room that the pose has left, the robot's
-motion, what would have been heard, what lies in the way. A scan is placed only where one hypothesis beats all others.
+The only method that uses odometry, and the only one for long logs. Every way to align a scan with the map is a
+hypothesis. Its evidence (Laplace approximation, nats) is the sum of the log-likelihood of the features, the prior of the
+motion, the volume of the posterior, and negative evidence. A scan is registered only if one hypothesis beats all others.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsonar.detection.extract import LocalModel
-from jaxsonar.geometry.se2 import composed, inverse
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.geometry.se2 import compose, inverse, subtract_poses, wrap_pose
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.registration.feature_map import NOT_PARALLEL, Places, Seen, seen_of
-from jaxsonar.registration.pose_hypotheses import Motion, only_pose
-from jaxsonar.registration.pose_likelihood import explained
-
-ODOMETRY = 0.05
-"""Standard deviation of odometry as a share of the way and of the turn."""
-MARGIN = 4.0
-"""Nats by which the best hypothesis must beat any other one that is elsewhere."""
-LATE = 1.0
-"""Nats more for each scan between this one and the nearest that is placed: the robot may be among new walls."""
-LOST = 5
-"""Scans without a place in a row after which a map of its own is begun, to be joined later."""
+from jaxsonar.registration.features import Features, fuse_scan, map_as_scan, no_features, scan_features
+from jaxsonar.registration.motion_prior import MotionModel, MotionPrior
+from jaxsonar.registration.pose_hypotheses import pose_hypotheses
+from jaxsonar.registration.pose_likelihood import pose_log_likelihood, refine_poses
+from jaxsonar.registration.scan_negative_evidence import scan_negative_evidence
+from jaxsonar.registration.settings import FEATURE_SETTINGS as SETTINGS
 
 
-def place(
+def register_scans(
     models: Sequence[LocalModel],
     odometry: Float[np.ndarray, "scans 3"] | None = None,
     *,
-    slip: float = ODOMETRY,
-    margin: float = MARGIN,
-    blur: float = 1.0,
-    progress: Callable[[int, int], None] | None = None,
-) -> Float[np.ndarray, "scans 3"]:
-    """Poses of the scans of an unmeasured room, good to centimetres and degrees: a start for an adjustment.
-
-    The first of ``place_parts``, whose arguments these are; all NaN where there is none.
-    """
-    parts = place_parts(models, odometry, slip=slip, margin=margin, blur=blur, progress=progress)
-    return parts[0] if parts else np.full((len(models), 3), np.nan)
-
-
-def place_parts(
-    models: Sequence[LocalModel],
-    odometry: Float[np.ndarray, "scans 3"] | None = None,
-    *,
-    slip: float = ODOMETRY,
-    margin: float = MARGIN,
-    blur: float = 1.0,
+    odometry_sd: float = SETTINGS.odometry_sd,
+    margin: float = SETTINGS.margin,
+    noise_scale: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Float[np.ndarray, "scans 3"]]:
-    """Poses of the scans of an unmeasured room, in parts that could not be laid on one another.
+    """Poses of the scans of an unknown place, accurate to centimetres and degrees: a start for an adjustment.
 
-    Scans that may be at more than one place are left out rather than guessed. Without odometry a scan needs two walls
-    that are not parallel, or a wall and a point, in common with what is known by then.
+    Scans whose pose is ambiguous are left out. Without odometry a scan needs two walls that are not parallel, or a wall
+    and a point, in common with the map.
 
     Args:
-        models: local models in the order of the way, lines and points in the robot frame.
+        models: local models in the order of the trajectory, lines and points in the robot frame.
         odometry: (scans, 3) world_from_robot (x, y, theta), metres and radians, drifting; NaN where there is none.
-        slip: standard deviation of odometry as a share of the way and of the turn.
-        margin: nats by which a place must be likelier than all others; with less, more scans are placed, also wrongly.
-        blur: 1 for a ring that may be centimetres off, less for one that is known better.
-        progress: called with (scans looked at, scans) now and then.
+        odometry_sd: standard deviation of odometry as a fraction of the distance and of the rotation.
+        margin: log-likelihood ratio, in nats, by which a pose must beat every other pose. A smaller margin registers
+            more scans, but some of them wrongly.
+        noise_scale: factor on the noise added to features: 1 for a ring that may be centimetres off, less for a
+            calibrated one.
+        progress: called with (scans processed, scans) now and then.
 
     Returns:
-        The parts, the one with the most scans first. Of each (scans, 3) world_from_robot (x, y, theta), metres and
-        radians, in a world of its own: its first scan is at the origin, or at its odometry pose if it has one; NaN
-        where a scan is not of this part.
+        One array per cluster of scans that could not be registered to each other, the largest cluster first. Each is
+        (scans, 3) world_from_robot in a world of its own, metres and radians: the first scan of the cluster is at the
+        origin, or at its odometry pose; NaN where a scan is not in the cluster. Empty if there is no usable scan.
 
     Raises:
         SonarError: odometry of another shape.
@@ -78,177 +56,239 @@ def place_parts(
     count = len(models)
     given = np.full((count, 3), np.nan) if odometry is None else np.array(odometry, dtype=np.float64)
     if given.shape != (count, 3):
-        raise SonarError(f"place: odometry of shape {given.shape}; allowed is ({count}, 3): x, y, theta for every scan")
+        raise SonarError(
+            f"register_scans: odometry of shape {given.shape}; allowed is ({count}, 3): x, y, theta for every scan"
+        )
     given[~np.isfinite(given).all(axis=1)] = np.nan
-    tracker = _Tracker([seen_of(model, blur=blur) for model in models], Motion(given, slip), margin)
-    # Scan after scan; where the way is lost, a map of its own begins.
-    parts = tracker.parts(progress)
-    # Maps that fit together become one; then what was left out is looked at again, before and behind being known.
-    parts = tracker.joined(parts)
-    parts = sorted(parts, key=lambda part: -int(part.placed.sum()))
-    return [_begun(part.poses, given) for part in parts]
+    scans = [scan_features(model, noise_scale=noise_scale) for model in models]
+    registration = _Registration(scans, MotionModel(given, odometry_sd), margin)
+    # 1. Scan after scan; a new cluster is started where the robot is lost.
+    clusters = registration.clusters(progress)
+    # 2. Clusters that align unambiguously are merged; then the remaining scans are tried again.
+    clusters = registration.merged(sorted(clusters, key=lambda one: -one.count))
+    clusters = sorted(clusters, key=lambda one: -one.count)
+    # 3. The first pose of each cluster defines its world.
+    return [_from_first(cluster.poses, given) for cluster in clusters]
 
 
-def place_more(
+def register_remaining(
     models: Sequence[LocalModel],
     poses: Float[np.ndarray, "scans 3"],
     odometry: Float[np.ndarray, "scans 3"] | None = None,
     *,
-    slip: float = ODOMETRY,
-    margin: float = MARGIN,
-    blur: float = 1.0,
+    odometry_sd: float = SETTINGS.odometry_sd,
+    margin: float = SETTINGS.margin,
+    noise_scale: float = 1.0,
 ) -> Float[np.ndarray, "scans 3"]:
-    """The same poses, with those scans that find their place in the map of the others by now.
+    """Register scans without a pose to the map of the scans that have one.
 
     Args:
-        models: as for ``place_parts``.
-        poses: world_from_robot of those that are placed, metres and radians; NaN for the others.
-        odometry: as for ``place_parts``.
-        slip: as for ``place_parts``.
-        margin: as for ``place_parts``.
-        blur: as for ``place_parts``.
+        models: as for ``register_scans``.
+        poses: (scans, 3) world_from_robot of the registered scans, metres and radians; NaN for the others.
+        odometry: as for ``register_scans``.
+        odometry_sd: as for ``register_scans``.
+        margin: as for ``register_scans``.
+        noise_scale: as for ``register_scans``.
 
     Returns:
-        (scans, 3); the poses that were given are as they were, NaN where a scan has no place yet.
+        (scans, 3): the given poses, unchanged, and those that were found; NaN for the remaining scans.
     """
     given = np.full((len(models), 3), np.nan) if odometry is None else np.array(odometry, dtype=np.float64)
-    tracker = _Tracker([seen_of(model, blur=blur) for model in models], Motion(given, slip), margin)
-    base = _Part(np.full((len(models), 3), np.nan), Places())
+    scans = [scan_features(model, noise_scale=noise_scale) for model in models]
+    registration = _Registration(scans, MotionModel(given, odometry_sd), margin)
+    base = _Cluster(len(models))
     for scan in np.flatnonzero(np.isfinite(poses[:, 0])):
-        base.take(int(scan), tracker.seen[scan], poses[scan])
-    free = ~base.placed
-    tracker.fill(base, free)
-    others = [part for part in tracker.parts(None, free & ~base.placed) if part.placed.sum() > 1]
-    return tracker.joined([base, *others], first=True)[0].poses
+        base.add(int(scan), scans[scan], poses[scan])
+    free = ~base.registered
+    registration.fill(base, free)
+    others = [one for one in registration.clusters(None, free & ~base.registered) if one.count > 1]
+    return registration.merged([base, *others])[0].poses
 
 
-def _begun(poses: Float[np.ndarray, "scans 3"], given: Float[np.ndarray, "scans 3"]) -> Float[np.ndarray, "scans 3"]:
-    """The same with the first placed scan at the origin, or where the odometry has it."""
+def _from_first(
+    poses: Float[np.ndarray, "scans 3"], odometry: Float[np.ndarray, "scans 3"]
+) -> Float[np.ndarray, "scans 3"]:
+    """Poses in the world in which the first registered scan is at its odometry pose, or at the origin."""
     first = int(np.flatnonzero(np.isfinite(poses[:, 0]))[0])
-    start = given[first] if np.isfinite(given[first, 0]) else np.zeros(3)
-    return composed(composed(start, inverse(poses[first])), poses)
+    start = odometry[first] if np.isfinite(odometry[first, 0]) else np.zeros(3)
+    return compose(compose(start, inverse(poses[first])), poses)
 
 
-class _Part(NamedTuple):
-    """Scans that are placed with respect to each other."""
+class _Cluster:
+    """Scans that are registered to each other, and their map."""
 
-    poses: Float[np.ndarray, "scans 3"]
-    """NaN where a scan is not of this part."""
-    map: Places
+    def __init__(self, scans: int) -> None:
+        self.poses = np.full((scans, 3), np.nan)
+        self.map = no_features()
 
     @property
-    def placed(self) -> Bool[np.ndarray, " scans"]:
-        """Which scans are of this part."""
+    def registered(self) -> Bool[np.ndarray, " scans"]:
         return np.isfinite(self.poses[:, 0])
 
-    def take(self, scan: int, seen: Seen, pose: Float[np.ndarray, "3"]) -> None:
-        """A scan is of this part."""
+    @property
+    def count(self) -> int:
+        return int(self.registered.sum())
+
+    def add(self, scan: int, features: Features, pose: Float[np.ndarray, "3"]) -> None:
+        """Add a scan at a pose, and fuse its features with the map."""
         self.poses[scan] = pose
-        known = explained(self.map, seen, pose[None])
-        self.map.add(seen, pose, known.wall[0], known.point[0])
+        match = pose_log_likelihood(self.map, features, pose[None])
+        self.map = fuse_scan(self.map, features, pose, match.wall[0], match.point[0])
 
 
-class _Tracker:
-    """Places scans in maps."""
+class _Registration:
+    """The scans of a log, and how they are added to clusters."""
 
-    def __init__(self, seen: list[Seen], motion: Motion, margin: float):
-        self.seen, self.motion, self.margin = seen, motion, margin
-        far = np.concatenate([np.zeros(1), *(one.heard[:, 0] for one in seen)])
-        self.reach = 0.85 * float(np.quantile(far, 0.98))  # as near as this walls are surely heard
+    def __init__(self, scans: list[Features], motion: MotionModel, margin: float):
+        self.scans, self.motion, self.margin = scans, motion, margin
+        distance = np.concatenate([np.zeros(1), *(one.detections[:, 0] for one in scans)])
+        self.reach = SETTINGS.reach_factor * float(np.quantile(distance, SETTINGS.range_quantile))
 
-    def parts(
+    def clusters(
         self, progress: Callable[[int, int], None] | None, free: Bool[np.ndarray, " scans"] | None = None
-    ) -> list[_Part]:
-        """The log in pieces, or those scans of it that are free: a new one begins where several find no place."""
-        count, parts = len(self.seen), []
+    ) -> list[_Cluster]:
+        """Clusters of the free scans (all if left out), each from its first scan on."""
+        count, clusters = len(self.scans), []
         free = np.ones(count, dtype=bool) if free is None else free.copy()
         for start in range(count):
-            if not free[start] or not self._begins(start):
+            if not free[start] or not self._can_start(start):
                 continue
-            part = self._begun_at(start, free, progress)
-            self.fill(part, free)
-            free &= ~part.placed
-            parts.append(part)
+            cluster = self._grown_from(start, free, progress)
+            self.fill(cluster, free)
+            free &= ~cluster.registered
+            clusters.append(cluster)
         if progress is not None:
             progress(count, count)
-        return [part for part in parts if part.placed.sum() > 1] or parts[:1]
+        return [one for one in clusters if one.count > 1] or clusters[:1]
 
-    def _begins(self, scan: int) -> bool:
-        """Whether a map can begin with this scan: two directions, unless odometry holds the free one."""
-        seen = self.seen[scan]
-        spread = np.abs(np.sin(seen.theta[:, None] - seen.theta)).max(initial=0.0) > NOT_PARALLEL
-        enough = spread or (len(seen.theta) and len(seen.point)) or len(seen.point) > 1
-        return bool(enough) or bool(len(seen.theta) and self.motion.known(scan))
+    def _can_start(self, scan: int) -> bool:
+        """Whether a scan determines a frame: by two directions, or by one and odometry."""
+        features = self.scans[scan]
+        walls, points = len(features.theta), len(features.point)
+        sine = np.abs(np.sin(features.theta[:, None] - features.theta)).max(initial=0.0)
+        enough = sine > SETTINGS.crossing_sine or (walls and points) or points > 1
+        return bool(enough) or bool(walls and self.motion.has_odometry(scan))
 
-    def _begun_at(
+    def _grown_from(
         self, start: int, free: Bool[np.ndarray, " scans"], progress: Callable[[int, int], None] | None
-    ) -> _Part:
-        """A part from this scan on, until the way is lost."""
-        count, lost = len(self.seen), 0
-        part = _Part(np.full((count, 3), np.nan), Places())
-        part.take(start, self.seen[start], np.zeros(3))
+    ) -> _Cluster:
+        """A cluster from one scan on, until the robot is lost."""
+        count, lost = len(self.scans), 0
+        cluster = _Cluster(count)
+        cluster.add(start, self.scans[start], np.zeros(3))
         for scan in range(start + 1, count):
-            found = free[scan] and self.find(part, scan)
+            found = free[scan] and self._register(cluster, scan)
             lost = 0 if found else lost + 1
             if progress is not None:
                 progress(scan, count)
-            if lost >= LOST:
+            if lost >= SETTINGS.max_lost:
                 break
-        return part
+        return cluster
 
-    def find(self, part: _Part, scan: int) -> bool:
-        """Take a scan into a part, if its place there is not open."""
-        seen = self.seen[scan]
-        if not len(seen.theta) + len(seen.point):
+    def _register(self, cluster: _Cluster, scan: int) -> bool:
+        """Add a scan to a cluster if its pose is unambiguous; whether it was."""
+        features = self.scans[scan]
+        if not len(features.theta) + len(features.point):
             return False
-        placed = np.flatnonzero(part.placed)
-        split = int(np.searchsorted(placed, scan))
-        anchors = placed[max(split - 1, 0) : split + 1]
-        priors = self.motion.priors(part.poses, anchors, scan)
-        margin = self.margin + LATE * (int(np.abs(anchors - scan).min()) - 1)
-        pose = only_pose(seen, part.map, priors, reach=self.reach, margin=margin)
+        inside = np.flatnonzero(cluster.registered)
+        split = int(np.searchsorted(inside, scan))
+        anchors = inside[max(split - 1, 0) : split + 1]
+        priors = self.motion.priors(cluster.poses, anchors, scan)
+        margin = self.margin + SETTINGS.margin_per_gap * (int(np.abs(anchors - scan).min()) - 1)
+        pose = unambiguous_pose(features, cluster.map, priors, reach=self.reach, margin=margin)
         if pose is not None:
-            part.take(scan, seen, pose)
+            cluster.add(scan, features, pose)
         return pose is not None
 
-    def fill(self, part: _Part, free: Bool[np.ndarray, " scans"]) -> None:
-        """Look again for those that were left out near this part's scans, backward and forward, until none is found."""
+    def fill(self, cluster: _Cluster, free: Bool[np.ndarray, " scans"]) -> None:
+        """Try the free scans near a cluster again, backward and forward, until none is added."""
         for turn in range(4):
-            inside, scans = np.flatnonzero(part.placed), np.arange(len(free))
+            inside, scans = np.flatnonzero(cluster.registered), np.arange(len(free))
             behind = np.searchsorted(inside, scans)
             beside = inside[np.clip(np.stack([behind - 1, behind]), 0, len(inside) - 1)]
-            near = np.abs(beside - scans).min(axis=0)
-            wanted = np.flatnonzero(free & ~part.placed & (near <= LOST))
-            more = [self.find(part, int(scan)) for scan in (wanted if turn % 2 else wanted[::-1])]
-            if turn and not any(more):
+            gap = np.abs(beside - scans).min(axis=0)
+            wanted = np.flatnonzero(free & ~cluster.registered & (gap <= SETTINGS.max_lost))
+            added = [self._register(cluster, int(scan)) for scan in (wanted if turn % 2 else wanted[::-1])]
+            if turn and not any(added):
                 break
 
-    def joined(self, parts: list[_Part], *, first: bool = False) -> list[_Part]:
-        """Lay smaller parts on the largest, or all on the first, wherever that is unambiguous."""
-        parts = parts if first else sorted(parts, key=lambda part: -int(part.placed.sum()))
+    def merged(self, clusters: list[_Cluster]) -> list[_Cluster]:
+        """Merge the other clusters into the first one wherever the alignment is unambiguous."""
         number = 1
-        while number < len(parts):
-            moved = self._laid_on(parts[0], parts[number])
+        while number < len(clusters):
+            base = clusters[0]
+            moved = self._aligned(base, clusters[number])
             if moved is None:
                 number += 1
                 continue
             for scan in np.flatnonzero(np.isfinite(moved[:, 0])):
-                parts[0].take(int(scan), self.seen[scan], moved[scan])
-            parts = parts[:number] + parts[number + 1 :]
-            taken = np.any([part.placed for part in parts], axis=0)
-            self.fill(parts[0], ~taken)
-            # With more known, parts that were open may not be so any more.
+                base.add(int(scan), self.scans[scan], moved[scan])
+            clusters = clusters[:number] + clusters[number + 1 :]
+            taken = np.any([one.registered for one in clusters], axis=0)
+            self.fill(base, ~taken)
+            # The map has grown: clusters that were ambiguous may not be any more.
             number = 1
-        return parts
+        return clusters
 
-    def _laid_on(self, base: _Part, other: _Part) -> Float[np.ndarray, "scans 3"] | None:
-        """The other part's poses in the base's frame, or None where it is open how they lie."""
-        mine, theirs = np.flatnonzero(base.placed), np.flatnonzero(other.placed)
+    def _aligned(self, base: _Cluster, other: _Cluster) -> Float[np.ndarray, "scans 3"] | None:
+        """Poses of another cluster in the frame of the base, or None where the alignment is ambiguous."""
+        mine, theirs = np.flatnonzero(base.registered), np.flatnonzero(other.registered)
         gap = np.abs(mine[:, None] - theirs)
         a, b = np.unravel_index(int(gap.argmin()), gap.shape)
         anchor = int(theirs[b])
         priors = self.motion.priors(base.poses, mine[a : a + 1], anchor)
-        margin = self.margin + LATE * min(int(gap[a, b]), LOST)
+        margin = self.margin + SETTINGS.margin_per_gap * min(int(gap[a, b]), SETTINGS.max_lost)
         other_from_anchor = other.poses[anchor]
-        pose = only_pose(other.map.as_seen(other_from_anchor), base.map, priors, reach=0.0, margin=margin)
-        return None if pose is None else composed(composed(pose, inverse(other_from_anchor)), other.poses)
+        scan = map_as_scan(other.map, other_from_anchor)
+        pose = unambiguous_pose(scan, base.map, priors, reach=0.0, margin=margin)
+        return None if pose is None else compose(compose(pose, inverse(other_from_anchor)), other.poses)
+
+
+def unambiguous_pose(
+    scan: Features, known: Features, priors: list[MotionPrior], *, reach: float, margin: float
+) -> Float[np.ndarray, "3"] | None:
+    """The only pose at which a scan agrees with a map, map_from_robot, or None.
+
+    Args:
+        scan: features of the scan in the robot frame.
+        known: the map.
+        priors: components of the prior, the widest one last.
+        reach: distance within which walls are surely detected, metres; 0: no negative evidence.
+        margin: nats by which the best hypothesis must beat every different one.
+    """
+    widest = priors[-1]
+    near = known.within(widest.pose[:2], 3 * widest.sd[0] + 2 * scan.radius)
+    candidates = [_refined_hypotheses(scan, near, prior, reach) for prior in priors]
+    poses, nats, information = (np.concatenate(part) for part in zip(*candidates, strict=True))
+    if not len(poses):
+        return None
+    best = int(nats.argmax())
+    offset = subtract_poses(poses, poses[best])
+    different = np.linalg.norm(offset[:, :2], axis=1) > SETTINGS.distinct_pose[0]
+    different |= np.abs(offset[:, 2]) > SETTINGS.distinct_pose[1]
+    if nats[different].max(initial=-np.inf) > nats[best] - margin:
+        return None
+    cov = np.linalg.inv(information[best])
+    position_sd, heading_sd = SETTINGS.max_pose_sd
+    if np.linalg.eigvalsh(cov[:2, :2])[-1] > position_sd**2 or cov[2, 2] > heading_sd**2:
+        return None
+    return wrap_pose(poses[best])
+
+
+def _refined_hypotheses(
+    scan: Features, known: Features, prior: MotionPrior, reach: float
+) -> tuple[Float[np.ndarray, "poses 3"], Float[np.ndarray, " poses"], Float[np.ndarray, "poses 3 3"]]:
+    """The best hypotheses under a prior: poses, their evidence in nats, and their information."""
+    poses = pose_hypotheses(scan, known, prior.pose)
+    poses = poses[np.linalg.norm(poses[:, :2] - prior.pose[:2], axis=1) < 3.5 * prior.sd[0]]
+    score = pose_log_likelihood(known, scan, poses).log_likelihood + prior.log_density(poses)
+    poses = poses[np.argsort(-score, kind="stable")[: SETTINGS.refined_poses]]
+    # Odometry is a measurement; the usual motion of robots only damps the steps.
+    mean = None if prior.any_turn else prior.pose
+    poses = refine_poses(known, scan, poses, prior.information(), prior_mean=mean)
+    found = pose_log_likelihood(known, scan, poses)
+    information = found.information + prior.information()
+    volume = 1.5 * np.log(2 * np.pi) - np.linalg.slogdet(information)[1] / 2
+    start = prior.pose[:2] if prior.straight else None
+    against = scan_negative_evidence(known, scan, poses, found.wall, reach=reach, start=start)
+    return poses, found.log_likelihood + prior.log_density(poses) + volume - against, information

@@ -14,10 +14,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 
-from jaxsonar.detection.extract import Line, LocalModel
+from jaxsonar.detection.local_map import Line, LocalModel
 from jaxsonar.evaluation.laser_segments import PolygonalModel
 from jaxsonar.floor_plans.room import Room
-from jaxsonar.geometry.se2 import to_world
+from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.mapping.global_map import POINT_KINDS, GlobalMap
 from jaxsonar.occupancy.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from jaxsonar.reports.plot_style import (
@@ -69,10 +69,10 @@ def modeling_figure(
     for order, scan in enumerate(scans):
         colour, pose = PALETTE[order % len(PALETTE)], poses[scan]
         for line in models[scan].lines:
-            segment = to_world(pose, line.segment.astype(float))
+            segment = transform_points(pose, line.segment.astype(float))
             if near is not None and np.linalg.norm(segment.mean(axis=0) - near) > within:
                 continue
-            rays = to_world(pose, reflection_lines(ring, line))
+            rays = transform_points(pose, reflection_lines(ring, line))
             axes.add_collection(LineCollection(list(rays[1:-1]), colors=colour, linewidths=0.35, zorder=4))
             outer = [*rays[:1], *rays[-1:]]
             axes.add_collection(LineCollection(outer, colors=colour, linewidths=1.1, zorder=4))
@@ -83,7 +83,7 @@ def modeling_figure(
             pose[0], pose[1], str(scan + 1), color=colour, fontweight="bold", ha="center", va="center", zorder=7,
             path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )  # fmt: skip
-        shown.append(to_world(pose, np.asarray(ring.position)))
+        shown.append(transform_points(pose, np.asarray(ring.position)))
         handles.append(Line2D([], [], color=colour, lw=4, label=f"line elements from position {scan + 1}"))
     handles += [
         Line2D([], [], color=WALL, lw=1.1, label="outermost reflection lines"),
@@ -135,7 +135,7 @@ def aggregated_segments(
 ) -> Float[np.ndarray, "segments 2 2"]:
     """The segments of all scans in the world frame, metres, scan by scan (paper, section 5)."""
     found = [
-        to_world(pose, line.segment.astype(float))
+        transform_points(pose, line.segment.astype(float))
         for model, pose in zip(models, poses, strict=True)
         for line in model.lines
     ]

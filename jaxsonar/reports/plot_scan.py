@@ -18,10 +18,12 @@ from matplotlib.patches import Wedge
 from matplotlib.ticker import MultipleLocator
 
 from jaxsonar import kernels
+from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.detection.connected_components import label_components
-from jaxsonar.detection.extract import LocalModel, arcs_of, settings_for
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.settings import hough_settings
 from jaxsonar.floor_plans.room import Room
-from jaxsonar.geometry.se2 import to_world
+from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.reports.plot_style import (
     CROSS,
     DIRECT,
@@ -38,7 +40,8 @@ from jaxsonar.reports.plot_style import (
     styled,
     wall_handle,
 )
-from jaxsonar.scans.echo_batches import FlatEchoes
+from jaxsonar.scans.echo_batches import pack
+from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -128,10 +131,10 @@ def lines_figure(
     for number, line in enumerate(model.lines, start=1):
         along = _tangent(line.theta)
         foot = line.rho * np.array([np.cos(line.theta), np.sin(line.theta)])
-        infinite = to_world(pose, foot + np.array([[-1.6], [1.6]]) * along)
+        infinite = transform_points(pose, foot + np.array([[-1.6], [1.6]]) * along)
         axes.plot(*infinite.T, color=LINE, lw=0.8, ls=(0, (4, 3)), zorder=4, scalex=False, scaley=False)
-        axes.plot(*to_world(pose, line.segment).T, color=LINE, lw=3.2, solid_capstyle="butt", zorder=5)
-        place = to_world(pose, (foot * (1 + 0.12 / max(line.rho, 0.12)))[None])[0]
+        axes.plot(*transform_points(pose, line.segment).T, color=LINE, lw=3.2, solid_capstyle="butt", zorder=5)
+        place = transform_points(pose, (foot * (1 + 0.12 / max(line.rho, 0.12)))[None])[0]
         axes.text(place[0], place[1], str(number), color=LINE, fontweight="bold", ha="center", va="center", zorder=6)
     handles.append(Line2D([], [], color=LINE, lw=0.8, ls=(0, (4, 3)), label="the same line, continued"))
     handles += _draw_points(axes, model, pose)
@@ -144,9 +147,10 @@ def accumulator_figure(
     ring: Ring, scan: Scan, model: LocalModel, *, settings: kernels.HoughSettings | None = None
 ) -> Figure:
     """The accumulator before and after the low pass, and the components above the threshold (paper, section 4)."""
-    settings = settings_for(ring, settings)
-    packed = next(FlatEchoes.from_log(ring, scan.as_log())[0].steps(1)).packed
-    arcs = arcs_of(ring, settings)
+    settings = hough_settings(ring, settings)
+    echoes, _ = FlatEchoes.from_log(ring, scan.as_log())
+    packed = next(pack(echoes, settings.cells)).packed
+    arcs = arc_tables(ring, settings).arcs
     votes, smooth = (np.asarray(image)[0] for image in kernels.accumulators(arcs, packed, settings=settings))
     level = float(arcs.level)
     labels = np.abs(label_components((smooth > level)[None])[0][0, :-1])
@@ -211,7 +215,7 @@ def _draw_points(axes: Axes, model: LocalModel, pose: Float[np.ndarray, "3"]) ->
     for marker, (label, places) in kinds.items():
         style = {"color": LINE, "marker": marker, "ls": "", "ms": 7, "mfc": "white", "mew": 1.8, "label": label}
         if places:
-            axes.plot(*to_world(pose, np.array(places)).T, **style, zorder=6)
+            axes.plot(*transform_points(pose, np.array(places)).T, **style, zorder=6)
             handles.append(Line2D([], [], **style))
     return handles
 
@@ -233,7 +237,7 @@ def _draw_arcs(axes: Axes, ring: Ring, scan: Scan, pose: Float[np.ndarray, "3"],
         (path[heard & ~direct], reach[heard & ~direct], CROSS, 0.9),
         (path[heard & direct], reach[heard & direct], DIRECT, 1.1),
     ):
-        arcs = to_world(pose, arc_points(ring, rows, ranges))
+        arcs = transform_points(pose, arc_points(ring, rows, ranges))
         axes.add_collection(
             LineCollection(list(arcs), colors=colour, linewidths=width, alpha=1.0 if colour == FAINT else alpha)
         )

@@ -1,8 +1,9 @@
 """The ring: where the sensors sit, which of them hear each other, and in which directions (paper, section 3)."""
 
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Hashable, Sequence
+from functools import cached_property, lru_cache
 from operator import index
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -195,6 +196,25 @@ class Ring(eqx.Module):
     def echo_paths(self) -> kernels.EchoPaths:
         """Geometry of every path, in the order of ``paths``."""
         return kernels.echo_paths(self.sensors)
+
+    @cached_property
+    def cache(self) -> dict[Hashable, Any]:
+        """Values that other packages derive from this ring and compute once, by keys of their own.
+
+        A changed copy of the ring starts with an empty cache.
+        """
+        return {}
+
+    @cached_property
+    def exact_paths(self) -> kernels.EchoPaths:
+        """``echo_paths`` as read-only NumPy arrays in double precision, computed once per ring."""
+
+        def exact(leaf: jax.Array) -> np.ndarray:
+            array = np.array(leaf, dtype=np.float64)
+            array.setflags(write=False)
+            return array
+
+        return jax.tree.map(exact, self.echo_paths)
 
     @property
     def virtual_sensors(self) -> Float[AnyArray, "paths 2"]:

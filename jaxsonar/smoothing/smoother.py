@@ -13,16 +13,19 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.detection.extract import LocalModel, check_sigma, local_models
-from jaxsonar.estimation.alternation import AGAIN, MAPS, Round, alternated
-from jaxsonar.estimation.landmark_map import Surroundings, seen_world, surroundings
-from jaxsonar.estimation.odometry_noise import Slip
-from jaxsonar.estimation.robust_adjustment import Data, Settled, State, approach, settle
+from jaxsonar.detection.extract import local_models
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.settings import check_sigma
+from jaxsonar.estimation.alternation import AGAIN, MAPS, AlternationResult, alternate
+from jaxsonar.estimation.batch_data import BatchData
+from jaxsonar.estimation.landmark_map import LandmarkMap, map_with_tentative_points, landmark_map_of
+from jaxsonar.estimation.odometry_noise import OdometryNoise
+from jaxsonar.estimation.robust_adjustment import AdjustmentResult, AdjustmentState, anneal, gnc_adjust
 from jaxsonar.estimation.sparse_lm import known
-from jaxsonar.geometry.se2 import composed, relative
+from jaxsonar.geometry.se2 import compose, relative
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.registration.sequential import place_more
+from jaxsonar.registration.sequential import register_remaining
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import check_window
 from jaxsonar.sensors.ring import Ring
@@ -93,7 +96,7 @@ def smooth(
     window: float | None = None,
     speed: bool = False,
     scale: bool = False,
-    slip: Slip | None = None,
+    slip: OdometryNoise | None = None,
     models: Sequence[LocalModel] | None = None,
     passages: Passages | None = None,
     progress: Callable[[str], None] | None = None,
@@ -128,7 +131,7 @@ def smooth(
         say("local models")
         models = list(local_models(ring, log, sigma=sigma))
     job = _Job(
-        ring, log, measured, modes, slip or Slip(), sigma, window, models, passages, int(_placed(given).argmax()), say
+        ring, log, measured, modes, slip or OdometryNoise(), sigma, window, models, passages, int(_placed(given).argmax()), say
     )
     # 1. Maps and least squares in turn, from the poses as they came.
     best = job.settled(_led(given, measured))
@@ -138,10 +141,10 @@ def smooth(
         if _placed(best.poses).all():
             break
         say("looking again for scans without a place")
-        more = place_more(models or [], best.poses, measured, margin=margin, blur=BLUR)
+        more = register_remaining(models or [], best.poses, measured, margin=margin, noise_scale=BLUR)
         if _placed(more).sum() > _placed(best.poses).sum():
             fit = job.settled(more)
-            best = fit if fit.round.used > best.round.used and fit.sigma < _NOISIER * best.sigma else best
+            best = fit if fit.round.explained_count > best.round.explained_count and fit.sigma < _NOISIER * best.sigma else best
     # 3. How well all of it is known.
     say("covariances")
     return job.result(best)
@@ -150,15 +153,15 @@ def smooth(
 class _Fit(NamedTuple):
     """Poses that settled."""
 
-    data: Data
-    round: Round
+    data: BatchData
+    round: AlternationResult
     poses: Float[np.ndarray, "scans 3"]
     """NaN where a scan has no place."""
     heard: Int[np.ndarray, " scans"]
 
     @property
     def sigma(self) -> float:
-        return self.round.settled.sigma
+        return self.round.adjustment.sigma
 
 
 @dataclass(frozen=True)
@@ -169,7 +172,7 @@ class _Job:
     log: Log
     odometry: Float[np.ndarray, "scans 3"]
     modes: RingModes
-    slip: Slip
+    odometry_noise: OdometryNoise
     sigma: float | None
     window: float | None
     models: Sequence[LocalModel] | None
@@ -193,46 +196,46 @@ class _Job:
             self.say("again, less of what broke the odometry")
             again = self._settled(np.where(_placed(fit.poses)[:, None], poses, np.nan), parted)
             left = np.setdiff1d(self._broken(again), parted)
-            if len(left) >= len(broken) or again.round.used * _GROWN < fit.round.used:
+            if len(left) >= len(broken) or again.round.explained_count * _GROWN < fit.round.explained_count:
                 break
             fit, broken, parted = again, left, np.union1d(parted, left)
         return fit
 
     def _broken(self, fit: _Fit) -> Int[np.ndarray, " some"]:
         """Scans from which the odometry to the next one is broken."""
-        data, state, rows = fit.data, fit.round.settled.state, fit.data.rows[0]
+        data, state, rows = fit.data, fit.round.adjustment.state, fit.data.scan_rows[0]
         told, change = data.odometry[:-1].copy(), self.modes.columns @ state.coordinates
         if len(change) > 3 * self.ring.count + 1:
             told *= np.exp(-change[[-2, -2, -1]])
         last = len(rows) - 1
-        return rows[broken_steps(state.poses[: last + 1], told[:last], data.linked[:last])]
+        return rows[broken_steps(state.poses[: last + 1], told[:last], data.odometry_information[:last])]
 
     def _settled(self, poses: Float[np.ndarray, "scans 3"], broken: Int[np.ndarray, " some"] = _NONE) -> _Fit:
         log = replace(self.log, pose=poses)
-        data = _free(Data.of(self.ring, [log], [self.odometry], self.slip, silent=True), self.first)
-        data = replace(data, together=_TOGETHER if self.window is None else 1, sparse=True)
+        data = _free(BatchData.from_logs(self.ring, [log], [self.odometry], self.odometry_noise, keep_empty_scans=True), self.first)
+        data = replace(data, min_echoes_per_landmark=_TOGETHER if self.window is None else 1, sparse=True)
         if self.models is not None:
-            data = replace(data, of_wall=of_own_walls(self.ring, data, self.models))
-        if data.scans > _MANY:
-            data = replace(data, steps=_FEW_STEPS)
+            data = replace(data, wall_explained=of_own_walls(self.ring, data, self.models))
+        if data.scan_count > _MANY:
+            data = replace(data, max_iterations=_FEW_STEPS)
         found = self._alternated(data, log, Breaks(broken, self._rows))
         if found is None:
             raise SonarError("smooth: no echo fits the walls; is it the right ring, are poses and units right?")
-        rows = data.rows[0]
+        rows = data.scan_rows[0]
         heard, echoes = np.zeros((2, len(log)), dtype=np.int64)
-        heard[rows] = found.settled.used.sum(axis=1)[: len(rows)]
+        heard[rows] = found.adjustment.used.sum(axis=1)[: len(rows)]
         echoes[rows] = np.isfinite(data.reported).sum(axis=1)[: len(rows)]
         odd = self._odd(data, heard, echoes)
-        now = data.placed([log], found.settled.state.poses)[0].pose
+        now = data.logs_with_poses([log], found.adjustment.state.poses)[0].pose
         return _Fit(data, found, np.where(odd[:, None], np.nan, now), np.where(odd, 0, heard))
 
     def _odd(
-        self, data: Data, heard: Int[np.ndarray, " scans"], echoes: Int[np.ndarray, " scans"]
+        self, data: BatchData, heard: Int[np.ndarray, " scans"], echoes: Int[np.ndarray, " scans"]
     ) -> Bool[np.ndarray, " scans"]:
         """Scans that nothing holds where they are: too few echoes fit, and no odometry leads to them."""
-        rows = data.rows[0]
+        rows = data.scan_rows[0]
         linked = np.zeros(len(heard), dtype=bool)
-        tied = (data.linked[: len(rows), 0] > 0)[:-1] if len(rows) else np.zeros(0, dtype=bool)
+        tied = (data.odometry_information[: len(rows), 0] > 0)[:-1] if len(rows) else np.zeros(0, dtype=bool)
         linked[rows[:-1]] |= tied
         linked[rows[1:]] |= tied
         usual = heard.sum() / max(echoes.sum(), 1)
@@ -241,9 +244,9 @@ class _Job:
         odd[self.first] = False
         return odd
 
-    def _mapped(self, data: Data, log: Log, state: State, breaks: Breaks) -> GlobalMap:
+    def _mapped(self, data: BatchData, log: Log, state: AdjustmentState, breaks: Breaks) -> GlobalMap:
         ring = self._heard_with(state)
-        world = seen_world(ring, data.placed([log], state.poses)[0], window=self.window, models=self.models)
+        world = map_with_tentative_points(ring, data.logs_with_poses([log], state.poses)[0], window=self.window, models=self.models)
         if not len(world):
             raise SonarError("smooth: no wall found; allowed are scans of a place with straight walls in reach")
         world = world if self.passages is None else self.passages.parted(world, self._rows)
@@ -254,52 +257,52 @@ class _Job:
         """Of the scans by their numbers."""
         return {int(number): row for row, number in enumerate(self.log.scan)}
 
-    def _around(self, data: Data, worlds: list[GlobalMap], breaks: Breaks) -> Surroundings:
+    def _around(self, data: BatchData, worlds: list[GlobalMap], breaks: Breaks) -> LandmarkMap:
         """The reflectors of the only map, and who may hear them."""
-        around = surroundings(worlds, tied=False)
+        around = landmark_map_of(worlds, tie_corners=False)
         if self.passages is None and not len(breaks.steps):
             return around
-        world, rows = worlds[0], data.rows[0]
+        world, rows = worlds[0], data.scan_rows[0]
         heard = breaks.heard_by(world, len(self.log))
         if self.passages is not None:
             heard &= self.passages.heard_by(world, self._rows)[self.passages.part]
         heard_by = np.zeros((len(data.poses), len(around.world)), dtype=bool)
         heard_by[: len(rows), : heard.shape[1]] = heard[rows]
-        return around._replace(heard_by=heard_by)
+        return around._replace(visible=heard_by)
 
-    def _alternated(self, data: Data, log: Log, breaks: Breaks) -> Round | None:
+    def _alternated(self, data: BatchData, log: Log, breaks: Breaks) -> AlternationResult | None:
         """Map and least squares in turn; at first the poses stay near where they began, until the map has shape."""
-        near = replace(data, anchored=np.maximum(data.anchored, 1 / np.square(_NEAR)))
-        state = State(np.zeros(self.modes.columns.shape[1]), data.poses, surroundings([], tied=False))
+        near = replace(data, prior_information=np.maximum(data.prior_information, 1 / np.square(_NEAR)))
+        state = AdjustmentState(np.zeros(self.modes.columns.shape[1]), data.poses, landmark_map_of([], tie_corners=False))
         self.say("first map")
-        start = state._replace(around=self._around(data, [self._mapped(data, log, state, breaks)], breaks))
+        start = state._replace(landmark_map=self._around(data, [self._mapped(data, log, state, breaks)], breaks))
         with jax.enable_x64(True):
-            start = approach(self.ring, near, self.modes, start, widest=_WIDEST, sigma=self.sigma)
-        return alternated(
+            start = anneal(self.ring, near, self.modes, start, initial_scale=_WIDEST, sigma=self.sigma)
+        return alternate(
             start,
-            mapped=lambda state: [self._mapped(data, log, state, breaks)],
-            settle=lambda state, widest: self._settle(data, state, widest),
-            widest=AGAIN,
-            say=self.say,
-            maps=_FEW_MAPS if data.scans > _MANY else MAPS,
-            around=lambda worlds: self._around(data, worlds, breaks),
+            build_maps=lambda state: [self._mapped(data, log, state, breaks)],
+            adjust=lambda state, widest: self._settle(data, state, widest),
+            initial_scale=AGAIN,
+            progress=self.say,
+            max_maps=_FEW_MAPS if data.scan_count > _MANY else MAPS,
+            landmarks_of=lambda worlds: self._around(data, worlds, breaks),
         )
 
-    def _settle(self, data: Data, state: State, widest: float) -> Settled:
+    def _settle(self, data: BatchData, state: AdjustmentState, widest: float) -> AdjustmentResult:
         """In double precision."""
         with jax.enable_x64(True):
-            return settle(self.ring, data, self.modes, state, widest=widest, poses_free=True, sigma=self.sigma)
+            return gnc_adjust(self.ring, data, self.modes, state, initial_scale=widest, poses_free=True, sigma=self.sigma)
 
-    def _heard_with(self, state: State) -> Ring:
+    def _heard_with(self, state: AdjustmentState) -> Ring:
         """The ring with the speed of sound so far."""
         faster = float(np.exp((self.modes.columns @ state.coordinates)[self.ring.count]))
         return replace(self.ring, speed_of_sound=float(self.ring.speed_of_sound) * faster)
 
     def result(self, fit: _Fit) -> Smoothed:
         """With covariances."""
-        found, rows = fit.round.settled, fit.data.rows[0]
+        found, rows = fit.round.adjustment, fit.data.scan_rows[0]
         with jax.enable_x64(True):
-            cov = known(found.problem, found.adjusted.unknowns)
+            cov = known(found.problem, found.solution.unknowns)
         pose_cov = np.full((len(self.log), 3, 3), np.nan)
         pose_cov[rows] = cov.poses[: len(rows)]
         pose_cov[np.isnan(fit.poses[:, 0])] = np.nan
@@ -312,8 +315,8 @@ class _Job:
             poses=fit.poses,
             pose_cov=pose_cov,
             heard=fit.heard,
-            world=settled_map(fit.round.worlds[0], found, cov.reflectors),
-            used=float(found.used.sum() / max(fit.data.echoes, 1)),
+            world=settled_map(fit.round.maps[0], found, cov.reflectors),
+            used=float(found.used.sum() / max(fit.data.echo_count, 1)),
             sigma=found.sigma,
             ring=ring,
             speed_of_sound_sd=float(sd[count] * ring.speed_of_sound),
@@ -333,11 +336,11 @@ def _modes(ring: Ring, *, speed: bool, scale: bool) -> RingModes:
     return RingModes(columns, (*modes.names, "way", "turn"))
 
 
-def _free(data: Data, first: int) -> Data:
+def _free(data: BatchData, first: int) -> BatchData:
     """With all poses free but that of one scan, and reflectors that may go as far."""
     anchored = np.tile(1 / np.square(_LOOSE), (len(data.poses), 1))
-    anchored[int(np.flatnonzero(data.rows[0] == first)[0])] = 1 / _ANCHOR**2
-    return replace(data, anchored=anchored, reach=_LOOSE[0])
+    anchored[int(np.flatnonzero(data.scan_rows[0] == first)[0])] = 1 / _ANCHOR**2
+    return replace(data, prior_information=anchored, landmark_prior_sd=_LOOSE[0])
 
 
 def _led(poses: Float[np.ndarray, "scans 3"], odometry: Float[np.ndarray, "scans 3"]) -> Float[np.ndarray, "scans 3"]:
@@ -347,7 +350,7 @@ def _led(poses: Float[np.ndarray, "scans 3"], odometry: Float[np.ndarray, "scans
         return out
     for row in np.flatnonzero(~_placed(poses) & _placed(odometry)):
         near = known[np.argmin(np.abs(known - row))]
-        out[row] = composed(poses[near], relative(odometry[near], odometry[row]))
+        out[row] = compose(poses[near], relative(odometry[near], odometry[row]))
     return out
 
 

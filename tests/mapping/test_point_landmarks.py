@@ -244,7 +244,7 @@ def shut(gaps, theta):
 
 def test_two_walls_end_at_the_corner_between_them():
     walls = snap_endpoints(walls_of([[0, 0], [1.6, 0]], [[2, 0.5], [2, 2]]), points_at([2.0, 0.001]), shut)
-    for segment in walls.segments:
+    for segment in walls.endpoints:
         assert np.linalg.norm(segment - [2.0, 0.0], axis=-1).min() < 0.002
     assert np.sort(walls.length) == pytest.approx([2.0, 2.0], abs=0.005)
 
@@ -257,7 +257,7 @@ def test_feet_beyond_the_corner_are_taken_back():
 @pytest.mark.parametrize("position", [[2.0, 0.1], [3.6, 0.0], [1.0, 0.0], [0.8, 0.3]])
 def test_other_points_end_nothing(place):
     walls = walls_of([[0, 0], [1.6, 0]])
-    assert snap_endpoints(walls, points_at(place), shut).segments.tolist() == walls.segments.tolist()
+    assert snap_endpoints(walls, points_at(place), shut).endpoints.tolist() == walls.endpoints.tolist()
     assert snap_endpoints(walls, points_at(), shut) is walls
     assert len(snap_endpoints(walls_of(), points_at(place), shut)) == 0
 

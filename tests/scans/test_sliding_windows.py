@@ -417,11 +417,11 @@ def test_sensors_that_the_ring_does_not_have_are_refused():
     message = "tx 1, rx 7; allowed are 0 to 3"
     with pytest.raises(SonarError, match=message):
         gather_windows(FOUR, log, length=1.0)
-    stretch = WindowBuffer()
+    buffer = WindowBuffer()
     for scan in log:
-        stretch, _ = stretch.including(scan, length=1.0)
+        buffer, _ = buffer.add(scan, length=1.0)
     with pytest.raises(SonarError, match=message):
-        stretch.window(FOUR, length=1.0)
+        buffer.window(FOUR, length=1.0)
 
 
 def test_pairs_that_the_ring_does_not_listen_to_are_counted_and_left_out():
@@ -449,22 +449,22 @@ def test_scan_numbers_name_scans_and_do_not_order_them():
 
 def scan_by_scan(ring, log, length):
     """Windows of a log as a robot gathers them, with rows as in the log."""
-    stretch, ended, row, found = WindowBuffer(), True, {int(number): k for k, number in enumerate(log.scan)}, []
+    buffer, ended, row, found = WindowBuffer(), True, {int(number): k for k, number in enumerate(log.scan)}, []
 
-    def close(stretch):
-        part, windows = stretch.window(ring, length=length)
+    def close(buffer):
+        part, windows = buffer.window(ring, length=length)
         rows = np.array([row[int(number)] for number in part.scan])
         found.append(type(windows)(rows[windows.last], windows.echoes, rows[windows.scan], windows.gap))
 
     for scan in log:
-        following, ends = stretch.including(scan, length=length)
+        following, ends = buffer.add(scan, length=length)
         if not np.isfinite(scan.pose).all() and not ended:
-            close(stretch)
-        stretch, ended = following, ends or not np.isfinite(scan.pose).all()
+            close(buffer)
+        buffer, ended = following, ends or not np.isfinite(scan.pose).all()
         if ends:
-            close(stretch)
+            close(buffer)
     if not ended:
-        close(stretch)
+        close(buffer)
     return found
 
 
@@ -499,19 +499,19 @@ def test_a_reading_that_comes_twice_in_a_scan_is_the_same_scan_by_scan():
 
 def test_the_stretch_given_is_left_as_it_was():
     log = a_log(5, missing=0.0)
-    stretch, _ = WindowBuffer().including(log[0], length=1.0)
-    before = (stretch.scans, stretch.way, stretch.new, dict(stretch.runs), stretch.place)
-    stretch.including(log[1], length=1.0)
-    assert (stretch.scans, stretch.way, stretch.new, dict(stretch.runs), stretch.place) == before
+    buffer, _ = WindowBuffer().add(log[0], length=1.0)
+    before = (buffer.scans, buffer.travelled, buffer.fresh, dict(buffer.runs), buffer.place)
+    buffer.add(log[1], length=1.0)
+    assert (buffer.scans, buffer.travelled, buffer.fresh, dict(buffer.runs), buffer.place) == before
 
 
 def test_a_stretch_forgets_what_lies_farther_back_than_a_window():
     nobody = np.zeros(0, int)
-    stretch, step = (
+    buffer, step = (
         WindowBuffer(),
         partial(Scan, stamp=0.0, tx=nobody, rx=nobody, range=np.zeros(0), amplitude=np.zeros(0)),
     )
     for k in range(200):
-        stretch, _ = stretch.including(step(scan=k, pose=np.array([k / 8, 0.0, 0.0])), length=1.0)
-        assert len(stretch.scans) <= 9
-    assert [scan.scan for scan in stretch.scans] == list(range(191, 200))
+        buffer, _ = buffer.add(step(scan=k, pose=np.array([k / 8, 0.0, 0.0])), length=1.0)
+        assert len(buffer.scans) <= 9
+    assert [scan.scan for scan in buffer.scans] == list(range(191, 200))

@@ -1,0 +1,59 @@
+"""Tables of a ring's echo arcs that every scan shares; computed once per ring and settings."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsonar import kernels
+from jaxsonar.sensors.ring import Ring
+
+
+class NormalSums(NamedTuple):
+    """Cumulative sums over the arc points of every path; the sum over a run of points is a difference of two."""
+
+    x: Float[np.ndarray, "paths points_and_one"]
+    """Sums of the x components of the normals of the first k points, k from 0."""
+    y: Float[np.ndarray, "paths points_and_one"]
+    """Sums of the y components."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArcTables:
+    """Echo arcs of all paths of a ring for one set of accumulator settings."""
+
+    arcs: kernels.RingArcs
+    """Equidistant arc points and the occupancy threshold, on the device."""
+    pieces: Int[np.ndarray, " paths"]
+    """Number of pieces of ``kernels.PIECE`` points into which the arc of each path is cut."""
+
+    @cached_property
+    def normal_sums(self) -> NormalSums:
+        """Cumulative sums of the normals, in double precision on the host."""
+        theta = np.asarray(self.arcs.arcs.theta, np.float64)
+        normals = np.stack([np.cos(theta), np.sin(theta)])
+        return NormalSums(*np.cumsum(np.pad(normals, ((0, 0), (0, 0), (1, 0))), axis=-1))
+
+    def moved(self, path_pose: Float[np.ndarray, "paths 3"], settings: kernels.HoughSettings) -> "ArcTables":
+        """The tables for a ring that moved during a scan.
+
+        Args:
+            path_pose: model_from_robot when the transmitter of each path fired: x, y (m), theta (rad).
+            settings: the settings of these tables.
+        """
+        pose = jnp.asarray(path_pose, jnp.float32)
+        return ArcTables(kernels.moved_arcs(self.arcs, pose, settings=settings), self.pieces)
+
+
+def arc_tables(ring: Ring, settings: kernels.HoughSettings) -> ArcTables:
+    """Tables of a ring at rest, stored in ``Ring.cache``."""
+    key = ("arc_tables", settings)
+    if key not in ring.cache:
+        points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
+        arcs = kernels.ring_arcs(ring.sensors, settings=settings, points=points)
+        pieces = -(-np.asarray(arcs.arcs.counts).sum(axis=1) // kernels.PIECE)
+        ring.cache[key] = ArcTables(arcs, pieces)
+    return ring.cache[key]

@@ -1,0 +1,91 @@
+"""Echoes of scans as flat columns, addressed by the echo paths of a ring."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsonar.hardware.errors import SonarError
+from jaxsonar.scans.scan_log import Log, Scan
+from jaxsonar.sensors.ring import Ring
+
+
+class FlatEchoes:
+    """Echoes of scans or of windows of scans, one array per column, sorted by scan."""
+
+    def __init__(
+        self,
+        scan_count: int,
+        scan: Int[np.ndarray, " echoes"],
+        path: Int[np.ndarray, " echoes"],
+        reported: Float[np.ndarray, " echoes"],
+        *,
+        pose: Float[np.ndarray, "echoes 3"] | None = None,
+        gathered: Float[np.ndarray, " scans"] | None = None,
+    ):
+        """Store columns that are sorted by scan.
+
+        Args:
+            scan_count: number of scans, including those without echoes.
+            scan: index of the scan of each echo, ascending.
+            path: row of ``Ring.paths`` of each echo.
+            reported: ranges as a log holds them, metres.
+            pose: model_from_robot when each echo was received: x, y (m), theta (rad). All echoes share one pose if
+                omitted.
+            gathered: effective number of scans that were gathered into each of these scans; 1 if omitted.
+        """
+        self.scan_count, self.scan, self.path, self.reported = scan_count, scan, path, reported
+        self.pose, self.gathered = pose, gathered
+        self.start = np.searchsorted(scan, np.arange(scan_count + 1))
+
+    @classmethod
+    def from_dense(cls, ring: Ring, ranges: Float[np.ndarray, "scans paths echoes"]) -> "FlatEchoes":
+        """Echoes of a dense array of ranges (metres), in which NaN means no echo.
+
+        Raises:
+            SonarError: the shape does not match the ring's paths, or a range is not positive.
+        """
+        ranges = np.asarray(ranges)
+        paths = len(ring.paths)
+        if ranges.ndim != 3 or ranges.shape[1] != paths:
+            raise SonarError(
+                f"ranges: shape {ranges.shape} came; allowed is (scans, {paths}, echoes) for the {paths} echo paths of "
+                f"{ring.name!r}"
+            )
+        if ranges.dtype.kind != "f":
+            raise SonarError(f"ranges: dtype {ranges.dtype} came; allowed are floating-point numbers, NaN for no echo")
+        scan, path, echo = np.nonzero(~np.isnan(ranges))
+        reported = ranges[scan, path, echo]
+        if (reported <= 0).any():
+            k = int(np.argmax(reported <= 0))
+            raise SonarError(
+                f"ranges[{scan[k]}, {path[k]}, {echo[k]}] = {reported[k]:g}; allowed are metres above 0, NaN = no echo"
+            )
+        return cls(len(ranges), scan, path, reported)
+
+    @classmethod
+    def from_log(cls, ring: Ring, log: Log) -> tuple["FlatEchoes", int]:
+        """Echoes of a log on the ring's paths, and the number of echoes on other (tx, rx) pairs, which are omitted.
+
+        Raises:
+            SonarError: the log contains a sensor index that the ring does not have.
+        """
+        sensor = np.maximum(log.tx, log.rx)
+        if (sensor >= ring.count).any():
+            k = int(np.argmax(sensor >= ring.count))
+            raise SonarError(
+                f"scan {log.scan[log.echo_scan[k]]}: echo of sensors tx {log.tx[k]}, rx {log.rx[k]}; allowed are 0 to "
+                f"{ring.count - 1}, the sensors of {ring.name!r}"
+            )
+        path = ring.path_index[log.tx, log.rx]
+        is_path = path >= 0
+        return cls(len(log), log.echo_scan[is_path], path[is_path], log.range[is_path]), int((~is_path).sum())
+
+
+def corrected_echoes(ring: Ring, scan: Scan) -> tuple[Int[np.ndarray, " echoes"], Float[np.ndarray, " echoes"]]:
+    """Path (row of ``Ring.paths``) and corrected range (metres) of the echoes of a scan.
+
+    Echoes on other (tx, rx) pairs, and those at or beyond the maximum range, are omitted.
+    """
+    path = ring.path_index[scan.tx, scan.rx]
+    distance = np.asarray(ring.corrected(scan.range, scan.tx, scan.rx), dtype=np.float64)
+    valid = (path >= 0) & (distance > 0) & (distance < ring.max_range)
+    return path[valid], distance[valid]
