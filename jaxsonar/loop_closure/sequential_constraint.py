@@ -1,4 +1,4 @@
-"""Consecutive submaps share walls: these tell better than the path alone how the one lies on the other."""
+"""Sequential constraints: walls that consecutive submaps share determine their relative pose better than odometry."""
 
 from typing import NamedTuple
 
@@ -6,104 +6,107 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri
 
-from jaxsonar.estimation.pose_graph import Link
-from jaxsonar.geometry.se2 import wrap_angle
-from jaxsonar.loop_closure.pose_candidates import Prior, starts
+from jaxsonar.estimation.pose_graph import BetweenFactor
+from jaxsonar.geometry.se2 import subtract_poses, wrap_pose
+from jaxsonar.loop_closure.pose_candidates import PosePrior, pose_candidates
+from jaxsonar.loop_closure.settings import SETTINGS
 from jaxsonar.loop_closure.submap import Submap
-from jaxsonar.loop_closure.submap_matching import UNLIKELY, Pairs, covariance_of, gains, misfit, nearest, spread
-
-STEPS = 3
-NEAR = np.diag(np.square([0.02, 0.02, np.radians(1.0)]))
-"""Covariance of a pose at which something was laid on something."""
-APART = np.array([0.04, 0.04, np.radians(1.5)])
-"""Metres and radians by which two ways to join differ."""
-ALIKE = 0.5
-"""Another way counts fully if its pairs have this share of the best one's nats."""
-MARGIN = 4.0
-"""Nats by which one way must beat those that differ."""
+from jaxsonar.loop_closure.submap_matching import Pairs, log_likelihood_gains, nearest_pairs, pair_residuals
 
 
-def joined(previous: Submap, following: Submap, number: int = 0) -> Link:
-    """The chain link from a submap to the next one, with what both have seen.
-
-    An iterated Kalman step: the exit and the reflectors of the previous submap are known jointly, and the next one
-    measures its reflectors anew, independently, from its own frame.
+def odometry_factor(submap: Submap, number: int) -> BetweenFactor:
+    """Constraint between a submap and the next one, by the exit pose alone.
 
     Args:
-        previous: the submap that was left at ``exit``.
-        following: the one that begins there.
-        number: of the previous submap's node.
+        submap: the submap.
+        number: its node in the pose graph.
+    """
+    return BetweenFactor(number, number + 1, submap.exit, np.linalg.inv(submap.covariance[:3, :3]))
+
+
+def sequential_factor(previous: Submap, following: Submap, number: int = 0) -> BetweenFactor:
+    """Constraint between a submap and the next one, by the exit pose and the reflectors that both observed.
+
+    An iterated Kalman update: the exit pose and the reflectors of the previous submap have a joint covariance; the
+    following submap is an independent measurement of its reflectors in its own frame.
+
+    Args:
+        previous: the submap that ends at ``exit``.
+        following: the submap that begins there.
+        number: node of the previous submap in the pose graph.
 
     Returns:
-        The link from node ``number`` to ``number + 1``; by the exit alone where nothing is shared.
+        Constraint between the nodes ``number`` and ``number + 1``; that of ``odometry_factor`` where no reflector is
+        shared or where the pairs are ambiguous.
     """
-    exit_cov = previous.covariance[:3, :3]
-    alone = Link(number, number + 1, previous.exit, np.linalg.inv(exit_cov))
+    alone = odometry_factor(previous, number)
     if not (len(previous) and len(following)):
         return alone
-    # Pairs are looked for around every pose that lays something on something, so that they agree from the beginning.
-    ways: list[_Way] = []
-    for pose in starts(previous, following, Prior(previous.exit, exit_cov)):
-        way = _way(previous, following, pose)
-        if way is not None:
-            ways.append(way)
-    if not ways:
+    # 1. An update from every pose at which reflectors agree, with the pairs found there.
+    prior = PosePrior(previous.exit, previous.covariance[:3, :3])
+    updates = [_update_from(previous, following, pose) for pose in pose_candidates(previous, following, prior)]
+    updates = [one for one in updates if one is not None]
+    if not updates:
         return alone
-    best = max(ways, key=lambda way: way.gain - way.chi2 / 2)
-    for way in ways:
-        off = np.append(way.pose[:2] - best.pose[:2], wrap_angle(float(way.pose[2] - best.pose[2])))
-        # Fewer pairs are no proof against a way where doors repeat: what counts is how far it is from the exit.
-        less = min(0.0, way.gain - ALIKE * best.gain) - way.chi2 / 2 + best.chi2 / 2
-        if (np.abs(off) > APART).any() and less > -MARGIN:
+    # 2. The best must beat all that differ from it.
+    best = max(updates, key=lambda one: one.gain - one.chi2 / 2)
+    position, heading = SETTINGS.sequential_distinct
+    for one in updates:
+        differs = (np.abs(subtract_poses(one.pose, best.pose)) > np.array([position, position, heading])).any()
+        # Where doors repeat, fewer pairs prove nothing; the distance from the exit pose does.
+        gain = min(0.0, one.gain - SETTINGS.sequential_similarity * best.gain) - one.chi2 / 2 + best.chi2 / 2
+        if differs and gain > -SETTINGS.sequential_margin:
             return alone
-    return Link(number, number + 1, best.pose, np.linalg.inv(best.covariance))
+    return BetweenFactor(number, number + 1, best.pose, np.linalg.inv(best.covariance))
 
 
-class _Way(NamedTuple):
-    """One way to join two submaps."""
+class _Update(NamedTuple):
+    """Relative pose after an update with some pairs."""
 
     pose: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"]
     gain: float
-    """Nats by which the pairs would beat chance if they fitted perfectly."""
+    """Log-likelihood ratio of the pairs against chance if their residuals were zero, nats."""
     chi2: float
 
 
-def _way(previous: Submap, following: Submap, pose: Float[np.ndarray, "3"]) -> _Way | None:
-    """With the pairs that are near each other at a pose, as many as fit together and to the exit."""
-    pairs = nearest(previous, following, pose, NEAR)
+def _update_from(previous: Submap, following: Submap, pose: Float[np.ndarray, "3"]) -> _Update | None:
+    """Update with the pairs near a pose; the worst is removed until the rest is jointly compatible."""
+    position, heading = SETTINGS.sequential_pose_sd
+    pairs = nearest_pairs(previous, following, pose, np.diag(np.square([position, position, heading])))
     fewest = max(1, int(np.ceil(2 * len(pairs) / 3)))
     while len(pairs) >= fewest:
-        found, cov, chi2, share = _updated(previous, following, pairs)
-        if chi2 <= chdtri(2 * len(pairs), UNLIKELY):
-            return _Way(found, cov, float(gains(previous, following, pairs, found).sum()), chi2)
+        found, cov, chi2, share = _kalman_update(previous, following, pairs)
+        if chi2 <= chdtri(2 * len(pairs), SETTINGS.compatibility_probability):
+            gain = float(log_likelihood_gains(previous, following, pairs, found).sum())
+            return _Update(found, cov, gain, chi2)
         pairs = pairs.without(int(share.argmax()))
     return None
 
 
-def _updated(
+def _kalman_update(
     previous: Submap, following: Submap, pairs: Pairs
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float, Float[np.ndarray, " pairs"]]:
-    """Exit after the pairs were used, its covariance, chi2 of all pairs before that, and the share of each in it."""
+    """Exit pose after the update, its covariance, chi-square of the innovation, and the share of each pair in it."""
     count = len(pairs)
     unknown = np.concatenate([np.arange(3), (3 + 2 * pairs.earlier[:, None] + np.arange(2)).ravel()])
     known = previous.covariance[np.ix_(unknown, unknown)]
-    mine = covariance_of(following, pairs.newest)
-    pose, moved = previous.exit, np.zeros(len(unknown))
+    mine = following.joint_covariance(pairs.newest)
+    pose, change = previous.exit, np.zeros(len(unknown))
     chi2, share, cov = 0.0, np.zeros(count), known
-    for step in range(STEPS):
-        seen = misfit(previous, following, pairs.earlier, pairs.newest, pose)
-        design = np.concatenate([seen.by_pose.reshape(-1, 3), -np.eye(2 * count)], axis=1)
-        # The misfit was taken at the reflectors' places of before.
-        surprise = seen.residual.ravel() - seen.by_pose.reshape(-1, 3) @ moved[:3]
-        innovation = design @ known @ design.T + spread(seen.by_newest, mine)
-        gain = np.linalg.solve(innovation, design @ known).T
+    for step in range(SETTINGS.sequential_steps):
+        found = pair_residuals(previous, following, pairs.earlier, pairs.newest, pose)
+        by_pose = found.by_pose.reshape(-1, 3)
+        design = np.concatenate([by_pose, -np.eye(2 * count)], axis=1)
+        # Only the pose is linearized anew; the reflectors stay at their prior mean.
+        innovation = found.residual.ravel() - by_pose @ change[:3]
+        innovation_cov = design @ known @ design.T + found.covariance_by_newest(mine)
+        gain = np.linalg.solve(innovation_cov, design @ known).T
         if not step:
-            pulled = np.linalg.solve(innovation, surprise)
-            chi2, share = float(surprise @ pulled), (surprise * pulled).reshape(-1, 2).sum(-1)
-        moved = -gain @ surprise
-        pose = previous.exit + moved[:3]
+            weighted = np.linalg.solve(innovation_cov, innovation)
+            chi2, share = float(innovation @ weighted), (innovation * weighted).reshape(-1, 2).sum(-1)
+        change = -gain @ innovation
+        pose = previous.exit + change[:3]
         cov = known - gain @ design @ known
-    pose = np.append(pose[:2], wrap_angle(float(pose[2])))
     cov = cov[:3, :3]
-    return pose, (cov + cov.T) / 2, chi2, share
+    return wrap_pose(pose), (cov + cov.T) / 2, chi2, share

@@ -3,7 +3,8 @@
 At first every scan is a cluster. Two clusters with consecutive scans are aligned in every way in which some of their
 reflectors agree. Each alignment is adjusted with all echoes and gets a log-evidence: few reflectors explain the echoes,
 the motion is a usual one, expected detections are present, no wall is in the way. A pair is merged only if one
-alignment beats all others, and of all pairs the surest goes first: an ambiguous scan waits until its neighbors know more.
+alignment beats all others, and of all pairs the surest is merged first: an ambiguous scan waits until the map around it
+has grown.
 """
 
 from collections.abc import Callable, Sequence

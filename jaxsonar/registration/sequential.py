@@ -1,8 +1,9 @@
 """Sequential registration: each scan is registered to the map of the scans before it, by walls, corners and edges.
 
 The only method that uses odometry, and the only one for long logs. Every way to align a scan with the map is a
-hypothesis. Its evidence (Laplace approximation, nats) is the sum of the log-likelihood of the features, the prior of the
-motion, the volume of the posterior, and negative evidence. A scan is registered only if one hypothesis beats all others.
+hypothesis. Its evidence (Laplace approximation, nats) is the sum of the log-likelihood of the features, the prior of
+the motion, the volume of the posterior, and negative evidence. A scan is registered only if one hypothesis beats all
+others.
 """
 
 from collections.abc import Callable, Sequence

@@ -10,11 +10,13 @@ from support.submaps import along, building, ring, room, submap, submaps
 from jaxsonar import kernels
 from jaxsonar.estimation.pose_graph import BetweenFactor, solve_pose_graph
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
-from jaxsonar.loop_closure.closure import closure
-from jaxsonar.loop_closure.sequential_constraint import joined
-from jaxsonar.loop_closure.submap_graph import SubmapGraph, candidates
-from jaxsonar.loop_closure.submap_matching import Pairs, fitted, misfit, nearest
-from jaxsonar.loop_closure.verification import ACCEPTED, SURE, Closures, Proposal
+from jaxsonar.loop_closure.closure_candidate import ACCEPTED, ClosureCandidate
+from jaxsonar.loop_closure.closure_detection import detect_closure
+from jaxsonar.loop_closure.sequential_constraint import sequential_factor
+from jaxsonar.loop_closure.settings import SETTINGS
+from jaxsonar.loop_closure.submap_graph import SubmapGraph, overlap_candidates
+from jaxsonar.loop_closure.submap_matching import Pairs, fit_pose, nearest_pairs, pair_residuals
+from jaxsonar.loop_closure.verification import ClosureVerifier
 
 NICHE = np.array([[0, 0], [4, 0], [4, 3.2], [2.4, 3.2], [2.4, 2.7], [1.2, 2.7], [1.2, 3.2], [0, 3.2]], dtype=float)
 FIRST, SECOND = along((1, 1), (3, 1), (3, 2.2), (1.2, 2.2)), along((3, 2), (1, 1.8), (1, 1), (2.8, 1.2))
@@ -33,7 +35,9 @@ def two(outline, first, second, seed, sigma):
 
 def off_by(found, true):
     """Error of a relative pose in the directions that it determines, and its squared Mahalanobis length."""
-    error = np.append(found.relative[:2] - true[:2], wrap_angle(float(found.relative[2] - true[2])))
+    error = np.append(
+        found.earlier_from_newest[:2] - true[:2], wrap_angle(float(found.earlier_from_newest[2] - true[2]))
+    )
     error = found.basis.T @ error
     return error, float(error @ (found.basis.T @ found.information @ found.basis) @ error)
 
@@ -43,7 +47,7 @@ def test_closures_of_a_room_are_right_and_honest():
     surprise, rank = [], 0
     for seed in range(9):
         earlier, newest, true, prior, cov = two(NICHE, FIRST, SECOND, seed, (0.1, 0.3, 0.7)[seed % 3])
-        found = closure(newest, earlier, prior, cov)
+        found = detect_closure(newest, earlier, prior, cov)
         if found is not None:
             error, chi2 = off_by(found, true)
             assert np.abs(error).max() < 0.1
@@ -58,8 +62,8 @@ def test_a_room_found_again_after_little_drift_needs_no_confirmation():
     sure = 0
     for seed in range(5):
         earlier, newest, _, prior, cov = two(NICHE, FIRST, SECOND, seed, 0.1)
-        found = closure(newest, earlier, prior, cov)
-        sure += found is not None and found.odds > SURE
+        found = detect_closure(newest, earlier, prior, cov)
+        sure += found is not None and found.log_odds > SETTINGS.acceptance_odds
     assert sure >= 4
 
 
@@ -69,16 +73,16 @@ def test_a_room_like_another_one_is_not_taken_for_it(sigma):
     first = along((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
     for seed in range(3):
         earlier, newest, _, prior, cov = two(TWINS, first, first + np.array([4.6, 0, 0]), seed, sigma)
-        found = closure(newest, earlier, prior, cov)
-        assert found is None or found.odds < SURE - 2
+        found = detect_closure(newest, earlier, prior, cov)
+        assert found is None or found.log_odds < SETTINGS.acceptance_odds - 2
 
 
 def test_not_even_where_drift_has_laid_one_on_the_other():
     first = along((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
     for seed in range(4):
         earlier, newest, _, _, cov = two(TWINS, first, first + np.array([4.6, 0, 0]), seed, 2.0)
-        found = closure(newest, earlier, np.zeros(3), cov)
-        assert found is None or found.odds < SURE - 2
+        found = detect_closure(newest, earlier, np.zeros(3), cov)
+        assert found is None or found.log_odds < SETTINGS.acceptance_odds - 2
 
 
 def test_a_rectangle_is_not_turned_half_around():
@@ -86,14 +90,14 @@ def test_a_rectangle_is_not_turned_half_around():
     there = compose(half, SECOND)  # the same path from the other side
     for seed in range(3):
         earlier, newest, true, prior, cov = two(outline, FIRST, SECOND, seed, 0.3)
-        found = closure(newest, earlier, prior, cov)
+        found = detect_closure(newest, earlier, prior, cov)
         if found is not None:
             assert np.abs(off_by(found, true)[0]).max() < 0.1
         # With every heading possible there are two answers, hence none.
-        found = closure(newest, earlier, compose(true, np.array([0.0, 0.0, 1.5])), np.diag([1.0, 1.0, 9.0]))
-        assert found is None or found.odds < SURE
+        found = detect_closure(newest, earlier, compose(true, np.array([0.0, 0.0, 1.5])), np.diag([1.0, 1.0, 9.0]))
+        assert found is None or found.log_odds < SETTINGS.acceptance_odds
         earlier, newest, true, prior, cov = two(outline, FIRST, there, seed, 0.3)
-        found = closure(newest, earlier, prior, cov)
+        found = detect_closure(newest, earlier, prior, cov)
         assert found is None or np.abs(off_by(found, true)[0]).max() < 0.1
 
 
@@ -102,8 +106,8 @@ def test_doors_that_repeat_are_not_counted_wrongly():
         shift = 2.0 * (seed % 3 - 1)
         second = along((9.2 + shift, 0.8), (5.9 + shift, 0.8))
         earlier, newest, _, prior, cov = two(DOORS, along((5.0, 0.9), (8.5, 0.9)), second, seed, 0.8)
-        found = closure(newest, earlier, prior, cov)
-        assert found is None or found.free is not None or found.odds < SURE
+        found = detect_closure(newest, earlier, prior, cov)
+        assert found is None or found.free is not None or found.log_odds < SETTINGS.acceptance_odds
 
 
 def test_parallel_walls_leave_the_way_along_them_open():
@@ -111,7 +115,7 @@ def test_parallel_walls_leave_the_way_along_them_open():
     for seed in range(4):
         first, second = along((6.0, 0.9), (9.0, 0.9)), along((9.4, 0.8), (6.9, 0.8))
         earlier, newest, true, prior, cov = two(outline, first, second, seed, 0.15)
-        found = closure(newest, earlier, prior, cov)
+        found = detect_closure(newest, earlier, prior, cov)
         if found is None:
             continue
         assert found.free is not None
@@ -122,17 +126,19 @@ def test_parallel_walls_leave_the_way_along_them_open():
         assert off_by(found, true)[1] < 32
         # In a graph it leaves the variance along the corridor as it was.
         chain = [BetweenFactor(0, 1, prior, np.linalg.inv(cov))]
-        graph = solve_pose_graph(np.stack([np.zeros(3), prior]), [*chain, BetweenFactor(0, 1, found.relative, found.information)])
+        graph = solve_pose_graph(
+            np.stack([np.zeros(3), prior]), [*chain, BetweenFactor(0, 1, found.earlier_from_newest, found.information)]
+        )
         after = graph.marginal_covariances(np.array([1]))[0]
         assert free @ after @ free > 0.9 * (free @ cov @ free)
 
 
 def test_the_misfit_and_its_derivatives(rng):
     earlier, newest, true, _, _ = two(NICHE, FIRST, SECOND, 3, 0.1)
-    pairs = nearest(earlier, newest, true, np.diag([1e-4, 1e-4, 1e-5]))
+    pairs = nearest_pairs(earlier, newest, true, np.diag([1e-4, 1e-4, 1e-5]))
     assert len(pairs) > 5
     pose = true + np.array([0.05, -0.03, 0.02])
-    seen = misfit(earlier, newest, pairs.earlier, pairs.newest, pose)
+    seen = pair_residuals(earlier, newest, pairs.earlier, pairs.newest, pose)
     # Independently: walls and points moved as points on them.
     for k, (a, b) in enumerate(zip(*pairs, strict=True)):
         if earlier.kind[a] != kernels.PLANE:
@@ -149,13 +155,13 @@ def test_the_misfit_and_its_derivatives(rng):
     for k in range(3):
         step = np.zeros(3)
         step[k] = 1e-6
-        sides = [misfit(earlier, newest, *pairs, pose + sign * step).residual for sign in (1, -1)]
+        sides = [pair_residuals(earlier, newest, *pairs, pose + sign * step).residual for sign in (1, -1)]
         np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, seen.by_pose[..., k], atol=1e-6)
     for k in range(2):
         step = np.zeros(2)
         step[k] = 1e-6
         sides = [
-            misfit(earlier, replace(newest, parameters=newest.parameters + sign * step), *pairs, pose).residual
+            pair_residuals(earlier, replace(newest, parameters=newest.parameters + sign * step), *pairs, pose).residual
             for sign in (1, -1)
         ]
         np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, seen.by_newest[..., k], atol=1e-6)
@@ -163,15 +169,15 @@ def test_the_misfit_and_its_derivatives(rng):
 
 def test_the_fit_is_the_least_squares_solution():
     earlier, newest, true, _, _ = two(NICHE, FIRST, SECOND, 1, 0.1)
-    pairs = nearest(earlier, newest, true, np.diag([1e-4, 1e-4, 1e-5]))
-    fit = fitted(earlier, newest, pairs, true)
+    pairs = nearest_pairs(earlier, newest, true, np.diag([1e-4, 1e-4, 1e-5]))
+    fit = fit_pose(earlier, newest, pairs, true)
     for step in 1e-3 * np.concatenate([np.eye(3), -np.eye(3)]):
         # A quadratic form around the minimum with the information as its curvature: chi2 at other poses, by hand.
-        seen = misfit(earlier, newest, *pairs, fit.pose + step)
+        seen = pair_residuals(earlier, newest, *pairs, fit.pose + step)
         rows = (3 + 2 * pairs.earlier[:, None] + np.arange(2)).ravel()
         others = (3 + 2 * pairs.newest[:, None] + np.arange(2)).ravel()
         design = np.zeros((len(rows), len(others)))
-        for k, block in enumerate(misfit(earlier, newest, *pairs, fit.pose).by_newest):
+        for k, block in enumerate(pair_residuals(earlier, newest, *pairs, fit.pose).by_newest):
             design[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = block
         cov = earlier.covariance[np.ix_(rows, rows)] + design @ newest.covariance[np.ix_(others, others)] @ design.T
         off = seen.residual.ravel()
@@ -184,7 +190,7 @@ def test_shared_walls_make_the_chain_better_and_honest():
     for seed in range(count):
         rng = np.random.default_rng(seed)
         made, true = submaps(NICHE, along((1, 1), (3, 1), (3, 2.2), (1.2, 2.2), (1, 1)), rng, scans=25, slip=3.0)
-        link, expected = joined(made[0], made[1], 4), relative(true[0], true[1])
+        link, expected = sequential_factor(made[0], made[1], 4), relative(true[0], true[1])
         assert (link.first, link.second) == (4, 5)
         off = link.first_from_second - expected
         off[2] = wrap_angle(off[2])
@@ -209,10 +215,10 @@ def test_without_shared_walls_the_chain_is_the_exit():
         scans=there.scans[:0],
         covariance=there.covariance[:3, :3],
     )
-    link = joined(here, empty)
+    link = sequential_factor(here, empty)
     np.testing.assert_array_equal(link.first_from_second, here.exit)
-    assert closure(empty, here, np.zeros(3), np.eye(3)) is None
-    assert len(nearest(here, empty, np.zeros(3), np.eye(3))) == 0
+    assert detect_closure(empty, here, np.zeros(3), np.eye(3)) is None
+    assert len(nearest_pairs(here, empty, np.zeros(3), np.eye(3))) == 0
 
 
 def around(outline, path, seed, **errors):
@@ -221,7 +227,7 @@ def around(outline, path, seed, **errors):
     graph = SubmapGraph()
     for one in made:
         graph.add(one)
-        graph.settle()
+        graph.process_all()
     return graph, relative(np.broadcast_to(true[0], true.shape), true)
 
 
@@ -232,9 +238,9 @@ def test_a_way_around_a_block_twice_is_closed_rightly(slip):
     corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
     path = along(*corners, *corners[:3])
     graph, true = around(ring(7, 5, doors), path, 2, slip=slip, missed=0.1, spurious=0.5)
-    assert len(graph.closures.accepted) >= 3
-    for one in graph.closures.accepted:
-        error, chi2 = off_by(one.closure, relative(true[one.earlier], true[one.newest]))
+    assert len(graph.verifier.accepted) >= 3
+    for one in graph.verifier.accepted:
+        error, chi2 = off_by(one.measurement, relative(true[one.earlier], true[one.newest]))
         assert np.abs(error).max() < 0.15
         assert chi2 < 16 * len(error)
     off = graph.poses - true
@@ -249,21 +255,21 @@ def test_work_done_piece_by_piece_comes_to_the_same():
     at_once, slowly = SubmapGraph(), SubmapGraph()
     for one in made:
         at_once.add(one)
-        decisions = at_once.settle()
+        decisions = at_once.process_all()
         slowly.add(one)
         before, said = slowly, []
-        while slowly.busy:
+        while slowly.has_pending_work:
             before, slowly = slowly, slowly.copy()
-            said += slowly.work()
-            assert before.busy  # what was copied is as it was
+            said += slowly.process_next()
+            assert before.has_pending_work  # what was copied is as it was
         assert [vars(one) for one in said] == [vars(one) for one in decisions]
-    assert at_once.closures.accepted
+    assert at_once.verifier.accepted
     np.testing.assert_array_equal(at_once.poses, slowly.poses)
     # What is left is done before the next one comes.
     late = SubmapGraph()
     for one in made:
         late.add(one)
-    late.settle()
+    late.process_all()
     np.testing.assert_array_equal(at_once.poses, late.poses)
 
 
@@ -271,39 +277,43 @@ def test_a_wrong_closure_is_withdrawn_and_leaves_no_trace():
     corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
     doors = [(0, 1.7, 0.5, 0.2), (0, 3.9, 0.4, 0.2), (1, 3.0, 0.5, 0.2)]
     graph, _ = around(ring(7, 5, doors), along(*corners, *corners[:2]), 1)
-    known = graph.closures
+    known = graph.verifier
     good, before = known.accepted[0], graph.graph
-    wrong = good.closure._replace(relative=good.closure.relative + np.array([1.0, 0.0, 0.0]))
+    wrong = good.measurement._replace(
+        earlier_from_newest=good.measurement.earlier_from_newest + np.array([1.0, 0.0, 0.0])
+    )
     # As if an early, wide prior had let it in.
-    known.proposals.append(Proposal(good.earlier, good.newest, wrong, good.place, ACCEPTED))
-    after = known.settled(before.poses, graph.chain, len(graph.submaps) - 1)
+    known.candidates.append(ClosureCandidate(good.earlier, good.newest, wrong, good.position, ACCEPTED))
+    after = known.solve(before.poses, graph.chain, len(graph.submaps) - 1)
     np.testing.assert_allclose(after.poses, before.poses, atol=1e-5)
-    np.testing.assert_allclose(after.marginal_covariances(np.arange(5)), before.marginal_covariances(np.arange(5)), atol=1e-8)
+    np.testing.assert_allclose(
+        after.marginal_covariances(np.arange(5)), before.marginal_covariances(np.arange(5)), atol=1e-8
+    )
     assert [one.state for one in known.decisions][-1] == "withdrawn"
 
 
 def test_a_closure_that_the_chain_forbids_is_refused():
     earlier, newest, true, _, cov = two(NICHE, FIRST, SECOND, 0, 0.1)
-    found = closure(newest, earlier, true, cov)
+    found = detect_closure(newest, earlier, true, cov)
     assert found is not None
     graph = solve_pose_graph(np.stack([np.zeros(3), true]), [BetweenFactor(0, 1, true, np.linalg.inv(cov))])
     for shift, state in ((0.0, ACCEPTED), (2.0, "refused")):
-        known = Closures()
-        moved = found._replace(relative=found.relative + np.array([shift, 0.0, 0.0]))
-        assert known.consider(graph, Proposal(0, 1, moved, np.zeros(2))) == (state == ACCEPTED)
+        known = ClosureVerifier()
+        moved = found._replace(earlier_from_newest=found.earlier_from_newest + np.array([shift, 0.0, 0.0]))
+        assert known.add(graph, ClosureCandidate(0, 1, moved, np.zeros(2))) == (state == ACCEPTED)
         assert known.decisions[-1].state == state
-        assert len(known.links) == (state == ACCEPTED)
+        assert len(known.factors) == (state == ACCEPTED)
 
 
 def test_candidates_are_few_and_near():
     made, true = submaps(building(30, []), along((1, 0.9), (29, 0.9), (1, 0.8)), np.random.default_rng(0))
     links = [BetweenFactor(k, k + 1, relative(a, b), 1e4 * np.eye(3)) for k, (a, b) in enumerate(pairwise(true))]
     graph, newest = solve_pose_graph(true, links), len(made) - 1
-    chosen = candidates(graph, made, newest, most=3)
+    chosen = overlap_candidates(graph, made, newest, max_compared=3)
     assert 1 <= len(chosen) <= 3
     assert chosen.max() < newest - 1
     assert np.linalg.norm(true[chosen, :2] - true[newest, :2], axis=1).max() < 8.0
-    assert len(candidates(graph, made, 1)) == 0
+    assert len(overlap_candidates(graph, made, 1)) == 0
 
 
 def test_leaving_out_a_pair_leaves_the_others():

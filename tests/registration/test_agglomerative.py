@@ -1,23 +1,19 @@
 """Agglomerative registration by ranges: unambiguous scans are registered correctly, ambiguous ones stay separate."""
 
-import jax
 import numpy as np
 import pytest
 
 from jaxsonar import Ring, Room, kernels, local_models, simulate
 from jaxsonar.geometry.se2 import compose, inverse, relative, wrap_angle
-from jaxsonar.kernels import measurement_model
 from jaxsonar.registration.agglomerative import register_by_ranges
 from jaxsonar.registration.cluster_adjustment import adjust, single_scan
 from jaxsonar.registration.cluster_negative_evidence import cluster_negative_evidence
 from jaxsonar.registration.echo_clusters import ScanObservations
-from jaxsonar.registration.range_models import RANGE_OF_KIND, predict_ranges
 from jaxsonar.registration.scan_cluster import merge_clusters
 from jaxsonar.simulation.office import load_office
 
 SIGMA = 0.005
 """Metres; of a thresholded sensor, the hard case."""
-EXACT = {kernels.PLANE: measurement_model.plane_echo, kernels.CORNER: measurement_model.corner_echo, kernels.EDGE: measurement_model.edge_echo}
 
 
 def simulated_log(ring, room, poses, *, sigma=SIGMA, seed=0):
@@ -38,34 +34,6 @@ def office():
 def observations(office):
     ring, _, log, models = office
     return ScanObservations.of(ring, log, models, SIGMA)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", list(RANGE_OF_KIND))
-def test_range_models_agree_with_the_kernels(kind, rng):
-    paths = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), Ring.circular().echo_paths)
-    parameters, range_of = np.array([1.3, 0.4]), RANGE_OF_KIND[kind]
-    with jax.enable_x64(True):
-        exact = jax.vmap(EXACT[kind], in_axes=(None, 0))(jax.numpy.asarray(parameters), paths)
-    found = range_of(parameters[None], paths.midpoint, paths.half_baseline)
-    np.testing.assert_allclose(found.range, exact.range, rtol=1e-12)
-    np.testing.assert_allclose(found.by_landmark, exact.slope, atol=1e-12)
-    np.testing.assert_allclose(found.departure, exact.departure, atol=1e-12)
-    np.testing.assert_allclose(found.arrival, exact.arrival, atol=1e-12)
-    step = 1e-6 * rng.normal(size=(2, 2))
-    moved = range_of(parameters[None], paths.midpoint + step[0], paths.half_baseline + step[1])
-    change = found.by_midpoint @ step[0] + found.by_half_baseline @ step[1]
-    np.testing.assert_allclose(moved.range - found.range, change, atol=1e-10)
-
-
-def test_mixed_kinds_give_the_ranges_of_each_kind(rng):
-    kind = np.array([0, 2, 1, 0], dtype=np.int32)
-    parameters = rng.uniform(0.5, 1.5, (4, 1, 2))
-    midpoint, base = rng.normal(size=(1, 5, 2)), rng.normal(size=(1, 5, 2)) / 9
-    found = predict_ranges(kind, parameters, midpoint, base)
-    for row, one in enumerate(kind.tolist()):
-        expected = RANGE_OF_KIND[one](parameters[row], midpoint[0], base[0]).range
-        np.testing.assert_array_equal(found.range[row], expected)
 
 
 def test_every_echo_is_clustered_or_unassigned(office, observations):

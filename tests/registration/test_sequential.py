@@ -141,7 +141,9 @@ def test_odometry_of_another_shape_is_an_error():
 
 def test_progress_reaches_the_end():
     said = []
-    largest([model_at(pose) for pose in trajectory(6)], progress=lambda done, all_of_them: said.append((done, all_of_them)))
+    largest(
+        [model_at(pose) for pose in trajectory(6)], progress=lambda done, all_of_them: said.append((done, all_of_them))
+    )
     assert said[-1] == (6, 6)
     assert said == sorted(said)
 

@@ -1,0 +1,213 @@
+"""Echoes of many scans, grouped into clusters: echoes of one scan that one wall, corner or edge explains."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.stats import chi2
+
+from jaxsonar import kernels
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.geometry.se2 import unit
+from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS
+from jaxsonar.scans.flat_echoes import corrected_echoes
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.range_models import KINDS, RANGE_OF_KIND
+from jaxsonar.sensors.ring import Ring
+
+
+class ClusteredEchoes(NamedTuple):
+    """Echoes as flat arrays, in the frames of their robots."""
+
+    scan: Int[np.ndarray, " echoes"]
+    cluster: Int[np.ndarray, " echoes"]
+    """Row of ``EchoClusters``; -1 for unassigned echoes."""
+    range: Float[np.ndarray, " echoes"]
+    """Half path lengths, corrected, metres."""
+    path: Int[np.ndarray, " echoes"]
+    """Row of the ring's paths."""
+    midpoint: Float[np.ndarray, "echoes 2"]
+    """Midpoint between transmitter and receiver, metres."""
+    half_baseline: Float[np.ndarray, "echoes 2"]
+    """Half the vector from transmitter to receiver, metres."""
+
+
+class EchoClusters(NamedTuple):
+    """Clusters of echoes whose kind of reflector is undecided, in the frames of their robots."""
+
+    scan: Int[np.ndarray, " clusters"]
+    plane: Float[np.ndarray, "clusters 2"]
+    """(rho, theta) if the reflector is a wall, metres and radians."""
+    point: Float[np.ndarray, "clusters 2"]
+    """(x, y) if it is a corner or an edge, metres."""
+    log_prior: Float[np.ndarray, "clusters 3"]
+    """Log-probability of each kind according to the local model."""
+
+
+class PathGeometry(NamedTuple):
+    """Geometry of echo paths in the robot frame; the fields are those of ``kernels.EchoPaths``."""
+
+    midpoint: Float[np.ndarray, "paths 2"]
+    half_baseline: Float[np.ndarray, "paths 2"]
+    axes: Float[np.ndarray, "paths 2 2"]
+    cone: Float[np.ndarray, "paths 2"]
+
+    def take(self, rows: Int[np.ndarray, " rows"]) -> "PathGeometry":
+        """Some of the paths."""
+        return PathGeometry(*(column[rows] for column in self))
+
+
+class _Cluster(NamedTuple):
+    """One row of ``EchoClusters``, with the paths (transmitter, receiver) of its echoes."""
+
+    plane: Float[np.ndarray, "2"]
+    point: Float[np.ndarray, "2"]
+    log_prior: Float[np.ndarray, "3"]
+    paths: Int[np.ndarray, "echoes 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class ScanObservations:
+    """The echoes of all scans, and their clusters."""
+
+    ring: Ring
+    sigma: float
+    """Standard deviation of the ranges, metres."""
+    clustered: ClusteredEchoes
+    """Echoes that belong to a cluster."""
+    unassigned: ClusteredEchoes
+    """All other echoes."""
+    clusters: EchoClusters
+    ranges: Float[np.ndarray, "scans paths slots"]
+    """All ranges by path, metres, sorted; infinite where there is no echo."""
+    paths: PathGeometry
+
+    @classmethod
+    def of(cls, ring: Ring, log: Log, models: Sequence[LocalModel], sigma: float) -> "ScanObservations":
+        """Cluster the echoes of scans according to their local models.
+
+        Args:
+            ring: the sensors.
+            log: the scans.
+            models: the local model of each scan.
+            sigma: standard deviation of the ranges, metres.
+        """
+        exact = ring.exact_paths
+        columns = exact.midpoint, exact.half_baseline, exact.axes, exact.cone
+        paths = PathGeometry(*(np.asarray(column) for column in columns))
+        slots = SETTINGS.echoes_per_path
+        ranges = np.full((len(models), len(ring.paths), slots), np.inf)
+        echoes: list[tuple[np.ndarray, ...]] = []
+        clusters: list[tuple[int, _Cluster]] = []
+        for row, model in enumerate(models):
+            path, measured = corrected_echoes(ring, log[row])
+            order = np.lexsort((measured, path))
+            path, measured = path[order], measured[order]
+            slot = np.arange(len(path)) - np.searchsorted(path, path)
+            kept = slot < slots
+            ranges[row, path[kept], slot[kept]] = measured[kept]
+            cluster = np.full(len(path), -1)
+            for one in _clusters_of(model):
+                own = ring.path_index[one.paths[:, 0], one.paths[:, 1]]
+                free = np.flatnonzero(np.isin(path, own) & (cluster < 0))
+                mine = free[_inliers(one, path[free], measured[free], paths, sigma)]
+                if len(mine):
+                    cluster[mine] = len(clusters)
+                    clusters.append((row, one))
+            echoes.append((np.full(len(path), row), cluster, measured, path))
+        scan, cluster, measured, path = _columns(echoes)
+        flat = ClusteredEchoes(scan, cluster, measured, path, paths.midpoint[path], paths.half_baseline[path])
+        some, rest = (ClusteredEchoes(*(column[rows] for column in flat)) for rows in (cluster >= 0, cluster < 0))
+        table = EchoClusters(
+            scan=np.array([row for row, _ in clusters], dtype=np.int64),
+            plane=np.array([one.plane for _, one in clusters], dtype=np.float64).reshape(-1, 2),
+            point=np.array([one.point for _, one in clusters], dtype=np.float64).reshape(-1, 2),
+            log_prior=np.array([one.log_prior for _, one in clusters], dtype=np.float64).reshape(-1, 3),
+        )
+        return cls(ring, sigma, some, rest, table, ranges, paths)
+
+    @cached_property
+    def wide_paths(self) -> Int[np.ndarray, " some"]:
+        """Rows of the paths whose transducers look in about the same direction."""
+        width = np.asarray(self.ring.echo_paths.width)
+        return np.flatnonzero(width > 0.5 * width.max())
+
+
+def _columns(
+    echoes: Sequence[tuple[np.ndarray, ...]],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Scan, cluster, range and path of all echoes."""
+    none = np.zeros(0, dtype=np.int64)
+    whole = [np.concatenate(column) for column in zip((none, none, np.zeros(0), none), *echoes, strict=True)]
+    return whole[0], whole[1], whole[2], whole[3]
+
+
+def _clusters_of(model: LocalModel) -> Iterator[_Cluster]:
+    """The reflectors of a local model, as walls and as points."""
+    rest = (1 - SETTINGS.decided_probability) / 2
+    least = SETTINGS.min_kind_probability
+    for line in model.lines:
+        log_prior = np.log([SETTINGS.decided_probability, rest, rest])
+        yield _Cluster(np.array([line.rho, line.theta]), line.rho * unit(line.theta), log_prior, line.paths)
+    for one in model.points:
+        probability = np.full(3, max((1 - one.probability) / 2, least))
+        probability[kernels.CORNER if one.kind == "corner" else kernels.EDGE] = one.probability
+        point = np.array([one.x, one.y])
+        plane = np.array([np.hypot(*point), np.arctan2(one.y, one.x)])
+        yield _Cluster(plane, point, np.log(probability), one.paths)
+    for other in model.undecided:
+        probability = np.array([other.probability[name] for name in ("plane", "corner", "edge")])
+        plane, point = np.array([other.rho, other.theta]), np.array([other.x, other.y])
+        yield _Cluster(plane, point, np.log(np.maximum(probability, least)), other.paths)
+
+
+def _inliers(
+    one: _Cluster,
+    path: Int[np.ndarray, " echoes"],
+    measured: Float[np.ndarray, " echoes"],
+    paths: PathGeometry,
+    sigma: float,
+) -> Int[np.ndarray, " inliers"]:
+    """Echoes that one reflector explains, at most one per path; none if no kind of reflector explains them well."""
+    nothing = np.zeros(0, dtype=np.int64)
+    if not len(path):
+        return nothing
+    midpoint, base = paths.midpoint[path], paths.half_baseline[path]
+    start = {kind: one.plane if kind == kernels.PLANE else one.point for kind in KINDS}
+    off = np.min(
+        [np.abs(RANGE_OF_KIND[k](at[None], midpoint, base).range - measured) for k, at in start.items()], axis=0
+    )
+    order = np.argsort(off, kind="stable")
+    mine = order[np.unique(path[order], return_index=True)[1]]
+    mine = mine[off[mine] < 6 * sigma + 0.02]
+    if len(mine) < 2:
+        return nothing
+    fits = [_fit_residuals(k, at, measured[mine], midpoint[mine], base[mine], sigma) for k, at in start.items()]
+    best = min(fits, key=lambda off: float(np.square(np.minimum(off, SETTINGS.cluster_gate)).sum()))
+    good = best < SETTINGS.cluster_gate
+    probability = chi2.sf(np.square(best[good]).sum(), max(int(good.sum()) - 2, 1))
+    return mine[good] if good.sum() >= 2 and probability >= SETTINGS.cluster_significance else nothing
+
+
+def _fit_residuals(
+    kind: int,
+    parameters: Float[np.ndarray, "2"],
+    measured: Float[np.ndarray, " echoes"],
+    midpoint: Float[np.ndarray, "echoes 2"],
+    half_baseline: Float[np.ndarray, "echoes 2"],
+    sigma: float,
+) -> Float[np.ndarray, " echoes"]:
+    """Absolute residuals, in sigma, of a robust fit of one reflector (Geman-McClure, graduated non-convexity)."""
+    parameters, scale = parameters.copy(), 8 * sigma
+    for _ in range(SETTINGS.cluster_steps):
+        predicted = RANGE_OF_KIND[kind](parameters[None], midpoint, half_baseline)
+        residual = measured - predicted.range
+        weight = 1 / np.square(1 + np.square(residual / scale))
+        scale = max(scale / 2, 3 * sigma)
+        slope = predicted.d_range_d_reflector
+        information = slope.T @ (weight[:, None] * slope) + 1e-4 * np.eye(2)
+        parameters += np.clip(np.linalg.solve(information, slope.T @ (weight * residual)), -0.1, 0.1)
+    return np.abs(measured - RANGE_OF_KIND[kind](parameters[None], midpoint, half_baseline).range) / sigma
