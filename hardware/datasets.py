@@ -1,7 +1,7 @@
-"""Recordings of real devices, each in its makers' own format, as flat echoes in SI units.
+"""Readers of published sonar data sets, each in its own format. Result: flat arrays of echoes in SI units.
 
-Whatever a device reported is kept as it reported it, stale readings and constant offsets included: the ring and the map
-know what to make of them. Row numbers in messages are lines of the file, from 1.
+Reported values are kept unchanged, including stale readings and constant offsets; calibration and mapping handle these.
+Row numbers in messages are line numbers of the file, from 1.
 """
 
 import os
@@ -14,57 +14,61 @@ from typing import NoReturn
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .errors import SonarError
+from .errors import SonarError, reason, shown
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a device heard: one entry a scan in ``stamp`` and ``pose``, one entry an echo in the others."""
+    """A recorded run. ``stamp`` and ``pose`` have one entry per scan, the other arrays one entry per echo."""
 
     stamp: Float[np.ndarray, " scans"]
     """Seconds."""
     pose: Float[np.ndarray, "scans 3"]
-    """world_from_robot: x, y (m), theta (rad, [-pi, pi)) from odometry; NaN where there is none."""
+    """world_from_robot: x, y (m), theta (rad, [-pi, pi)) from odometry; NaN if unknown."""
     scan_index: Int[np.ndarray, " echoes"]
-    """Scan of each echo, 0 to scans - 1, never falling; a scan that is absent heard nothing."""
+    """Scan of each echo, 0 to scans - 1, non-decreasing. A scan that does not occur has no echo."""
     tx: Int[np.ndarray, " echoes"]
-    """Sensor that fired."""
+    """Transmitter of each echo."""
     rx: Int[np.ndarray, " echoes"]
-    """Sensor that heard it."""
+    """Receiver of each echo."""
     range: Float[np.ndarray, " echoes"]
-    """Half path length as reported, metres."""
+    """Half the echo path length as reported, metres."""
     amplitude: Float[np.ndarray, " echoes"]
-    """NaN: none of these devices reports one."""
+    """NaN: none of these devices reports amplitudes."""
 
 
-def read_corridor8(path: str | os.PathLike[str]) -> Recording:
-    """A robot with 8 sonars and odometry: ``measurement.txt`` and ``poses.txt``, a line a scan, no headers.
+def read_corridor8(filename: str | os.PathLike[str]) -> Recording:
+    """Read corridor8: a robot with 8 sonars and odometry.
 
-    Sensor k is column k + 2 of ``measurement.txt``, the right side first. Direct echoes only; 5110 mm is no echo.
+    ``measurement.txt`` and ``poses.txt`` have one line per scan and no header. Sensor k is column k + 2 of
+    ``measurement.txt``, starting at the right side. Direct echoes only; 5110 mm means no echo.
 
     Args:
-        path: the folder with both files, or its ``measurement.txt``.
+        filename: the folder with both files, or its ``measurement.txt``.
 
     Raises:
-        SonarError: a file is missing, a row is malformed, or the two files do not agree.
+        SonarError: a missing file, a malformed row, or files that contradict each other.
     """
-    measurements = Path(path) / "measurement.txt" if Path(path).is_dir() else Path(path)
+    measurements = Path(filename) / "measurement.txt" if Path(filename).is_dir() else Path(filename)
     sensors = [f"range {k}" for k in range(8)]
-    sonar = Table(measurements, text_lines(measurements), ("t_ms", *sensors), separator=None)
+    sonar = NumericTable(measurements, text_lines(measurements), ("t_ms", *sensors), separator=None)
     reported = sonar.number[:, 1:]
     sonar.refuse((reported <= 0) | (reported > 5110), sensors, "a range above 0 and up to 5110 mm, which is no echo")
     stamp, pose = corridor8_poses(sonar)
     return _direct(stamp, pose, np.where(reported == 5110, np.nan, reported / 1000))
 
 
-def corridor8_poses(table: "Table") -> tuple[Float[np.ndarray, " scans"], Float[np.ndarray, "scans 3"]]:
-    """Time (s) and odometry (m, rad) of every row of a corridor8 file that starts with t_ms, from its ``poses.txt``.
+def corridor8_poses(table: "NumericTable") -> tuple[Float[np.ndarray, " scans"], Float[np.ndarray, "scans 3"]]:
+    """Read the ``poses.txt`` beside a corridor8 file whose first column is t_ms.
+
+    Returns:
+        Time (s) and odometry pose (m, rad) of every row of the table.
 
     Raises:
-        SonarError: that file is missing or malformed, or the two do not agree.
+        SonarError: the file is missing or malformed, or contradicts the table.
     """
     poses = table.file.with_name("poses.txt")
-    odometry = Table(poses, text_lines(poses), ("t_ms", "x_mm", "y_mm", "heading"), separator=None)
+    odometry = NumericTable(poses, text_lines(poses), ("t_ms", "x_mm", "y_mm", "heading"), separator=None)
     time, heading = table.number[:, 0], odometry.number[:, 3]
     odometry.refuse((heading < 0) | (heading > 3600), "heading", "0 to 3600 tenths of a degree")
     table.refuse(np.append(False, np.diff(time) <= 0), "t_ms", "a later time than in the row before")
@@ -77,74 +81,74 @@ def corridor8_poses(table: "Table") -> tuple[Float[np.ndarray, " scans"], Float[
     return time / 1000, pose
 
 
-def read_scitos24(path: str | os.PathLike[str]) -> Recording:
-    """A ring of 24 sonars at 9 Hz: ``sensor_readings_24.data``, CSV with header ``S1,...,S24,OUTPUT``.
+def read_scitos24(filename: str | os.PathLike[str]) -> Recording:
+    """Read scitos24: a ring of 24 sonars at 9 Hz, without poses.
 
-    Sensor k is column S(k + 1). Direct echoes only; 5.0 m and more is no echo. There are no poses; OUTPUT, what the
-    robot's wall following chose, is left out.
+    ``sensor_readings_24.data`` is CSV with the header ``S1,...,S24,OUTPUT``. Sensor k is column S(k + 1). Direct echoes
+    only; 5.0 m and more means no echo. OUTPUT, the command of a wall follower, is ignored.
 
     Args:
-        path: the file, or the folder it is in.
+        filename: the file, or its folder.
 
     Raises:
-        SonarError: the file is missing or a row is malformed.
+        SonarError: a missing file or a malformed row.
     """
-    file = Path(path) / "sensor_readings_24.data" if Path(path).is_dir() else Path(path)
+    file = Path(filename) / "sensor_readings_24.data" if Path(filename).is_dir() else Path(filename)
     lines = text_lines(file)
     sensors = [f"S{k}" for k in range(1, 25)]
     header = (*sensors, "OUTPUT")
     if not lines or tuple(lines[0].split(",")) != header:
         came = f"'{shown(lines[0])}'" if lines else "nothing"
         raise SonarError(f"{shown(file)}: row 1: {came} came; allowed is the header S1,...,S24,OUTPUT")
-    table = Table(file, lines[1:], header, separator=",", first_row=2, words=1)
+    table = NumericTable(file, lines[1:], header, separator=",", first_row=2, text_columns=1)
     table.refuse(table.number <= 0, sensors, "a range above 0 m; 5.0 and more is no echo")
     scans = len(table.number)
-    nowhere = np.full((scans, 3), np.nan)
-    return _direct(np.arange(scans) / 9.0, nowhere, np.where(table.number >= 5.0, np.nan, table.number))
+    unknown_pose = np.full((scans, 3), np.nan)
+    return _direct(np.arange(scans) / 9.0, unknown_pose, np.where(table.number >= 5.0, np.nan, table.number))
 
 
-def read_sew_amr(path: str | os.PathLike[str]) -> Recording:
-    """The ultrasonic messages of the SEW-Eurodrive Multimodal AMR data set: four sensors that all hear each other.
+def read_sew_amr(filename: str | os.PathLike[str]) -> Recording:
+    """Read the ultrasonic messages of the SEW-Eurodrive Multimodal AMR data set: four sensors, all 16 paths.
 
-    A message is 48 rows of 4 columns in mm: 12 rows a transmitter, a column a receiver. The 12 distances of a pair are
-    begin and end of up to 6 objects in turn, 65535 where there is none; the begins are its echoes. Messages come every
-    0.1 s: four firings, 25 ms each. The format carries neither time nor pose.
+    A message is 48 rows of 4 columns in mm: 12 rows per transmitter, one column per receiver. The 12 distances of a
+    path are start and end of up to 6 objects, alternating; 65535 means no object. The starts are the echoes. There is a
+    message every 0.1 s: four firings of 25 ms each. The format contains neither time nor pose.
 
     Args:
-        path: a ``dist.csv`` (a header, then one or more messages), or a folder with such files at any depth, each named
-            ``dist`` and whatever, read in the order of their paths (numbers by value).
+        filename: a ``dist.csv`` (a header, then one or more messages), or a folder. In a folder all files
+            ``dist*.csv`` at any depth are read, sorted by filename (numbers by value).
 
     Raises:
-        SonarError: no such file, or a row is malformed.
+        SonarError: a missing file or a malformed row.
     """
-    files = [Path(path)]
-    if Path(path).is_dir():
-        files = sorted(Path(path).rglob("dist*.csv"), key=_by_value)
+    files = [Path(filename)]
+    if Path(filename).is_dir():
+        files = sorted(Path(filename).rglob("dist*.csv"), key=_natural_sort_key)
         if not files:
-            raise SonarError(f"{shown(path)}: no dist.csv in this folder; needed is at least one")
+            raise SonarError(f"{shown(filename)}: no dist.csv in this folder; needed is at least one")
     messages = np.concatenate([_sew_messages(file) for file in files])
-    begins = messages[:, :, 0::2, :].swapaxes(2, 3)  # (messages, tx, rx, objects)
-    scan_index, tx, rx, nearest_first = np.nonzero(begins != 65535)
+    starts = messages[:, :, 0::2, :].swapaxes(2, 3)  # (messages, tx, rx, objects)
+    scan_index, tx, rx, echo = np.nonzero(starts != 65535)
     return Recording(
         stamp=np.arange(len(messages)) * 0.1,
         pose=np.full((len(messages), 3), np.nan),
         scan_index=scan_index,
         tx=tx,
         rx=rx,
-        range=begins[scan_index, tx, rx, nearest_first] / 1000,
+        range=starts[scan_index, tx, rx, echo] / 1000,
         amplitude=np.full(len(tx), np.nan),
     )
 
 
 def _sew_messages(file: Path) -> Float[np.ndarray, "messages 4 12 4"]:
-    """Distances in mm: message, tx, begin or end, rx."""
+    """Distances in mm: message, tx, start or end, rx."""
     lines = text_lines(file)
     if not lines:
         raise SonarError(f"{shown(file)}: row 1: nothing came; allowed is a header and 48 rows a message")
     if len(lines[0].split(",")) != 4 or re.fullmatch(r"[\d.,\s+-]+", lines[0]):
         raise SonarError(f"{shown(file)}: row 1: '{shown(lines[0])}' came; allowed is a header of 4 column names")
     columns = [f"{name.strip()} (rx {rx})" for rx, name in enumerate(lines[0].split(","))]
-    table = Table(file, lines[1:], tuple(columns), separator=",", first_row=2)
+    table = NumericTable(file, lines[1:], tuple(columns), separator=",", first_row=2)
     table.refuse((table.number <= 0) | (table.number > 65535), columns, "above 0 and up to 65535 mm, which is none")
     if len(table.number) % 48 or not len(table.number):
         came = f"{len(table.number)} rows below the header"
@@ -155,23 +159,23 @@ def _sew_messages(file: Path) -> Float[np.ndarray, "messages 4 12 4"]:
 
 
 def _direct(
-    stamp: Float[np.ndarray, " scans"], pose: Float[np.ndarray, "scans 3"], heard: Float[np.ndarray, "scans sensors"]
+    stamp: Float[np.ndarray, " scans"], pose: Float[np.ndarray, "scans 3"], ranges: Float[np.ndarray, "scans sensors"]
 ) -> Recording:
-    """A recording of direct echoes from one range a sensor and scan, metres, NaN where nothing was heard."""
-    scan_index, sensor = np.nonzero(~np.isnan(heard))
+    """A recording of direct echoes: one range per scan and sensor, metres, NaN without an echo."""
+    scan_index, sensor = np.nonzero(~np.isnan(ranges))
     return Recording(
         stamp=stamp,
         pose=pose,
         scan_index=scan_index,
         tx=sensor,
         rx=sensor.copy(),
-        range=heard[scan_index, sensor],
+        range=ranges[scan_index, sensor],
         amplitude=np.full(len(sensor), np.nan),
     )
 
 
-class Table:
-    """The numbers in a file's rows, each of which can be named once it turns out to be wrong."""
+class NumericTable:
+    """The numbers of a text file, with the positions of all fields for error messages."""
 
     def __init__(
         self,
@@ -181,9 +185,9 @@ class Table:
         *,
         separator: str | None,
         first_row: int = 1,
-        words: int = 0,
+        text_columns: int = 0,
     ):
-        """Split and convert; the last ``words`` columns are text and left out of ``number`` (rows, columns)."""
+        """Split and convert to ``number`` (rows, columns), without the last ``text_columns`` columns."""
         self.file, self.columns, self.first_row = file, columns, first_row
         self.fields = [line.split(separator) for line in lines]
         for row, fields in enumerate(self.fields):
@@ -191,7 +195,7 @@ class Table:
                 names = ", ".join(columns) if len(columns) < 10 else f"{columns[0]} to {columns[-1]}"
                 place = f"{shown(file)}: row {first_row + row}"
                 raise SonarError(f"{place}: {len(fields)} columns came; allowed are {len(columns)}: {names}")
-        count = len(columns) - words
+        count = len(columns) - text_columns
         try:
             self.number = np.array([fields[:count] for fields in self.fields], dtype=np.float64).reshape(-1, count)
         except ValueError:
@@ -205,10 +209,10 @@ class Table:
                     float(field)
                 except ValueError:
                     self._fail(row, self.columns[k], "a finite number")
-        raise AssertionError("a table that did not convert holds a field that does not")
+        raise AssertionError("the conversion failed, but every field is a number")
 
     def refuse(self, bad: Bool[np.ndarray, "..."], column: str | list[str], allowed: str) -> None:
-        """An error about the first bad row, if any: of one column, or of several named columns (rows, columns)."""
+        """Raise an error for the first bad row, if any. ``bad`` is per row, or per row and named column."""
         if bad.any():
             row, *rest = np.argwhere(bad)[0]
             self._fail(int(row), column[rest[0]] if isinstance(column, list) else column, allowed)
@@ -220,24 +224,17 @@ class Table:
 
 
 def text_lines(file: Path) -> list[str]:
-    """The lines of a text file, without their ends (LF or CRLF)."""
+    """The lines of a text file, without their line ends (LF or CRLF)."""
     try:
         text = file.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:
         raise SonarError(f"{shown(file)}: this is no text; needed is a recording as text") from None
     except (OSError, ValueError) as failure:
-        reason = getattr(failure, "strerror", None) or str(failure)
-        raise SonarError(f"{shown(file)}: {reason}; needed is a readable file of the recording") from None
+        raise SonarError(f"{shown(file)}: {reason(failure)}; needed is a readable file of the recording") from None
     return text.replace("\r\n", "\n").removesuffix("\n").split("\n") if text else []
 
 
-def _by_value(file: Path) -> list[tuple[int, str]]:
-    """Sort key under which message 10 follows message 9."""
+def _natural_sort_key(file: Path) -> list[tuple[int, str]]:
+    """Sort key that orders message 10 after message 9."""
     pieces = re.split(r"(\d+)", str(file))
     return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in pieces]
-
-
-def shown(text: object) -> str:
-    """One printable line for a message."""
-    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
-    return line if len(line) <= 200 else f"{line[:40]}..."

@@ -1,4 +1,4 @@
-"""A stream of messages as a device: in time, over a sink, on a link as bad as wanted."""
+"""Device emulator: sends a stream of messages over a sink in real time, with optional fault injection."""
 
 import math
 import threading
@@ -7,37 +7,37 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from .errors import SonarError
-from .fault_injection import BadLink, Faults
+from .fault_injection import FaultInjector, FaultSettings
 from .messages import Message
 from .protocol import encode, encode_end
-from .transport_servers import LINGER, Sink
+from .transport_servers import SETTINGS, Sink
 
-ENDINGS = 3
-"""Times that the end is said: a line that loses frames may lose it."""
+END_FRAMES = 3
+"""Repetitions of the end frame, because a lossy link may lose one. Chosen by hand."""
 
 
 @dataclass
-class Served:
-    """What an emulated device did."""
+class EmulationReport:
+    """Counters of an emulated device."""
 
     messages: int = 0
-    """Taken from the log or the room."""
+    """Messages sent."""
     frames: int = 0
-    """Sent, damaged ones included; the ends are none of them."""
+    """Frames sent, including corrupted ones, without end frames."""
     sent_bytes: int = 0
-    """Of those frames."""
+    """Bytes of those frames."""
     clients: int = 0
-    """Clients that were served, one after the other."""
+    """Clients served, one after the other."""
     damaged: int = 0
-    """Frames damaged on purpose."""
+    """Frames corrupted by fault injection."""
     dropped: int = 0
-    """Frames lost on purpose."""
+    """Frames dropped by fault injection."""
     swapped: int = 0
-    """Frames sent after the one that follows."""
+    """Frames swapped with the next one by fault injection."""
     stalls: int = 0
-    """Times of silence on purpose."""
-    latest: float = 0.0
-    """Seconds that the latest frame was behind its time, stalls included; 0 where there is no time to keep."""
+    """Stalls by fault injection."""
+    max_delay: float = 0.0
+    """Largest delay of a message against its due time, seconds, including stalls; 0 without real-time pacing."""
 
 
 def emulate(
@@ -45,49 +45,51 @@ def emulate(
     sink: Sink,
     *,
     speed: float = 1.0,
-    faults: Faults | None = None,
+    faults: FaultSettings | None = None,
     stop: threading.Event | None = None,
-) -> Served:
-    """Send messages to a client, each at its time; the first one as soon as there is a client.
+) -> EmulationReport:
+    """Send messages to clients, each at its device time. The first message is sent as soon as a client connects.
 
-    The device's clock stands still while there is no client: the next one continues with the message that the last one
-    did not get. After the last message the device says that this was the end, also after ``stop``. The sink stays open.
+    The emulated device clock stops while there is no client. The next client continues with the message that the last
+    client did not receive. After the last message, and after ``stop``, an end frame is sent. The sink stays open.
 
     Args:
-        messages: in their order, with the device's times.
-        sink: where to.
-        speed: 2 is twice as fast as the times say; 0 is as fast as it goes.
-        faults: none if left out.
-        stop: set it, from any thread, and this returns within a tenth of a second or so.
+        messages: messages in order of device time.
+        sink: server to send to.
+        speed: playback speed; 0: as fast as possible.
+        faults: faults to inject; none by default.
+        stop: set this event from any thread to return within about 0.1 s.
 
     Raises:
-        SonarError: a speed that is none, or a message that no frame can hold.
+        SonarError: an invalid speed, or a message that cannot be encoded.
     """
     if not (speed >= 0 and math.isfinite(speed)):
         raise SonarError(f"--speed: {speed:g} came; allowed is 0 (as fast as it goes) or more")
-    device = _Device(sink, speed, BadLink(faults or Faults()), stop or threading.Event())
+    device = _EmulatedDevice(sink, speed, FaultInjector(faults or FaultSettings()), stop or threading.Event())
     for message in messages:
         if not device.send(message):
             break
     return device.end()
 
 
-class _Device:
-    def __init__(self, sink: Sink, speed: float, link: BadLink, stop: threading.Event):
+class _EmulatedDevice:
+    """State of one emulation: pacing, current client, and counters."""
+
+    def __init__(self, sink: Sink, speed: float, link: FaultInjector, stop: threading.Event):
         self.sink, self.speed, self.link, self.stop = sink, speed, link, stop
-        self.done = Served()
-        self.began = 0.0  # when the first message was sent, by the host's clock
+        self.done = EmulationReport()
+        self.first_sent = 0.0  # host clock when the first message was sent
         self.start, self.start_us = 0.0, 0  # a message is due at start + (its time - start_us) / speed
         self.sequence = self.time_us = 0
 
     def send(self, message: Message) -> bool:
-        """Send a message at its time; False once stopped."""
-        frames = self.link.pass_on(encode(message))
+        """Send a message at its due time. False if stopped."""
+        frames = self.link.transmit(encode(message))
         self.time_us = message.time_us
         if not self.done.clients and not self.next_client():
             return False
-        pause = self.link.pause(time.monotonic() - self.began)
-        if self.stop.wait(max(pause, self.time_left())):
+        stall = self.link.stall_duration(time.monotonic() - self.first_sent)
+        if self.stop.wait(max(stall, self.time_left())):
             return False
         if not all([self.deliver(frame) for frame in frames]):
             return False
@@ -96,43 +98,43 @@ class _Device:
         return True
 
     def time_left(self) -> float:
-        """Seconds until the message is due; 0 if it is late."""
+        """Seconds until the current message is due; 0 if it is late."""
         if not self.speed:
             return 0.0
         left = self.start + (self.time_us - self.start_us) / 1e6 / self.speed - time.monotonic()
-        self.done.latest = max(self.done.latest, -left)
+        self.done.max_delay = max(self.done.max_delay, -left)
         return max(left, 0.0)
 
     def deliver(self, frame: bytes) -> bool:
-        """Send a frame to this client or, if that one leaves before it has it, to the next; False once stopped."""
+        """Send a frame to the client; if it disconnects before it has all of it, to the next one. False if stopped."""
         while not self.sink.send(frame, self.stop):
             if not self.next_client():
                 return False
-            frame = b"\0" + frame.lstrip(b"\0")  # so that nothing which is still on its way gets joined to it
+            frame = b"\0" + frame.lstrip(b"\0")  # separates it from a partial frame
         self.done.frames += 1
         self.done.sent_bytes += len(frame)
         return True
 
     def next_client(self) -> bool:
-        """Wait for one, who gets the present message at once; False once stopped."""
+        """Wait for a client; it receives the current message at once. False if stopped."""
         if not self.sink.wait_client(self.stop) or self.stop.is_set():
             return False
         self.start, self.start_us = time.monotonic(), self.time_us
-        self.began = self.began or self.start
+        self.first_sent = self.first_sent or self.start
         self.done.clients += 1
         return True
 
-    def end(self) -> Served:
-        """Say to the client, if there is one, that this was the end."""
+    def end(self) -> EmulationReport:
+        """Send the held-back frames and the end frame to the client, if there is one."""
         done, link = self.done, self.link
-        patience = threading.Event()
-        timer = threading.Timer(LINGER, patience.set)
+        timed_out = threading.Event()
+        timer = threading.Timer(SETTINGS.linger_time, timed_out.set)
         timer.start()
-        ending = encode_end((self.sequence + 1) % (1 << 32), self.time_us)
-        for frame in [*link.rest(), *[ending] * ENDINGS]:
-            if not done.clients or not self.sink.send(frame, patience):
+        end_frame = encode_end((self.sequence + 1) % (1 << 32), self.time_us)
+        for frame in [*link.flush(), *[end_frame] * END_FRAMES]:
+            if not done.clients or not self.sink.send(frame, timed_out):
                 break
-            done.frames += frame is not ending
+            done.frames += frame is not end_frame
         timer.cancel()
         timer.join()
         done.damaged, done.dropped, done.swapped, done.stalls = link.damaged, link.dropped, link.swapped, link.stalls

@@ -1,4 +1,4 @@
-"""A bad link on demand: frames that are damaged, lost, swapped or held up, the same ones for the same seed."""
+"""Fault injection for tests and ``jaxsonar emulate``: corrupted, lost, reordered or delayed frames, seeded."""
 
 import math
 import re
@@ -8,28 +8,28 @@ import numpy as np
 
 from .errors import SonarError
 
-KINDS = ("flip", "insert", "cut")
-"""Ways to damage a frame."""
-EVERY = 10.0
-"""Seconds between two stalls, unless told."""
+CORRUPTIONS = ("flip", "insert", "cut")
+"""Kinds of corruption of a frame: flipped bits, inserted bytes, removed bytes."""
+STALL_PERIOD = 10.0
+"""Default time between the starts of two stalls, seconds."""
 
 
 @dataclass(frozen=True)
-class Faults:
-    """What goes wrong, and how often."""
+class FaultSettings:
+    """Which faults are injected, and how often."""
 
     corrupt: float = 0.0
-    """Probability that a frame is damaged: bits flipped, bytes inserted, or bytes cut out."""
+    """Probability that a frame is corrupted: bits flipped, bytes inserted, or bytes removed."""
     drop: float = 0.0
     """Probability that a frame is lost."""
     reorder: float = 0.0
-    """Probability that a frame comes after the one that follows it."""
+    """Probability that a frame is swapped with the next one."""
     stall: float = 0.0
-    """Seconds that the device says nothing, again and again; what it had to say comes after that, late."""
-    every: float = EVERY
-    """Seconds between the beginnings of two stalls."""
+    """Duration of a periodic stall, seconds. Frames that are due during a stall are sent after it."""
+    every: float = STALL_PERIOD
+    """Time between the starts of two stalls, seconds."""
     seed: int = 0
-    """Of the random numbers."""
+    """Seed of the random numbers."""
 
     def __post_init__(self):
         for name in ("corrupt", "drop", "reorder"):
@@ -43,44 +43,50 @@ class Faults:
 
 
 def parse_stall(text: str) -> tuple[float, float]:
-    """``SECONDS`` or ``SECONDS@EVERY``, as in ``--stall 2@10``; EVERY is 10 s where it is left out, or more if needed.
+    """Parse ``SECONDS`` or ``SECONDS@EVERY``, as in ``--stall 2@10``.
+
+    Returns:
+        Duration and period, seconds. The default period is 10 s, or twice the duration if that is longer.
 
     Raises:
-        SonarError: it is neither.
+        SonarError: another text.
     """
     number = r"(\d+\.?\d*|\.\d+)"
     match = re.fullmatch(rf"{number}(?:@{number})?", text)
     if not match:
         raise SonarError(f"--stall: '{text[:40]}' came; allowed is SECONDS[@EVERY], as in 2 or 2@10")
     seconds = float(match[1])
-    return seconds, float(match[2]) if match[2] else max(EVERY, 2 * seconds)
+    return seconds, float(match[2]) if match[2] else max(STALL_PERIOD, 2 * seconds)
 
 
-class BadLink:
-    """Takes frames and gives what arrives."""
+class FaultInjector:
+    """Simulates a faulty link, frame by frame."""
 
-    def __init__(self, faults: Faults):
+    def __init__(self, faults: FaultSettings):
         self.faults = faults
         self.damaged = self.dropped = self.swapped = self.stalls = 0
-        """What was done so far."""
+        """Numbers of injected faults."""
         self._random = np.random.default_rng(faults.seed)
         self._held: bytes | None = None
         self._next_stall = faults.every
 
-    def pass_on(self, frame: bytes) -> list[bytes]:
-        """What arrives once this frame was sent: none, one or two.
+    def transmit(self, frame: bytes) -> list[bytes]:
+        """Send a frame over the faulty link.
 
         Args:
-            frame: with the 0x00 that ends it.
+            frame: with its final 0x00.
+
+        Returns:
+            The frames that arrive now: none, one, or two.
         """
         faults = self.faults
-        lost, bad, late = self._random.random(3) < (faults.drop, faults.corrupt, faults.reorder)
+        lost, corrupted, late = self._random.random(3) < (faults.drop, faults.corrupt, faults.reorder)
         if lost:
             self.dropped += 1
             return []
-        if bad:
+        if corrupted:
             self.damaged += 1
-            frame = damage(self._random, frame)
+            frame = corrupt_frame(self._random, frame)
         if self._held is not None:
             earlier, self._held = self._held, None
             return [frame, earlier]
@@ -90,16 +96,16 @@ class BadLink:
             return []
         return [frame]
 
-    def rest(self) -> list[bytes]:
-        """A frame that waits for one to follow, if any, once there will be none."""
+    def flush(self) -> list[bytes]:
+        """The frame that was held back for reordering, if any. Call after the last frame."""
         held, self._held = self._held, None
         return [] if held is None else [held]
 
-    def pause(self, elapsed: float) -> float:
-        """How long to say nothing now, seconds.
+    def stall_duration(self, elapsed: float) -> float:
+        """Duration of a stall that is due now, seconds; 0 if none is due.
 
         Args:
-            elapsed: seconds since the device began.
+            elapsed: seconds since the first message was sent.
         """
         if not self.faults.stall or elapsed < self._next_stall:
             return 0.0
@@ -108,19 +114,19 @@ class BadLink:
         return self.faults.stall
 
 
-def damage(random: np.random.Generator, frame: bytes) -> bytes:
-    """A frame with a random fault: never as it was.
+def corrupt_frame(random: np.random.Generator, frame: bytes) -> bytes:
+    """A copy of a frame with a random corruption. It always differs from the original.
 
     Args:
-        random: where the fault comes from.
+        random: random number generator.
         frame: at least one byte.
     """
-    kind = KINDS[random.integers(len(KINDS))]
+    kind = CORRUPTIONS[random.integers(len(CORRUPTIONS))]
     at = int(random.integers(len(frame)))
     size = int(min(random.geometric(0.3), 64))
     if kind == "flip":
         data = bytearray(frame)
-        for bit in np.unique(random.integers(8 * len(frame), size=size)).tolist():  # a bit flipped twice is none
+        for bit in np.unique(random.integers(8 * len(frame), size=size)).tolist():  # flipping a bit twice would undo it
             data[bit // 8] ^= 1 << bit % 8
         return bytes(data)
     if kind == "insert":

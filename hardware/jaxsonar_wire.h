@@ -1,8 +1,8 @@
 /* Frames of the jaxsonar protocol, version 1.0 (docs/protocol.md), for firmware. C99 or C++, no allocation.
  *
- * A frame goes straight into the caller's buffer, COBS and CRC-32 on the way. Both encoders return the number of bytes
- * to send, the closing 0x00 included, or 0 if the buffer is too small or there are more than 4096 echoes.
- * float and double have to be IEEE 754; the byte order of the machine does not matter.
+ * Frames are written directly to the caller's buffer; COBS and CRC-32 are computed on the fly. Both encoders return the
+ * number of bytes to send, including the final 0x00, or 0 if the buffer is too small or there are more than 4096 echoes.
+ * float and double must be IEEE 754. Any byte order of the machine works.
  */
 #ifndef JAXSONAR_WIRE_H
 #define JAXSONAR_WIRE_H
@@ -12,34 +12,34 @@
 #include <string.h>
 
 #define JAXSONAR_PAYLOAD(echoes) (36u + 14u * (size_t)(echoes))
-/* Bytes that a frame of so many echoes takes at most; a pose takes JAXSONAR_FRAME(1). */
+/* Maximum size of a frame with this number of echoes, bytes. For a pose: JAXSONAR_FRAME(1). */
 #define JAXSONAR_FRAME(echoes) (JAXSONAR_PAYLOAD(echoes) + JAXSONAR_PAYLOAD(echoes) / 254u + 2u)
 
 typedef struct {
-    uint16_t tx, rx;  /* sensor that fired, sensor that heard it */
-    uint8_t echo;     /* counts the echoes of this pair from 0, nearest first */
+    uint16_t tx, rx;  /* transmitter, receiver */
+    uint8_t echo;     /* number of the echo of this path from 0, nearest first */
     uint8_t flags;    /* 1 ring-down, 2 saturated */
-    float time_us;    /* time of flight there and back, above 0 and up to 1e6 */
-    float amplitude;  /* NAN if there is none */
+    float time_us;    /* two-way time of flight, above 0 and up to 1e6 */
+    float amplitude;  /* NAN if not measured */
 } jaxsonar_echo;
 
 typedef struct {
-    uint32_t sequence;      /* counts all frames of this device */
+    uint32_t sequence;      /* sequence number over all frames of this device */
     uint64_t time_us;       /* device clock when the group fired */
     uint32_t scan;
     uint16_t group, groups; /* group 0 to groups - 1 of the scan */
-    float temperature;      /* deg C, NAN if it is not measured */
+    float temperature;      /* deg C, NAN if not measured */
 } jaxsonar_group;
 
 typedef struct {
     uint32_t sequence;
     uint64_t time_us;
-    double x, y, theta;  /* odometry: metres, radians counter-clockwise; three NAN if it is not known any more */
+    double x, y, theta;  /* odometry: metres, radians counter-clockwise; three NAN if unknown */
 } jaxsonar_pose;
 
 typedef struct {
     uint8_t *out;
-    size_t size, used, code; /* code: where the length of the present COBS block belongs */
+    size_t size, used, code; /* code: position of the length byte of the current COBS block */
     uint32_t crc;
 } jaxsonar_writer;
 
@@ -50,9 +50,9 @@ static inline uint32_t jaxsonar_crc32(uint32_t crc, uint8_t byte) /* start with 
     return ~crc;
 }
 
-static inline void jaxsonar_stuff(jaxsonar_writer *w, uint8_t byte) /* the next byte, through COBS */
+static inline void jaxsonar_stuff(jaxsonar_writer *w, uint8_t byte) /* append a byte, COBS-encoded */
 {
-    if (w->used - w->code == 255) { /* a block is full: it ends without a zero */
+    if (w->used - w->code == 255) { /* the block is full: it ends without a zero */
         if (w->code < w->size) w->out[w->code] = 255;
         w->code = w->used++;
     }
@@ -121,7 +121,7 @@ static inline size_t jaxsonar_encode_group(uint8_t *out, size_t size, const jaxs
     jaxsonar_put(&w, group->group, 2);
     jaxsonar_put(&w, group->groups, 2);
     jaxsonar_put_float(&w, group->temperature);
-    jaxsonar_put(&w, count, 4); /* 16 bits, and 16 that are zero */
+    jaxsonar_put(&w, count, 4); /* 16-bit count and 16 reserved bits */
     for (const jaxsonar_echo *e = echoes; count > 0; e++, count--) {
         jaxsonar_put(&w, e->tx, 2);
         jaxsonar_put(&w, e->rx, 2);
@@ -143,7 +143,7 @@ static inline size_t jaxsonar_encode_pose(uint8_t *out, size_t size, const jaxso
     return jaxsonar_finish(&w);
 }
 
-/* Undo COBS in place and check the CRC. frame is without the closing 0x00. Returns the length of the record, or 0. */
+/* Decode COBS in place and check the CRC. frame is without its final 0x00. Returns the length of the record, or 0. */
 static inline size_t jaxsonar_decode(uint8_t *frame, size_t length)
 {
     size_t in = 0, out = 0, block = 0;

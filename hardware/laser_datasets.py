@@ -1,4 +1,4 @@
-"""Laser scans that come with recordings: what maps from echoes are held against (paper, section 4)."""
+"""Readers of the laser scans in published data sets. Sonar maps are compared with them (paper, section 4)."""
 
 import os
 from dataclasses import dataclass
@@ -7,40 +7,41 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from .datasets import Table, corridor8_poses, text_lines
+from .datasets import NumericTable, corridor8_poses, text_lines
 
 
 @dataclass(frozen=True, eq=False)
 class LaserRecording:
-    """Scans of a laser range finder and where the robot was."""
+    """Scans of a laser range finder, with poses of the robot."""
 
     stamp: Float[np.ndarray, " scans"]
     """Seconds."""
     pose: Float[np.ndarray, "scans 3"]
-    """world_from_robot: x, y (m), theta (rad, [-pi, pi)) from odometry; NaN where there is none."""
+    """world_from_robot: x, y (m), theta (rad, [-pi, pi)) from odometry; NaN if unknown."""
     ranges: Float[np.ndarray, "scans beams"]
-    """Metres from the laser; NaN where nothing came back."""
+    """Metres from the laser; NaN without a return."""
     bearing: Float[np.ndarray, " beams"]
-    """Direction of each beam in the laser's frame, radians, counter-clockwise, ascending."""
+    """Direction of each beam in the laser frame, radians, counter-clockwise, ascending."""
     mount: Float[np.ndarray, "3"]
     """robot_from_laser: x, y (m), yaw (rad)."""
 
 
-def read_corridor8_laser(path: str | os.PathLike[str]) -> LaserRecording:
-    """The laser of corridor8: ``laser.txt`` and ``poses.txt``, a line a scan, no headers.
+def read_corridor8_laser(filename: str | os.PathLike[str]) -> LaserRecording:
+    """Read the laser of corridor8: ``laser.txt`` and ``poses.txt``, one line per scan, no headers.
 
-    Beam i of 361 looks to -90 + 0.5 i deg. 81910 mm is no return; above 60000 and below 60 mm are none, either. The
-    laser sits 0.109 m in front of the robot's origin (+- 0.04 m), turned by -0.4 deg: fitted, no document gives it.
+    Beam i of 361 points to -90 + 0.5 i deg. 81910 mm means no return; ranges above 60000 mm and below 60 mm are treated
+    as no return, too. The mount (0.109 m +- 0.04 m in front of the robot's origin, yaw -0.4 deg) was fitted to the
+    data; no document states it.
 
     Args:
-        path: the folder with both files, or its ``laser.txt``.
+        filename: the folder with both files, or its ``laser.txt``.
 
     Raises:
-        SonarError: a file is missing, a row is malformed, or the two files do not agree.
+        SonarError: a missing file, a malformed row, or files that contradict each other.
     """
-    file = Path(path) / "laser.txt" if Path(path).is_dir() else Path(path)
+    file = Path(filename) / "laser.txt" if Path(filename).is_dir() else Path(filename)
     beams = [f"range {k}" for k in range(361)]
-    table = Table(file, text_lines(file), ("t_ms", *beams), separator=None)
+    table = NumericTable(file, text_lines(file), ("t_ms", *beams), separator=None)
     reported = table.number[:, 1:]
     table.refuse((reported < 0) | (reported > 81910), beams, "a range of 0 to 81910 mm, which is no return")
     stamp, pose = corridor8_poses(table)

@@ -1,150 +1,154 @@
-"""Raw records: every message as a frame, with the host's and the device's clock, in an MCAP file (extra ``live``).
+"""Raw recordings: every message as a wire frame, with host and device clock, in an MCAP file (extra ``live``).
 
-Chunks are small and closed at least every half second: of a file that was cut off, all but the last of them can be
-read from the beginning on.
+Chunks are small and closed at least every half second. Of a truncated file everything but the last chunk is readable.
 """
 
 import json
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from .errors import SonarError
+from .errors import SonarError, shown
 from .messages import Message
 from .protocol import encode
-from .recorder_base import FLUSHED, Recorder
-from .transport_base import EndOfStream, Event, Source, Url, shown
+from .recorder_base import FLUSH_INTERVAL, Recorder
+from .transport_base import EndOfStream, LinkEvent, Source, Url
 
-CHUNK = 16 * 1024
-"""Bytes."""
+CHUNK_SIZE = 16 * 1024
+"""Size of an MCAP chunk, bytes. Small, because a truncated file loses its last chunk."""
 MESSAGES, EVENTS = "jaxsonar/messages", "jaxsonar/events"
-"""Topics: frames of the wire protocol, with their final 0x00; what became of the link, as JSON."""
+"""Topics: frames of the wire protocol with their final 0x00; link events as JSON."""
 ENCODING = "jaxsonar-frame"
-_LONGEST_WAIT = 0.05
+PROFILE = "jaxsonar"
+"""Profile in the header of a raw recording."""
 
 
 class McapRecorder(Recorder):
-    """Messages and events as they come. Log time is the host's clock, publish time the device's."""
+    """Records messages and link events. MCAP's log time is the host clock, its publish time the device clock."""
 
-    def __init__(self, path: str | os.PathLike[str]):
-        """Begin a record; the file is replaced at once.
+    def __init__(self, filename: str | os.PathLike[str]):
+        """Start a recording; an existing file is replaced at once.
 
         Raises:
-            SonarError: it cannot be written, or the extra is missing.
+            SonarError: the file cannot be written, or the extra is missing.
         """
-        _, writing = _mcap(path)
-        self._path = path
+        _, writer_module = _mcap(filename)
+        self._filename = filename
         try:
-            self._file: Any = open(path, "wb")  # noqa: SIM115  closed by close()
+            self._file: Any = open(filename, "wb")  # noqa: SIM115  closed by close()
         except OSError as failure:
             raise SonarError(
-                f"{shown(path)}: cannot write: {failure.strerror}; allowed is a file you may write"
+                f"{shown(filename)}: cannot write: {failure.strerror}; allowed is a file you may write"
             ) from None
-        self._writer: Any = writing.Writer(self._file, chunk_size=CHUNK)
-        self._writer.start(profile="jaxsonar")
+        self._writer: Any = writer_module.Writer(self._file, chunk_size=CHUNK_SIZE)
+        self._writer.start(profile=PROFILE)
         self._messages = self._writer.register_channel(MESSAGES, ENCODING, 0)
         self._events = self._writer.register_channel(EVENTS, "json", 0)
-        self._flushed = 0.0
+        self._flushed_at = 0.0
 
     def message(self, message: Message, received: float) -> None:
         """See ``Recorder``."""
         self._add(self._messages, received, encode(message), message.time_us * 1000, message.sequence)
 
-    def event(self, event: Event) -> None:
+    def event(self, event: LinkEvent) -> None:
         """See ``Recorder``."""
-        said = {"kind": event.kind, "text": event.text, "time": event.time}
-        self._add(self._events, event.time, json.dumps(said).encode(), int(event.time * 1e9), 0)
+        record = {"kind": event.kind, "text": event.text, "time": event.time}
+        self._add(self._events, event.time, json.dumps(record).encode(), int(event.time * 1e9), 0)
 
     def tick(self, now: float) -> None:
         """See ``Recorder``."""
-        if now - self._flushed >= FLUSHED:
-            self._flushed = now
-            self._told(self._writer.flush)
+        if now - self._flushed_at >= FLUSH_INTERVAL:
+            self._flushed_at = now
+            self._write(self._writer.flush)
 
     def close(self) -> None:
         """See ``Recorder``."""
         if self._file is not None:
             file, self._file = self._file, None
-            self._told(self._writer.finish)
-            self._told(file.close)
+            self._write(self._writer.finish)
+            self._write(file.close)
 
-    def _add(self, channel: int, received: float, data: bytes, device: int, sequence: int) -> None:
+    def _add(self, channel: int, received: float, data: bytes, device_ns: int, sequence: int) -> None:
         def add() -> None:
-            self._writer.add_message(channel, int(received * 1e9), data, min(device, (1 << 64) - 1), sequence)
+            self._writer.add_message(channel, int(received * 1e9), data, min(device_ns, (1 << 64) - 1), sequence)
 
-        self._told(add)
+        self._write(add)
 
-    def _told(self, write: Any) -> None:
+    def _write(self, write: Callable[[], Any]) -> None:
+        """Call a function of the writer; report its I/O error as a SonarError."""
         try:
             write()
         except OSError as failure:
-            raise SonarError(f"{shown(self._path)}: {failure.strerror}; needed is room for the record") from None
+            needed = "enough disk space for the recording"
+            raise SonarError(f"{shown(self._filename)}: {failure.strerror}; needed is {needed}") from None
 
 
-def read_mcap(path: str | os.PathLike[str]) -> Iterator[tuple[str, float, bytes]]:
-    """What a raw record holds, from its beginning; one that was cut off as far as it can be read.
+def read_mcap(filename: str | os.PathLike[str]) -> Iterator[tuple[str, float, bytes]]:
+    """Read a raw recording from its beginning, a truncated one as far as possible.
 
     Yields:
         Topic, host clock in seconds since 1970, and the frame or the JSON text.
 
     Raises:
-        SonarError: the file cannot be read or is no raw record, or the extra is missing.
+        SonarError: the file cannot be read, is not a raw recording, or the extra is missing.
     """
-    reading, _ = _mcap(path)
+    mcap_records, _ = _mcap(filename)
     try:
-        with open(path, "rb") as file:
+        with open(filename, "rb") as file:
             topics: dict[int, str] = {}
-            began = False
+            started = False
             try:
-                for record in reading.StreamReader(file, record_size_limit=1 << 28).records:
-                    began = True
-                    if isinstance(record, reading.Channel):
+                for record in mcap_records.StreamReader(file, record_size_limit=1 << 28).records:
+                    started = True
+                    if isinstance(record, mcap_records.Channel):
                         topics[record.id] = record.topic
-                    elif isinstance(record, reading.Message) and record.channel_id in topics:
+                    elif isinstance(record, mcap_records.Message) and record.channel_id in topics:
                         yield topics[record.channel_id], record.log_time * 1e-9, record.data
             except OSError:
                 raise
-            except Exception:  # whatever a library says of bytes that stop in the middle
-                if not began:
-                    raise SonarError(f"{shown(path)}: this is no MCAP file; needed is a record (MCAP)") from None
+            except Exception:  # the library raises many types on truncated data
+                if not started:
+                    raise SonarError(f"{shown(filename)}: this is no MCAP file; needed is a record (MCAP)") from None
             if topics and MESSAGES not in topics.values():
                 others = shown(", ".join(sorted(topics.values())))
-                raise SonarError(f"{shown(path)}: topics {others}; needed is {MESSAGES}, which a record has")
+                raise SonarError(f"{shown(filename)}: topics {others}; needed is {MESSAGES}, which a record has")
     except OSError as failure:
-        raise SonarError(f"{shown(path)}: {failure.strerror}; needed is a readable file with a record (MCAP)") from None
+        needed = "a readable file with a record (MCAP)"
+        raise SonarError(f"{shown(filename)}: {failure.strerror}; needed is {needed}") from None
 
 
 class McapPlayer(Source):
-    """A raw record as a source of bytes, with the times between its messages."""
+    """Replays a raw recording as a source of bytes, with the recorded time between messages."""
 
     def __init__(self, url: Url, *, speed: float):
-        """Open a record.
+        """Open a recording.
 
         Args:
-            url: its ``path`` is the file.
-            speed: how many times as fast as it was recorded; 0: as fast as it goes.
+            url: its ``path`` is the filename.
+            speed: playback speed relative to the recording; 0: as fast as possible.
 
         Raises:
-            SonarError: it cannot be read.
+            SonarError: the file cannot be read.
         """
         self.url = url.text
         self._speed = speed
-        self._frames = ((when, data) for topic, when, data in read_mcap(url.path) if topic == MESSAGES)
-        self._next = next(self._frames, None)  # so that a file that is none is refused here
-        self._zero: tuple[float, float] | None = None
+        self._frames = ((time_s, data) for topic, time_s, data in read_mcap(url.path) if topic == MESSAGES)
+        self._next = next(self._frames, None)  # reports an unreadable file here, not in the first read()
+        self._start: tuple[float, float] | None = None
+        """Host clock now (``time.monotonic``) and in the recording, of the first frame."""
         self._closed = threading.Event()
 
     def read(self, timeout: float) -> bytes | None:
         """See ``Source``."""
         if self._next is None or self._closed.is_set():
             raise EndOfStream(f"{self.url}: the record ends here")
-        when, data = self._next
+        time_s, data = self._next
         if self._speed:
             now = time.monotonic()
-            self._zero = self._zero or (now, when)
-            wait = self._zero[0] + (when - self._zero[1]) / self._speed - now
+            self._start = self._start or (now, time_s)
+            wait = self._start[0] + (time_s - self._start[1]) / self._speed - now
             if wait > 0:
                 self._closed.wait(min(wait, timeout))
             if wait > timeout:
@@ -157,16 +161,17 @@ class McapPlayer(Source):
         self._closed.set()
 
 
-def _mcap(path: str | os.PathLike[str]) -> tuple[Any, Any]:
+def _mcap(filename: str | os.PathLike[str]) -> tuple[Any, Any]:
+    """The classes for reading, and the module for writing, of the library ``mcap``."""
     try:
         import mcap.records
         import mcap.stream_reader
         import mcap.writer
     except ImportError:
-        raise SonarError(f"{shown(path)}: records need the extra live: pip install 'jaxsonar[live]'") from None
+        raise SonarError(f"{shown(filename)}: records need the extra live: pip install 'jaxsonar[live]'") from None
 
-    class Reading:
+    class McapRecords:
         StreamReader = mcap.stream_reader.StreamReader
         Channel, Message = mcap.records.Channel, mcap.records.Message
 
-    return Reading, mcap.writer
+    return McapRecords, mcap.writer

@@ -1,6 +1,6 @@
-"""Frames on the wire: COBS, ended by 0x00, little-endian, CRC-32 (``docs/protocol.md``, ``jaxsonar_wire.h``).
+"""Wire protocol: COBS frames terminated by 0x00, little-endian, CRC-32 (``docs/protocol.md``, ``jaxsonar_wire.h``).
 
-A frame that a link damaged, or that says what no device can say, is counted and never becomes an echo.
+A damaged frame, or a frame with values that no device can report, is counted and discarded.
 """
 
 import struct
@@ -14,144 +14,147 @@ from .errors import SonarError
 from .messages import ECHO, Group, Message, Pose
 
 MAJOR, MINOR = 1, 0
-"""The version of the protocol. Each type of message carries the version that its layout first had."""
+"""Protocol version. Each message type carries the version in which its layout was introduced."""
 GROUP, POSE, END = 1, 2, 3
-"""Types of messages."""
-LARGEST_GROUP = 4096
-"""Echoes in one frame."""
-LONGEST_TIME_US = 1e6
-"""Time of flight: 171 m there and 171 m back."""
-COLDEST, HOTTEST = -100.0, 200.0
-"""Degrees Celsius."""
-FARTHEST = 1e8
-"""Metres, of an odometry."""
-LARGEST_ANGLE = 1e6
-"""Radians, of an odometry that does not wrap."""
+"""Message types."""
+MAX_GROUP_ECHOES = 4096
+"""Maximum number of echoes in one frame."""
+MAX_TIME_OF_FLIGHT_US = 1e6
+"""Maximum two-way time of flight, microseconds: a range of 171 m."""
+MIN_TEMPERATURE, MAX_TEMPERATURE = -100.0, 200.0
+"""Limits of the air temperature, degrees Celsius."""
+MAX_POSITION = 1e8
+"""Maximum absolute odometry position, metres."""
+MAX_ANGLE = 1e6
+"""Maximum absolute odometry heading, radians; odometry need not wrap."""
 
 _HEAD = struct.Struct("<BBBBIQ")
 _GROUP = struct.Struct("<BBBBIQIHHfHH")
 _POSE = struct.Struct("<BBBBIQddd")
 _CRC = struct.Struct("<I")
-LONGEST_PAYLOAD = _GROUP.size + LARGEST_GROUP * ECHO.itemsize + _CRC.size
-LONGEST_FRAME = LONGEST_PAYLOAD + LONGEST_PAYLOAD // 254 + 1
-"""Bytes of a frame on the wire, without the 0x00 that ends it; it fits a UDP datagram."""
+MAX_PAYLOAD_BYTES = _GROUP.size + MAX_GROUP_ECHOES * ECHO.itemsize + _CRC.size
+MAX_FRAME_BYTES = MAX_PAYLOAD_BYTES + MAX_PAYLOAD_BYTES // 254 + 1
+"""Maximum size of a frame without its final 0x00; it fits a UDP datagram."""
 
 
 @dataclass
-class Counts:
-    """What a decoder met."""
+class DecoderCounts:
+    """Counters of a decoder."""
 
     frames: int = 0
-    """Frames understood."""
+    """Valid frames."""
     damaged: int = 0
-    """Pieces between two 0x00 that are no whole frame, or whose CRC is wrong."""
+    """Data between two 0x00 that is not valid COBS, too short, or has a wrong CRC."""
     oversized: int = 0
-    """Pieces longer than any frame, thrown away as they came."""
+    """Data longer than any frame, discarded on arrival."""
     impossible: int = 0
-    """Frames with a right CRC that hold what no device can mean: counts, times or numbers out of bounds."""
+    """Frames with a valid CRC but invalid content: counts, times or numbers out of bounds."""
     out_of_ring: int = 0
-    """Frames with sensors that the ring does not have."""
+    """Frames with sensor numbers that the ring does not have."""
     unknown: int = 0
-    """Frames of a type that this version does not know."""
+    """Frames of an unknown message type."""
     newer: int = 0
-    """Frames of a newer minor version, skipped."""
+    """Frames of a newer minor version; skipped."""
     refused: int = 0
-    """Frames of a newer major version."""
+    """Frames of a newer major version; rejected."""
 
     @property
     def rejected(self) -> int:
-        """Everything that did not become a message."""
+        """Number of all frames that gave no message."""
         return sum(vars(self).values()) - self.frames
 
 
 def encode(message: Message) -> bytes:
-    """A message as a frame, with the 0x00 that ends it.
+    """Encode a message as a frame with its final 0x00.
 
     Args:
-        message: floats of a ``Group`` are rounded to 32 bits; those of a ``Pose`` stay as they are.
+        message: floats of a ``Group`` are rounded to 32 bits; those of a ``Pose`` stay 64 bits.
 
     Raises:
-        SonarError: a value that no frame can hold, named with what is allowed.
+        SonarError: a value outside its range; the message names the allowed range.
     """
-    _whole("sequence", message.sequence, 32)
-    _whole("time_us", message.time_us, 64)
+    _check_unsigned("sequence", message.sequence, 32)
+    _check_unsigned("time_us", message.time_us, 64)
     if isinstance(message, Pose):
         pose = (message.x, message.y, message.theta)
-        if not _possible_pose(*pose):
-            allowed = f"x and y up to {FARTHEST:g} m, theta up to {LARGEST_ANGLE:g} rad, or NaN for all three"
+        if not _is_valid_pose(*pose):
+            allowed = f"x and y up to {MAX_POSITION:g} m, theta up to {MAX_ANGLE:g} rad, or NaN for all three"
             raise SonarError(f"pose message: {pose} came; allowed are {allowed}")
-        return frame(_POSE.pack(MAJOR, MINOR, POSE, 0, message.sequence, message.time_us, *pose))
+        return encode_frame(_POSE.pack(MAJOR, MINOR, POSE, 0, message.sequence, message.time_us, *pose))
     _check_group(message)
     head = (message.sequence, message.time_us, message.scan, message.group, message.groups, message.temperature)
-    return frame(_GROUP.pack(MAJOR, MINOR, GROUP, 0, *head, len(message.echoes), 0) + message.echoes.tobytes())
+    return encode_frame(_GROUP.pack(MAJOR, MINOR, GROUP, 0, *head, len(message.echoes), 0) + message.echoes.tobytes())
 
 
 def encode_end(sequence: int, time_us: int) -> bytes:
-    """The frame of a sender that says no more: how a stream ends on lines that cannot be closed (udp, serial, pty).
+    """Encode an end frame. It ends a stream on links that cannot be closed (udp, serial, pty).
 
     Args:
-        sequence: as in every message.
+        sequence: sequence number, shared with all messages.
         time_us: device clock, microseconds.
 
     Raises:
-        SonarError: a value that no frame can hold.
+        SonarError: a value outside its range.
     """
-    _whole("sequence", sequence, 32)
-    _whole("time_us", time_us, 64)
-    return frame(_HEAD.pack(MAJOR, MINOR, END, 0, sequence, time_us))
+    _check_unsigned("sequence", sequence, 32)
+    _check_unsigned("time_us", time_us, 64)
+    return encode_frame(_HEAD.pack(MAJOR, MINOR, END, 0, sequence, time_us))
 
 
-def frame(record: bytes) -> bytes:
-    """Any record as a frame: CRC-32 behind it, COBS, 0x00. What it holds is not looked at."""
+def encode_frame(record: bytes) -> bytes:
+    """Encode any record as a frame: append CRC-32, apply COBS, append 0x00. The content is not checked."""
     return cobs.encode(record + _CRC.pack(zlib.crc32(record))) + b"\0"
 
 
 class Decoder:
-    """Bytes of any source, in pieces of any size, to messages. Holds at most one frame's worth of bytes.
+    """Decodes a stream of bytes to messages. Buffers at most one frame.
 
-    How the bytes are cut into pieces makes no difference to messages and counts.
+    Messages and counters do not depend on how the stream is split into chunks.
     """
 
     def __init__(self, *, sensors: int | None = None):
-        """A decoder for one sender.
+        """A decoder for one device.
 
         Args:
-            sensors: sensors of the ring; a frame with a number beyond is counted as ``out_of_ring``. None: any number.
+            sensors: number of sensors; frames with a larger sensor number count as ``out_of_ring``. None: no limit.
         """
-        self.counts = Counts()
+        self.counts = DecoderCounts()
         self.ended = False
-        """The sender's last frame said that it was the last; a later frame takes that back."""
+        """The latest frame was an end frame. A later frame resets this."""
         self.version = (MAJOR, MINOR)
-        """The newest version that the sender used, (major, minor)."""
+        """The newest version seen, (major, minor)."""
         self._sensors = 1 << 16 if sensors is None else sensors
-        self._held = bytearray()
+        self._buffer = bytearray()
         self._skipping = False
 
     def feed(self, data: bytes) -> list[Message]:
-        """The messages that these bytes complete, in their order.
+        """Decode a chunk of bytes.
 
         Args:
-            data: what came, a part of a frame or many of them.
+            data: any number of bytes: a part of a frame, or several frames.
+
+        Returns:
+            The messages that were completed, in order.
         """
         messages = []
-        *ends, rest = data.split(b"\0")
-        for piece in ends:
-            if self._held:
-                piece = bytes(self._held + piece)
-                self._held.clear()
+        *pieces, rest = data.split(b"\0")
+        for piece in pieces:
+            if self._buffer:
+                piece = bytes(self._buffer + piece)
+                self._buffer.clear()
             if self._skipping:
-                self._skipping = False  # counted when it grew too long
-            elif len(piece) > LONGEST_FRAME:
+                self._skipping = False  # already counted as oversized
+            elif len(piece) > MAX_FRAME_BYTES:
                 self.counts.oversized += 1
-            elif piece:  # nothing between two 0x00 is how a sender makes sure that a new frame begins
+            elif piece:  # an empty piece is allowed: a device may send an extra 0x00 to resynchronize
                 message = self._message(piece)
                 if message is not None:
                     messages.append(message)
         if not self._skipping:
-            self._held += rest[: LONGEST_FRAME + 1]
-            if len(self._held) > LONGEST_FRAME:
+            self._buffer += rest[: MAX_FRAME_BYTES + 1]
+            if len(self._buffer) > MAX_FRAME_BYTES:
                 self.counts.oversized += 1
-                self._held.clear()
+                self._buffer.clear()
                 self._skipping = True
         return messages
 
@@ -192,20 +195,20 @@ class Decoder:
         if size < _GROUP.size:
             counts.impossible += 1
             return None
-        *_, sequence, time_us, scan, group, groups, temperature, count, zero = _GROUP.unpack_from(payload)
-        # The length must be what the count says: with it, damage that a CRC lets through has to be right twice.
+        *_, sequence, time_us, scan, group, groups, temperature, count, reserved = _GROUP.unpack_from(payload)
+        # The redundancy of length and count catches damage that the CRC misses.
         if (
             size != _GROUP.size + count * ECHO.itemsize
-            or zero
-            or count > LARGEST_GROUP
+            or reserved
+            or count > MAX_GROUP_ECHOES
             or group >= groups
-            or temperature < COLDEST
-            or temperature > HOTTEST
+            or temperature < MIN_TEMPERATURE
+            or temperature > MAX_TEMPERATURE
         ):
             counts.impossible += 1
             return None
         echoes = np.frombuffer(payload, ECHO, count, _GROUP.size)
-        if count and not _possible_echoes(echoes):
+        if count and not _are_valid_echoes(echoes):
             counts.impossible += 1
             return None
         if count and max(echoes["tx"].max(), echoes["rx"].max()) >= self._sensors:
@@ -220,7 +223,7 @@ class Decoder:
             self.counts.impossible += 1
             return None
         *_, sequence, time_us, x, y, theta = _POSE.unpack_from(payload)
-        if not _possible_pose(x, y, theta):
+        if not _is_valid_pose(x, y, theta):
             self.counts.impossible += 1
             return None
         self.counts.frames += 1
@@ -228,38 +231,38 @@ class Decoder:
         return Pose(sequence, time_us, x, y, theta)
 
 
-def _possible_pose(x: float, y: float, theta: float) -> bool:
-    if x != x and y != y and theta != theta:  # NaN, all of them: not known
+def _is_valid_pose(x: float, y: float, theta: float) -> bool:
+    if x != x and y != y and theta != theta:  # all NaN: pose unknown
         return True
-    return abs(x) <= FARTHEST and abs(y) <= FARTHEST and abs(theta) <= LARGEST_ANGLE
+    return abs(x) <= MAX_POSITION and abs(y) <= MAX_POSITION and abs(theta) <= MAX_ANGLE
 
 
-def _possible_echoes(echoes: np.ndarray) -> bool:
+def _are_valid_echoes(echoes: np.ndarray) -> bool:
     time = echoes["time_us"]
-    # min and max of anything with NaN are NaN, which compares as False
-    return bool(time.min() > 0 and time.max() <= LONGEST_TIME_US and not np.isinf(echoes["amplitude"]).any())
+    # With a NaN, min and max are NaN, and the comparisons are False.
+    return bool(time.min() > 0 and time.max() <= MAX_TIME_OF_FLIGHT_US and not np.isinf(echoes["amplitude"]).any())
 
 
-def _whole(name: str, value: int, bits: int) -> None:
+def _check_unsigned(name: str, value: int, bits: int) -> None:
     if not 0 <= value < 1 << bits:
         raise SonarError(f"message: {name} {value} came; allowed is a whole number of {bits} bits, 0 or more")
 
 
 def _check_group(message: Group) -> None:
-    _whole("scan", message.scan, 32)
-    _whole("groups", message.groups, 16)
-    place = f"group message (scan {message.scan}, group {message.group})"
+    _check_unsigned("scan", message.scan, 32)
+    _check_unsigned("groups", message.groups, 16)
+    where = f"group message (scan {message.scan}, group {message.group})"
     if not 0 <= message.group < message.groups:
         allowed = f"0 to groups - 1, which is {message.groups - 1}"
-        raise SonarError(f"{place}: group {message.group} came; allowed is {allowed}")
-    if message.temperature < COLDEST or message.temperature > HOTTEST:
-        allowed = f"{COLDEST:g} to {HOTTEST:g} deg C, or NaN"
-        raise SonarError(f"{place}: temperature {message.temperature:g} came; allowed is {allowed}")
+        raise SonarError(f"{where}: group {message.group} came; allowed is {allowed}")
+    if message.temperature < MIN_TEMPERATURE or message.temperature > MAX_TEMPERATURE:
+        allowed = f"{MIN_TEMPERATURE:g} to {MAX_TEMPERATURE:g} deg C, or NaN"
+        raise SonarError(f"{where}: temperature {message.temperature:g} came; allowed is {allowed}")
     echoes = message.echoes
     if echoes.dtype != ECHO:
-        raise SonarError(f"{place}: echoes of type {echoes.dtype} came; allowed is messages.ECHO")
-    if len(echoes) > LARGEST_GROUP:
-        raise SonarError(f"{place}: {len(echoes)} echoes came; allowed are up to {LARGEST_GROUP}")
-    if len(echoes) and not _possible_echoes(echoes):
-        allowed = f"times above 0 and up to {LONGEST_TIME_US:g} us, amplitudes finite or NaN"
-        raise SonarError(f"{place}: an echo that no device can report came; allowed are {allowed}")
+        raise SonarError(f"{where}: echoes of type {echoes.dtype} came; allowed is messages.ECHO")
+    if len(echoes) > MAX_GROUP_ECHOES:
+        raise SonarError(f"{where}: {len(echoes)} echoes came; allowed are up to {MAX_GROUP_ECHOES}")
+    if len(echoes) and not _are_valid_echoes(echoes):
+        allowed = f"times above 0 and up to {MAX_TIME_OF_FLIGHT_US:g} us, amplitudes finite or NaN"
+        raise SonarError(f"{where}: an echo that no device can report came; allowed are {allowed}")

@@ -1,79 +1,90 @@
-"""The thread that reads a device: bytes to messages to scans, into the record and into the queue.
+"""The thread that reads a device: bytes to messages to scans, into the recorder and into the queue.
 
-What goes wrong in it is raised where the scans are taken; the end of the stream is the end of the queue.
+An error in this thread is raised in the thread that takes the scans. The end of the stream closes the queue.
 """
 
 import threading
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
-from .drop_oldest_queue import NewestQueue
+from .drop_oldest_queue import DropOldestQueue
 from .protocol import Decoder
 from .recorder_base import Recorder
-from .scan_assembler import Assembler, RawScan
-from .transport_base import EndOfStream, Event, Source
-
-LOOK = 0.1
-"""Seconds between two looks at the clock and at whether to stop."""
-AHEAD = 1.5
-"""Times as fast as the host's clock, from which on a device is played back."""
-GRACE = 0.3
-"""Seconds after a sender's last frame in which others may still come, out of order."""
+from .scan_assembler import RawScan, ScanAssembler
+from .transport_base import EndOfStream, LinkEvent, Source
 
 
-class Reader:
-    """Reads a source in a thread of its own until it ends or ``stop`` is called."""
+@dataclass(frozen=True)
+class ReaderSettings:
+    """Timing of the reading thread. All values are chosen by hand."""
+
+    poll_interval: float = 0.1
+    """Maximum time of one read, seconds. Between reads the thread checks the clock and the stop event."""
+    replay_speed: float = 1.5
+    """A device whose clock runs faster than the host clock by this factor is a replay."""
+    replay_margin: float = 1.0
+    """Seconds that the device clock may run ahead before ``replay_speed`` counts; covers jitter at the start."""
+    end_grace: float = 0.3
+    """Seconds to keep reading after an end frame; earlier frames may still arrive out of order."""
+
+
+SETTINGS = ReaderSettings()
+
+
+class ReaderThread:
+    """Reads a source in its own thread until the source ends or ``stop`` is called."""
 
     def __init__(
         self,
         source: Source,
-        queue: NewestQueue[RawScan],
+        queue: DropOldestQueue[RawScan],
         *,
         sensors: int | None = None,
         recorder: Recorder | None = None,
         scans: int | None = None,
-        patient: bool | None = False,
+        block_when_full: bool | None = False,
     ):
-        """Take over a source and a recorder: both are closed when the thread ends.
+        """Take ownership of a source and a recorder. Both are closed when the thread ends.
 
         Args:
-            source: of bytes; its events are told to ``event``.
-            queue: gets the scans, and is closed at the end.
-            sensors: sensors of the ring, to refuse others.
-            recorder: gets every message, scan and event, also those that the queue drops.
-            scans: stop after this many; None: when the source ends.
-            patient: wait while the queue is full instead of dropping scans: True for files, False for links that lose
-                what is not read (udp), None for those that hold it (tcp): then a device that runs ahead of its own
-                clock, which is played back and can wait, is waited for, and a live one is not.
+            source: source of bytes. Its link events are to be passed to ``event``.
+            queue: receives the scans; closed at the end.
+            sensors: number of sensors of the ring; frames with other sensor numbers are rejected.
+            recorder: receives every message, scan and event, including scans that the queue drops.
+            scans: stop after this many scans; None: when the source ends.
+            block_when_full: backpressure. True: wait while the queue is full (files). False: drop the oldest scan
+                (udp, which loses what is not read). None: wait only for a device that runs faster than the host clock,
+                because it is a replay and can wait (tcp, which buffers what is not read).
         """
         self.decoder = Decoder(sensors=sensors)
-        self.assembler = Assembler(sensors=sensors)
-        self.last_event: Event | None = None
-        """The latest word about the link."""
+        self.assembler = ScanAssembler(sensors=sensors)
+        self.last_event: LinkEvent | None = None
+        """The latest link event."""
         self.gaps = 0
-        """Times that the link was lost."""
+        """Number of times that the link was lost."""
         self._source, self._queue, self._recorder = source, queue, recorder
-        self._left = scans
-        self._patient = patient
-        self._began: tuple[float, float] | None = None
-        self._waited = 0.0
+        self._scans_left = scans
+        self._block_when_full = block_when_full
+        self._first_scan: tuple[float, float] | None = None
+        """Device time stamp and time of arrival of the first scan, seconds."""
+        self._blocked_time = 0.0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="jaxsonar reader", daemon=True)
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop reading; on return what came so far is written and in the queue."""
+        """Stop reading. On return everything received is recorded and in the queue."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join()
 
-    def event(self, event: Event) -> None:
-        """Take note of something about the link; for ``open_source``, called in the reading thread."""
+    def event(self, event: LinkEvent) -> None:
+        """Handle a link event. Pass this method to ``open_source``; it is called in the reading thread."""
         if self.decoder.ended:
-            return  # a device that has said its last word may go
+            return  # the device sent its end frame; a lost link is expected
         self.last_event = event
         self.gaps += event.kind == "lost"
         if self._recorder is not None:
@@ -81,17 +92,18 @@ class Reader:
 
     @property
     def counts(self) -> dict[str, int]:
-        """What decoder, assembler and queue met, by name."""
+        """Counters of decoder, assembler and queue, by name."""
         frames, groups = self.decoder.counts, self.assembler.counts
         both = {"impossible": frames.impossible + groups.impossible, "rejected": frames.rejected + groups.impossible}
         own = {"dropped": self._queue.dropped, "gaps": self.gaps}
         return asdict(frames) | asdict(groups) | both | own
 
     def _run(self) -> None:
+        """Read until the end, then close source, recorder and queue, whatever failed."""
         error: BaseException | None = None
         try:
             self._read()
-        except BaseException as failure:  # the consumer's to handle, whatever it is
+        except BaseException as failure:  # passed to the consumer through the queue
             error = failure
         for close in (self._source.close, self._recorder.close if self._recorder is not None else None):
             try:
@@ -103,50 +115,52 @@ class Reader:
 
     def _read(self) -> None:
         ended_at: float | None = None
-        while not self._stop.is_set() and self._left != 0:
+        while not self._stop.is_set() and self._scans_left != 0:
             try:
-                data = self._source.read(LOOK)
+                data = self._source.read(SETTINGS.poll_interval)
             except EndOfStream:
                 break
             now = time.monotonic()
             if data:
-                self._take(data, now)
-            self._hand_on(self.assembler.expire(now))
+                self._process(data, now)
+            self._deliver(self.assembler.expire(now))
             if self._recorder is not None:
                 self._recorder.tick(now)
             if not self.decoder.ended:
                 ended_at = None
             elif ended_at is None:
                 ended_at = now
-            elif now - ended_at >= GRACE:
+            elif now - ended_at >= SETTINGS.end_grace:
                 break
-        self._hand_on(self.assembler.flush())
+        self._deliver(self.assembler.flush())
 
-    def _take(self, data: bytes, now: float) -> None:
+    def _process(self, data: bytes, now: float) -> None:
         messages = self.decoder.feed(data)
         counts = self.decoder.counts
-        self.assembler.skipped = counts.unknown + counts.newer > 0
+        self.assembler.unknown_messages = counts.unknown + counts.newer > 0
         for message in messages:
-            if self._left == 0:
+            if self._scans_left == 0:
                 return
             if self._recorder is not None:
                 self._recorder.message(message, time.time())
-            self._hand_on(self.assembler.push(message, now))
+            self._deliver(self.assembler.push(message, now))
 
-    def _hand_on(self, scans: list[RawScan]) -> None:
+    def _deliver(self, scans: list[RawScan]) -> None:
+        """Put scans into the recorder first, then into the queue."""
         for scan in scans:
-            if self._left == 0:
+            if self._scans_left == 0:
                 return
-            if self._left is not None:
-                self._left -= 1
+            if self._scans_left is not None:
+                self._scans_left -= 1
             if self._recorder is not None:
                 self._recorder.scan(scan)
-            wait = self._patient or (self._patient is None and self._played_back(scan))
+            wait = self._block_when_full or (self._block_when_full is None and self._is_replay(scan))
             before = time.monotonic()
             self._queue.put(scan, wait=self._stop if wait else None)
-            self._waited += time.monotonic() - before
+            self._blocked_time += time.monotonic() - before
 
-    def _played_back(self, scan: RawScan) -> bool:
-        """Whether the device's clock runs far ahead of the host's, apart from the time that it was made to wait."""
-        first_stamp, first_received = self._began = self._began or (scan.stamp, scan.received)
-        return scan.stamp - first_stamp > AHEAD * (scan.received - first_received - self._waited) + 1.0
+    def _is_replay(self, scan: RawScan) -> bool:
+        """Whether the device clock runs far ahead of the host clock, not counting the time blocked by the queue."""
+        first_stamp, first_received = self._first_scan = self._first_scan or (scan.stamp, scan.received)
+        host_time = scan.received - first_received - self._blocked_time
+        return scan.stamp - first_stamp > SETTINGS.replay_speed * host_time + SETTINGS.replay_margin

@@ -1,8 +1,8 @@
-"""What a device said, on disk while it says it: scan logs here, raw messages in ``recording_mcap``.
+"""Recorders: scan logs as CSV here, raw messages in ``mcap_recorder``.
 
-A scan is handed to the operating system as soon as it is whole, so that a process that is killed loses what it was
-writing just then. While a log is being written there is a small file beside it, named like it with ``.recording``
-behind (``mark_of``), that says how many of its bytes are whole scans. If it is still there, readers go by it.
+A scan is handed to the operating system as soon as it is complete. A killed process loses at most the scan that it was
+writing. While a log is being recorded, a marker file lies beside it (``recording_marker``, suffix ``.recording``). It
+holds the number of bytes of the log that are complete scans. Readers of a log evaluate a marker that is left over.
 """
 
 import os
@@ -10,130 +10,130 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import SonarError
-from .recorder_base import Recorder, mark_of
+from .errors import SonarError, shown
+from .recorder_base import Recorder, recording_marker
 from .scan_assembler import RawScan
-from .transport_base import OnEvent, Source, Url, shown
+from .transport_base import OnEvent, Source, Url
 
 HEADER = "scan,stamp,x,y,theta,tx,rx,range,amplitude\n"
 """Columns of a scan log."""
 
 
-def open_recorder(path: str | os.PathLike[str]) -> Recorder:
-    """Begin a record; the suffix decides what is kept.
+def open_recorder(filename: str | os.PathLike[str]) -> Recorder:
+    """Start a recording. The suffix selects the format.
 
-    ``.csv``: a scan log. ``.mcap``: all messages with both clocks, each group's pose and temperature, and what became
-    of the link (extra ``live``).
+    ``.csv``: a scan log. ``.mcap``: all messages with host and device clock, and the link events (extra ``live``).
 
     Args:
-        path: the file, replaced at once.
+        filename: the file; an existing one is replaced at once.
 
     Raises:
-        SonarError: another suffix, a place that cannot be written, a missing extra.
+        SonarError: another suffix, a file that cannot be written, or a missing extra.
     """
-    suffix = Path(path).suffix.lower()
+    suffix = Path(filename).suffix.lower()
     if suffix == ".csv":
-        return CsvRecorder(path, mark=mark_of(path))
+        return CsvRecorder(filename, marker=recording_marker(filename))
     if suffix == ".mcap":
         from .mcap_recorder import McapRecorder
 
-        return McapRecorder(path)
+        return McapRecorder(filename)
     came = f"suffix '{shown(suffix)}'" if suffix else "no suffix"
-    raise SonarError(f"{shown(path)}: {came} came; allowed for a record is .csv, .parquet or .mcap")
+    raise SonarError(f"{shown(filename)}: {came} came; allowed for a record is .csv, .parquet or .mcap")
 
 
 class CsvRecorder(Recorder):
-    """A scan log as CSV, scan by scan: each is handed to the operating system in one piece, when it is whole."""
+    """Records a scan log as CSV. Each complete scan is one write to the operating system."""
 
-    def __init__(self, path: str | os.PathLike[str], *, mark: Path):
-        """Begin a log.
+    def __init__(self, filename: str | os.PathLike[str], *, marker: Path):
+        """Create the log and its marker.
 
         Args:
-            path: the file, replaced at once.
-            mark: kept beside it until ``close``: how many bytes are whole scans.
+            filename: the log; an existing one is replaced at once.
+            marker: marker file, kept until ``close``; holds the number of bytes that are complete scans.
 
         Raises:
-            SonarError: it cannot be written.
+            SonarError: a file cannot be written.
         """
-        self._path, self._mark = path, mark
+        self._filename, self._marker = filename, marker
         self._size = 0
-        self._files: list[int] = []
+        self._descriptors: list[int] = []
         try:
-            for name in (mark, path):  # the mark first: a log without one is whole
-                self._files.append(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666))
+            for name in (marker, filename):  # the marker first: a log without one counts as complete
+                self._descriptors.append(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666))
             self._write(HEADER.encode())
         except OSError as failure:
-            for file in self._files:
-                os.close(file)
-            mark.unlink(missing_ok=True)
+            for descriptor in self._descriptors:
+                os.close(descriptor)
+            marker.unlink(missing_ok=True)
             allowed = "a file that you may write"
-            raise SonarError(f"{shown(path)}: cannot write: {failure.strerror}; allowed is {allowed}") from None
+            raise SonarError(f"{shown(filename)}: cannot write: {failure.strerror}; allowed is {allowed}") from None
 
     def scan(self, scan: RawScan) -> None:
         """See ``Recorder``."""
         try:
-            self._write(scan_rows(scan).encode())
+            self._write(csv_rows(scan).encode())
         except OSError as failure:
-            raise SonarError(f"{shown(self._path)}: {failure.strerror}; needed is room for the record") from None
+            needed = "enough disk space for the recording"
+            raise SonarError(f"{shown(self._filename)}: {failure.strerror}; needed is {needed}") from None
 
     def close(self) -> None:
         """See ``Recorder``."""
-        if self._files:
-            for file in self._files:
-                os.close(file)
-            self._files = []
-            self._mark.unlink(missing_ok=True)
+        if self._descriptors:
+            for descriptor in self._descriptors:
+                os.close(descriptor)
+            self._descriptors = []
+            self._marker.unlink(missing_ok=True)
 
     def _write(self, data: bytes) -> None:
-        mark, log = self._files
-        rest = memoryview(data)
-        while rest:
-            rest = rest[os.write(log, rest) :]
+        marker, log = self._descriptors
+        remaining = memoryview(data)
+        while remaining:
+            remaining = remaining[os.write(log, remaining) :]
         self._size += len(data)
-        os.pwrite(mark, f"{self._size:20d}\n".encode(), 0)
+        os.pwrite(marker, f"{self._size:20d}\n".encode(), 0)
 
 
-def scan_rows(scan: RawScan) -> str:
-    """The rows of one scan in a CSV log, with their line ends."""
-    known = np.isfinite(scan.pose).all()
-    pose = ",".join(map(repr, scan.pose.tolist())) if known else ",,"
+def csv_rows(scan: RawScan) -> str:
+    """The CSV rows of one scan, each with its line end."""
+    has_pose = np.isfinite(scan.pose).all()
+    pose = ",".join(map(repr, scan.pose.tolist())) if has_pose else ",,"
     head = f"{scan.scan},{scan.stamp!r},{pose},"
     if not len(scan.echoes):
         return f"{head},,,\n"
     echoes = scan.echoes
     columns = (echoes["tx"].tolist(), echoes["rx"].tolist(), scan.ranges.tolist(), echoes["amplitude"].tolist())
     return "".join(
-        f"{head}{tx},{rx},{reach!r},{'' if loud != loud else repr(loud)}\n"  # NaN is not itself
-        for tx, rx, reach, loud in zip(*columns, strict=True)
+        f"{head}{tx},{rx},{range_!r},{'' if amplitude != amplitude else repr(amplitude)}\n"  # NaN != NaN
+        for tx, rx, range_, amplitude in zip(*columns, strict=True)
     )
 
 
-def open_file(url: Url, *, on_event: OnEvent, reconnect: bool, silence: float) -> Source:
-    """``file:RECORD.mcap?speed=1``: a raw record as if live. See ``open_source``.
+def open_recording(url: Url, *, on_event: OnEvent, reconnect: bool, silence: float) -> Source:
+    """Opener of ``file:RECORD.mcap?speed=1``: replays a raw recording. See ``open_source``.
 
     Args:
-        url: ``speed`` is how many times as fast as it was recorded, 0 as fast as it goes.
-        on_event: told of nothing: a file is always there.
-        reconnect: of no use.
-        silence: of no use.
+        url: option ``speed`` is the playback speed, 0 for as fast as possible.
+        on_event: never called; a file has no link events.
+        reconnect: ignored.
+        silence: ignored.
 
     Raises:
-        SonarError: no such file, another suffix.
+        SonarError: no such file, or another suffix.
     """
     if Path(url.path).suffix.lower() != ".mcap":
-        raise url.fail(f"'{shown(Path(url.path).name)}' came", "a .mcap record (scan logs need jaxsonar.streaming)")
+        raise url.fail(f"'{shown(Path(url.path).name)}' came", "a .mcap record (for scan logs use jaxsonar.stream)")
     from .mcap_recorder import McapPlayer
 
-    return McapPlayer(url, speed=speed_of(url))
+    return McapPlayer(url, speed=playback_speed(url))
 
 
-def speed_of(url: Url) -> float:
-    """The option ``speed`` of a file's URL; 1 without it.
+def playback_speed(url: Url) -> float:
+    """The option ``speed`` of a ``file:`` URL, 1 by default.
 
     Raises:
-        SonarError: it is no such number, or there is another option, a host or no path.
+        SonarError: not a number in range, another option, a host, or no filename.
     """
     url.check_options("speed")
     if url.host or url.port is not None or not url.path:
-        raise url.fail("no path of a file came", "file:LOG?speed=1")
+        raise url.fail("no filename came", "file:LOG?speed=1")
     return url.number("speed", 1.0, 0.0, 1e6)

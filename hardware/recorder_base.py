@@ -5,31 +5,31 @@ from pathlib import Path
 
 from .messages import Message
 from .scan_assembler import RawScan
-from .transport_base import Event
+from .transport_base import LinkEvent
 
-FLUSHED = 0.5
-"""Seconds after which everything is handed to the operating system."""
+FLUSH_INTERVAL = 0.5
+"""Seconds between two flushes to the operating system. Bounds what a killed process loses."""
 
 
 class Recorder:
-    """Where a reader puts what comes; for one thread."""
+    """Receives everything that a reader receives. Not thread-safe. The base class ignores all of it."""
 
     def message(self, message: Message, received: float) -> None:
-        """A message as decoded, and when it came: host clock, seconds since 1970."""
+        """Record a decoded message and its time of arrival (host clock, seconds since 1970)."""
 
     def scan(self, scan: RawScan) -> None:
-        """A scan as it was put together."""
+        """Record an assembled scan."""
 
-    def event(self, event: Event) -> None:
-        """Something about the link: lost, back, silent."""
+    def event(self, event: LinkEvent) -> None:
+        """Record a link event."""
 
     def tick(self, now: float) -> None:
-        """Called at least every 0.1 s, ``time.monotonic``."""
+        """Called at least every 0.1 s with ``time.monotonic()``; a recorder flushes here."""
 
     def close(self) -> None:
-        """Everything is on the disk; a second time does nothing."""
+        """Write everything to disk. Idempotent."""
 
 
-def mark_of(path: str | os.PathLike[str]) -> Path:
-    """The file beside a log that says that it is being written, or was when its process was killed."""
-    return Path(f"{os.fspath(path)}.recording")
+def recording_marker(log: str | os.PathLike[str]) -> Path:
+    """The marker file beside a log: the log is being recorded, or its recording process was killed."""
+    return Path(f"{os.fspath(log)}.recording")

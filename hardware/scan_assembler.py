@@ -1,7 +1,7 @@
-"""Firing groups to scans: put together what belongs together, whatever a link loses, repeats, mixes or delays.
+"""Assembles firing groups to scans, in the presence of lost, repeated, reordered and delayed messages.
 
-A scan is handed on when all its groups are there, when the scan after it is, when a group of the scan after that
-comes, or when nothing has come for a while. What comes later than that is counted and dropped.
+A scan is emitted when all its groups have arrived, when a later scan is emitted, when a group of the scan after the
+next arrives, or after a timeout. Groups that arrive later are counted and dropped.
 """
 
 from bisect import bisect_left, insort
@@ -14,258 +14,275 @@ from jaxtyping import Float, Int, Shaped
 from .messages import ECHO, Group, Message, Pose
 
 REFERENCE_SPEED_OF_SOUND = 343.2
-"""Metres a second; what a log's ranges are times of flight at, whatever the air was."""
-MOST_GROUPS = 256
-"""Groups of one scan; a sender that claims more is not believed."""
-WAITED = 0.5
-"""Seconds without a word after which an incomplete scan is handed on."""
-MOST_ECHOES = 1 << 14
-"""Echoes of one scan, likewise."""
-_LATE = 64  # messages; older ones come from a sender that started anew, or are lost
-_LATE_US = 2_000_000  # device time, likewise
-_REMEMBERED = 256  # messages, to tell repeated ones and gaps
-_CLOSED = 64  # scans that were handed on, to tell late groups
-_HOLD = 3  # messages that a complete scan waits for one that should have come before
-_WRAP = 1 << 32
+"""Metres per second. Fixed reference that converts times of flight to the ranges of a log, whatever the air was."""
+
+
+@dataclass(frozen=True)
+class AssemblerSettings:
+    """Limits of the scan assembler. All values are chosen by hand."""
+
+    max_groups: int = 256
+    """Maximum number of groups in a scan; a message that claims more is invalid."""
+    max_echoes: int = 1 << 14
+    """Maximum number of echoes in a scan; a message that exceeds it is invalid."""
+    incomplete_timeout: float = 0.5
+    """Seconds without a new group after which an incomplete scan is emitted."""
+    max_reordering: int = 64
+    """Messages older than this, in sequence numbers, are late or belong to a restarted device."""
+    max_clock_step_back_us: int = 2_000_000
+    """Messages older than this, in device time (microseconds), are late or belong to a restarted device."""
+    message_history: int = 256
+    """Sequence numbers kept to detect repeated and missing messages."""
+    scan_history: int = 64
+    """Numbers of emitted scans kept to detect late groups."""
+    pose_hold: int = 3
+    """Messages for which a complete scan waits for a missing message that may be a pose."""
+
+
+SETTINGS = AssemblerSettings()
+_SEQUENCE_RANGE = 1 << 32
 
 
 @dataclass(frozen=True, eq=False)
 class RawScan:
-    """One scan as the device told it: times of flight, its own clock, and a pose for each firing group."""
+    """One scan as the device reported it: times of flight, device clock, and one pose per firing group."""
 
     scan: int
-    """The device's number; where a device starts anew, its numbers are made to go on."""
+    """Scan number of the device; continued if the device restarts."""
     stamp: float
-    """Device clock when the first group fired, seconds; made to go on likewise."""
+    """Device clock at the first firing, seconds; continued if the device restarts."""
     pose: Float[np.ndarray, " 3"]
-    """world_from_robot of the last group: x, y (m), theta (rad); NaN where it is not known for certain."""
+    """world_from_robot of the last group: x, y (m), theta (rad); NaN if not known for certain."""
     group_pose: Float[np.ndarray, "groups 3"]
-    """The same of each group; NaN where the group is missing or its pose is not known."""
+    """world_from_robot of each group; NaN if the group is missing or its pose is unknown."""
     echoes: Shaped[np.ndarray, " echoes"]
-    """``messages.ECHO``, group by group; of a ring of known size in the order of its paths, nearest first."""
+    """Dtype ``messages.ECHO``. In the order of the ring's paths, nearest first, if the number of sensors is known;
+    otherwise group by group."""
     group: Int[np.ndarray, " echoes"]
-    """Group of each echo."""
+    """Firing group of each echo."""
     temperature: float
-    """Of the air, degrees Celsius, the mean of what the groups say; NaN where none does."""
+    """Air temperature, degrees Celsius: mean over the groups that report one; NaN if none does."""
     missing: int
-    """Groups that did not come."""
+    """Number of missing groups."""
     received: float
-    """Host clock when the last group came, seconds (``time.monotonic``)."""
+    """Host clock when the last group arrived, seconds (``time.monotonic``)."""
 
     @property
     def ranges(self) -> Float[np.ndarray, " echoes"]:
-        """Half path lengths as a log has them, metres: the one place where times of flight become ranges."""
+        """Half path lengths as in a log, metres. The only conversion of times of flight to ranges."""
         return self.echoes["time_us"].astype(np.float64) * (1e-6 * REFERENCE_SPEED_OF_SOUND / 2)
 
 
 @dataclass
-class AssemblyCounts:
-    """What an assembler met."""
+class AssemblerCounts:
+    """Counters of an assembler."""
 
     scans: int = 0
-    """Scans handed on."""
+    """Scans emitted."""
     echoes: int = 0
     """Echoes in them."""
     missing: int = 0
-    """Groups that those scans lack."""
+    """Groups missing in those scans."""
     repeated: int = 0
-    """Messages that came more than once."""
+    """Messages received more than once."""
     late: int = 0
-    """Messages that came after their scan was handed on."""
+    """Messages that arrived after their scan was emitted."""
     restarts: int = 0
-    """Times that the sender started anew."""
+    """Restarts of the device."""
     impossible: int = 0
-    """Groups that do not fit their scan, or claim more than ``MOST_GROUPS`` or ``MOST_ECHOES``."""
+    """Groups that contradict their scan, or exceed ``max_groups`` or ``max_echoes``."""
     lost: int = 0
-    """Sequence numbers that never came, of messages that were lost, damaged or unknown."""
+    """Missing sequence numbers: lost, damaged or unknown messages."""
 
 
 @dataclass
-class _Open:
-    """A scan that is being put together."""
+class _PartialScan:
+    """A scan that is being assembled."""
 
     groups: int
     parts: dict[int, tuple[int, Group]] = field(default_factory=dict)
-    """Sequence number and group, by number of the group."""
-    last: float = 0.0
-    """Host clock of the latest group."""
+    """Sequence number and message of each group, by group number."""
+    received: float = 0.0
+    """Host clock of the latest group, seconds."""
     echoes: int = 0
-    """Of all parts."""
+    """Number of echoes in all groups."""
 
     @property
     def complete(self) -> bool:
         return len(self.parts) == self.groups
 
 
-class Assembler:
-    """Messages of ONE sender in, scans out; holds at most three scans and the latest messages' numbers."""
+class ScanAssembler:
+    """Assembles the messages of one device. Keeps at most three partial scans and a history of sequence numbers."""
 
-    def __init__(self, *, sensors: int | None = None, waited: float = WAITED):
+    def __init__(self, *, sensors: int | None = None, timeout: float = SETTINGS.incomplete_timeout):
         """A new assembler.
 
         Args:
-            sensors: of the ring, for the order of the echoes; None: as they came.
-            waited: seconds without a group after which ``expire`` hands an incomplete scan on.
+            sensors: number of sensors, to sort the echoes by path; None: order of arrival.
+            timeout: seconds without a group after which ``expire`` emits an incomplete scan.
         """
-        self.counts = AssemblyCounts()
-        self.skipped = False
-        """The sender also says what the decoder does not know, so that a gap in the numbers need not be a lost pose."""
-        self._sensors, self._waited = sensors, waited
+        self.counts = AssemblerCounts()
+        self.unknown_messages = False
+        """The device also sends messages that the decoder skips, so a gap in the sequence need not be a lost pose."""
+        self._sensors, self._timeout = sensors, timeout
         self._suspect: Message | None = None
-        self._anew = False
+        self._renumber = False
         self._scan_offset, self._clock_offset = 0, 0.0
         self._last_stamp, self._last_received = 0.0, 0.0
-        self._lost_before = 0
-        self._forget()
+        self._lost_before_restart = 0
+        self._reset()
 
-    def _forget(self) -> None:
-        """What is only known of one run of the sender."""
-        self._open: dict[int, _Open] = {}
-        self._closed: deque[int] = deque(maxlen=_CLOSED)
-        self._seen: dict[int, tuple[int, int | None]] = {}  # sequence -> device time, and count of groups up to it
+    def _reset(self) -> None:
+        """Reset the state that belongs to one run of the device."""
+        self._partial: dict[int, _PartialScan] = {}
+        self._emitted: deque[int] = deque(maxlen=SETTINGS.scan_history)
+        self._history: dict[int, tuple[int, int | None]] = {}  # sequence -> device time, index of the group
         self._poses: list[tuple[int, Pose]] = []  # by sequence
-        self._first = self._newest = -1
-        self._distinct = 0
-        self._newest_time = 0
+        self._first_sequence = self._newest = -1
+        self._distinct_count = 0
+        self._newest_time_us = 0
         self._newest_scan = -1
 
     def push(self, message: Message, received: float) -> list[RawScan]:
-        """Take in one message.
+        """Add one message.
 
         Args:
-            message: in the order of arrival.
+            message: the message, in order of arrival.
             received: host clock, seconds (``time.monotonic``).
 
         Returns:
-            The scans that this completes or closes, oldest first.
+            The scans that are emitted, oldest first.
         """
-        if self._newest >= 0 and self._is_from_before(message):
+        if self._newest >= 0 and self._is_stale(message):
             suspect, self._suspect = self._suspect, message
             if suspect is None or not _follows(suspect, message):
                 self.counts.late += suspect is not None
                 return []
-            # Two in a row: the sender has started anew, its numbers and perhaps its clock with it.
-            closed = self._start_anew(suspect, received)
-            return [*closed, *self._taken(suspect, received), *self._taken(message, received)]
+            # Two consistent stale messages: the device restarted, and with it its numbers and perhaps its clock.
+            emitted = self._restart(suspect, received)
+            return [*emitted, *self._accept(suspect, received), *self._accept(message, received)]
         if self._suspect is not None:
             self.counts.late += 1
             self._suspect = None
-        return self._taken(message, received)
+        return self._accept(message, received)
 
     def expire(self, now: float) -> list[RawScan]:
-        """Scans whose groups have not come for too long.
+        """Emit incomplete scans after the timeout.
 
         Args:
             now: host clock, seconds (``time.monotonic``).
         """
-        stale = [number for number, scan in self._open.items() if now - scan.last > self._waited]
-        return self._handed_on(max(stale)) if stale else []
+        stale = [number for number, scan in self._partial.items() if now - scan.received > self._timeout]
+        return self._emit_up_to(max(stale)) if stale else []
 
     def flush(self) -> list[RawScan]:
-        """Everything that is left, at the end of a stream."""
+        """Emit all remaining scans, at the end of a stream."""
         self.counts.late += self._suspect is not None
         self._suspect = None
-        return self._handed_on(max(self._open, default=-1))
+        return self._emit_up_to(max(self._partial, default=-1))
 
-    def _is_from_before(self, message: Message) -> bool:
-        sequence = self._unwrapped(message.sequence)
-        known = self._seen.get(sequence)
+    def _is_stale(self, message: Message) -> bool:
+        """Whether a message is far too old: late, or from a restarted device."""
+        sequence = self._unwrap(message.sequence)
+        known = self._history.get(sequence)
         return (
-            sequence <= self._newest - _LATE
-            or message.time_us < self._newest_time - _LATE_US
+            sequence <= self._newest - SETTINGS.max_reordering
+            or message.time_us < self._newest_time_us - SETTINGS.max_clock_step_back_us
             or (known is not None and known[0] != message.time_us)
         )
 
-    def _unwrapped(self, sequence: int) -> int:
-        """A sequence number that goes on beyond 2^32."""
+    def _unwrap(self, sequence: int) -> int:
+        """The sequence number without the wrap at 2^32."""
         if self._newest < 0:
             return sequence
-        return self._newest + (sequence - self._newest + _WRAP // 2) % _WRAP - _WRAP // 2
+        return self._newest + (sequence - self._newest + _SEQUENCE_RANGE // 2) % _SEQUENCE_RANGE - _SEQUENCE_RANGE // 2
 
-    def _start_anew(self, message: Message, received: float) -> list[RawScan]:
-        closed = self._handed_on(max(self._open, default=-1))
-        newest, self._lost_before, self._suspect = self._newest_scan, self.counts.lost, None
+    def _restart(self, message: Message, received: float) -> list[RawScan]:
+        """Emit everything and start the numbering of a restarted device."""
+        emitted = self._emit_up_to(max(self._partial, default=-1))
+        newest, self._lost_before_restart, self._suspect = self._newest_scan, self.counts.lost, None
         self.counts.restarts += 1
-        self._forget()
-        self._anew, self._newest_scan = True, newest
-        # The stamps say how long nothing came.
+        self._reset()
+        self._renumber, self._newest_scan = True, newest
+        # Continue the time stamps by the host time that passed.
         stamp = self._last_stamp + max(0.0, received - self._last_received)
         self._clock_offset = stamp - message.time_us * 1e-6
-        return closed
+        return emitted
 
-    def _taken(self, message: Message, received: float) -> list[RawScan]:
-        sequence = self._unwrapped(message.sequence)
-        if sequence in self._seen:
+    def _accept(self, message: Message, received: float) -> list[RawScan]:
+        sequence = self._unwrap(message.sequence)
+        if sequence in self._history:
             self.counts.repeated += 1
             return []
-        self._first = sequence if self._newest < 0 else min(self._first, sequence)
+        self._first_sequence = sequence if self._newest < 0 else min(self._first_sequence, sequence)
         self._newest = max(self._newest, sequence)
-        self._distinct += 1
-        self.counts.lost = self._lost_before + self._newest - self._first + 1 - self._distinct
-        self._newest_time = max(self._newest_time, message.time_us)
+        self._distinct_count += 1
+        self.counts.lost = self._lost_before_restart + self._newest - self._first_sequence + 1 - self._distinct_count
+        self._newest_time_us = max(self._newest_time_us, message.time_us)
         rank = None
         if isinstance(message, Group):
             rank = message.scan * message.groups + message.group
-        self._seen[sequence] = (message.time_us, rank)
-        if len(self._seen) > _REMEMBERED:
-            del self._seen[next(iter(self._seen))]
+        self._history[sequence] = (message.time_us, rank)
+        if len(self._history) > SETTINGS.message_history:
+            del self._history[next(iter(self._history))]
         if isinstance(message, Pose):
             insort(self._poses, (sequence, message), key=_sequence)
-            del self._poses[:-_REMEMBERED]
-            return self._due()
-        return self._put(sequence, message, received)
+            del self._poses[: -SETTINGS.message_history]
+            return self._emit_due()
+        return self._add_group(sequence, message, received)
 
-    def _put(self, sequence: int, group: Group, received: float) -> list[RawScan]:
-        closed: list[RawScan] = []
+    def _add_group(self, sequence: int, group: Group, received: float) -> list[RawScan]:
+        emitted: list[RawScan] = []
         number = group.scan + self._scan_offset
-        if self._anew or (number < self._newest_scan - _CLOSED and sequence == self._newest):
-            # Scans are counted anew; a number is left out, so that no number comes twice.
-            closed, self._anew = self._handed_on(max(self._open, default=-1)), False
+        if self._renumber or (number < self._newest_scan - SETTINGS.scan_history and sequence == self._newest):
+            # The device restarted its scan numbers. Skip one number, so that no number is used twice.
+            emitted, self._renumber = self._emit_up_to(max(self._partial, default=-1)), False
             self._scan_offset = self._newest_scan + 2 - group.scan
             number = group.scan + self._scan_offset
-        if number in self._closed:
+        if number in self._emitted:
             self.counts.late += 1
-            return closed
-        scan = self._open.get(number, _Open(group.groups))
-        if group.groups > MOST_GROUPS or group.groups != scan.groups:
+            return emitted
+        scan = self._partial.get(number, _PartialScan(group.groups))
+        if group.groups > SETTINGS.max_groups or group.groups != scan.groups:
             self.counts.impossible += 1
-            return closed
+            return emitted
         if group.group in scan.parts:
             self.counts.repeated += 1
-            return closed
-        if scan.echoes + len(group.echoes) > MOST_ECHOES:
+            return emitted
+        if scan.echoes + len(group.echoes) > SETTINGS.max_echoes:
             self.counts.impossible += 1
-            return closed
-        self._open[number] = scan
+            return emitted
+        self._partial[number] = scan
         scan.echoes += len(group.echoes)
         scan.parts[group.group] = (sequence, group)
-        scan.last = self._last_received = received
+        scan.received = self._last_received = received
         self._newest_scan = max(self._newest_scan, number)
-        return closed + self._due()
+        return emitted + self._emit_due()
 
-    def _due(self) -> list[RawScan]:
-        """Hand on what is complete, and what comes before it or too far behind."""
+    def _emit_due(self) -> list[RawScan]:
+        """Emit complete scans, all scans before them, and scans too far behind."""
         due = [
             number
-            for number, scan in self._open.items()
-            if number <= self._newest_scan - 2 or (scan.complete and not self._waits(scan))
+            for number, scan in self._partial.items()
+            if number <= self._newest_scan - 2 or (scan.complete and not self._may_lack_pose(scan))
         ]
-        return self._handed_on(max(due)) if due else []
+        return self._emit_up_to(max(due)) if due else []
 
-    def _waits(self, scan: _Open) -> bool:
-        """Whether a pose of a complete scan may still be on its way: a number just before a group has not come."""
+    def _may_lack_pose(self, scan: _PartialScan) -> bool:
+        """Whether a pose of a complete scan may still arrive: the message before one of its groups is missing."""
         sequences = [sequence for sequence, _ in scan.parts.values()]
-        if self.skipped or self._newest >= max(sequences) + _HOLD:
+        if self.unknown_messages or self._newest >= max(sequences) + SETTINGS.pose_hold:
             return False
-        return any(s - 1 not in self._seen and s - 1 >= self._first for s in sequences)
+        return any(s - 1 not in self._history and s - 1 >= self._first_sequence for s in sequences)
 
-    def _handed_on(self, up_to: int) -> list[RawScan]:
-        numbers = sorted(number for number in self._open if number <= up_to)
-        scans = [self._raw(number, self._open.pop(number)) for number in numbers]
-        self._closed.extend(numbers)
+    def _emit_up_to(self, up_to: int) -> list[RawScan]:
+        numbers = sorted(number for number in self._partial if number <= up_to)
+        scans = [self._assembled(number, self._partial.pop(number)) for number in numbers]
+        self._emitted.extend(numbers)
         return scans
 
-    def _raw(self, number: int, scan: _Open) -> RawScan:
+    def _assembled(self, number: int, scan: _PartialScan) -> RawScan:
         order = sorted(scan.parts)
         groups = [scan.parts[k][1] for k in order]
         poses = np.full((scan.groups, 3), np.nan)
@@ -293,29 +310,29 @@ class Assembler:
             group=group,
             temperature=float(np.mean(measured)) if measured else float("nan"),
             missing=missing,
-            received=scan.last,
+            received=scan.received,
         )
 
     def _pose_before(self, sequence: int) -> tuple[float, float, float]:
-        """The latest pose sent before a message; NaN where a later one may have been lost."""
+        """The latest pose before a message, by sequence number; NaN if a later pose may have been lost."""
         before = bisect_left(self._poses, sequence, key=_sequence)
         if not before:
             return (np.nan, np.nan, np.nan)
         number, pose = self._poses[before - 1]
-        if not self.skipped and self._pose_lost(number, sequence):
+        if not self.unknown_messages and self._pose_lost(number, sequence):
             return (np.nan, np.nan, np.nan)
         return (pose.x, pose.y, pose.theta)
 
     def _pose_lost(self, pose: int, group: int) -> bool:
-        """Whether more messages are missing between a pose and a group than there are groups missing around it."""
-        if group - pose > _REMEMBERED // 2 or all(s in self._seen for s in range(pose + 1, group)):
+        """Whether a pose may be missing between a pose and a group: more missing messages than missing groups."""
+        if group - pose > SETTINGS.message_history // 2 or all(s in self._history for s in range(pose + 1, group)):
             return False
-        own = self._seen.get(group, (0, None))[1]
-        before = max((s for s, (_, rank) in self._seen.items() if rank is not None and s < pose), default=None)
+        own = self._history.get(group, (0, None))[1]
+        before = max((s for s, (_, rank) in self._history.items() if rank is not None and s < pose), default=None)
         first = pose if before is None else before
-        known = [rank for s, (_, rank) in self._seen.items() if first < s < group]
+        known = [rank for s, (_, rank) in self._history.items() if first < s < group]
         messages = group - first - 1 - len(known)
-        rank = None if before is None else self._seen[before][1]
+        rank = None if before is None else self._history[before][1]
         if own is None or rank is None:
             return True
         groups = own - rank - 1 - sum(between is not None for between in known)
@@ -327,13 +344,16 @@ def _sequence(entry: tuple[int, Pose]) -> int:
 
 
 def _follows(earlier: Message, later: Message) -> bool:
-    """Whether two messages can be neighbors of one run of a sender."""
-    step = (later.sequence - earlier.sequence) % _WRAP
-    return 0 < step <= _LATE and 0 <= later.time_us - earlier.time_us <= 10 * _LATE_US
+    """Whether two messages can be consecutive in one run of a device."""
+    step = (later.sequence - earlier.sequence) % _SEQUENCE_RANGE
+    return (
+        0 < step <= SETTINGS.max_reordering
+        and 0 <= later.time_us - earlier.time_us <= 10 * SETTINGS.max_clock_step_back_us
+    )
 
 
 def _path_order(echoes: Shaped[np.ndarray, " echoes"], sensors: int) -> Int[np.ndarray, " echoes"]:
-    """The order of a ring's paths: by neighbor 0, +1, -1, +2, -2, ..., then by transmitter, then nearest first."""
+    """Sort index in the order of a ring's paths: neighbor 0, +1, -1, +2, -2, ..., then transmitter, then nearest."""
     tx, rx = echoes["tx"].astype(np.int64), echoes["rx"].astype(np.int64)
     offset = (rx - tx) % sensors
     behind = 2 * offset > sensors

@@ -1,7 +1,7 @@
 """Sources of bytes by URL: ``serial:``, ``tcp:``, ``udp:``, ``pty:``, ``file:``, and others by entry point.
 
-An opener takes a parsed ``Url`` and the keywords of ``open_source`` and returns a ``Source``. Other packages offer one
-under the entry point group ``jaxsonar.transports``; the name of the entry is the scheme.
+An opener takes a parsed ``Url`` and the keywords of ``open_source`` and returns a ``Source``. Other packages can
+register an opener under the entry point group ``jaxsonar.transports``. The name of the entry point is the scheme.
 """
 
 import time
@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any
 from urllib.parse import parse_qsl
 
-from .errors import SonarError
+from .errors import SonarError, shown
 
 EXAMPLES = {
     "serial": "serial:///dev/ttyUSB0?baud=921600",
@@ -23,60 +23,60 @@ EXAMPLES = {
     "pty": "pty:PATH",
     "file": "file:LOG?speed=1",
 }
-"""What URLs look like."""
+"""An example URL of each built-in scheme, for messages."""
 
 ENTRY_POINTS = "jaxsonar.transports"
-"""Group under which other packages offer openers."""
+"""Entry point group of openers from other packages."""
 
-SILENCE = 2.0
-"""Seconds without a byte after which a source says so."""
+SILENCE_TIMEOUT = 2.0
+"""Seconds without a byte after which a source reports a ``silent`` event. Chosen by hand."""
 
 
 @dataclass(frozen=True)
-class Event:
-    """Something about a link that a person should hear of."""
+class LinkEvent:
+    """A change of the state of a link, reported to the user."""
 
     kind: str
-    """``lost`` (it broke; the source tries again), ``back`` (bytes come again), ``silent`` (none came for a while)."""
+    """``lost`` (the link broke; the source reconnects), ``back`` (data again), ``silent`` (no data for a while)."""
     text: str
-    """One line."""
+    """Message for the user, one line."""
     time: float = field(default_factory=time.time)
     """Seconds since 1970."""
 
 
-OnEvent = Callable[[Event], None]
+OnEvent = Callable[[LinkEvent], None]
 
 
 class EndOfStream(Exception):
-    """No more bytes will come: the end of a file, a connection that the device closed, a source that was closed.
+    """The stream has ended: end of a file, a connection that the device closed, or a source that was closed.
 
-    The message is one line. What breaks while a source may reconnect is an ``Event``, not this.
+    The message is one line. A broken link of a source that reconnects is a ``LinkEvent`` instead.
     """
 
 
 class Source(ABC):
-    """Where bytes come from. For one thread; ``close`` it there, or once that thread has ended."""
+    """A source of bytes. Not thread-safe: call ``close`` in the reading thread, or after that thread has ended."""
 
     url: str
-    """As the user wrote it."""
+    """The URL as the user wrote it."""
 
     @abstractmethod
     def read(self, timeout: float) -> bytes | None:
-        """What has come, as soon as something has.
+        """Return the received bytes as soon as there are any.
 
         Args:
-            timeout: seconds to wait at most. While a link is being made again it may take a second longer.
+            timeout: maximum waiting time, seconds. A reconnection attempt may exceed it by one second.
 
         Returns:
-            Bytes, or None where none came in time.
+            Bytes; None after the timeout.
 
         Raises:
-            EndOfStream: none will come any more; also every time after that.
+            EndOfStream: the stream has ended; raised again by every later call.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Give everything back; a second time does nothing."""
+        """Release all resources. Idempotent."""
 
     def __enter__(self) -> "Source":
         return self
@@ -90,27 +90,27 @@ class Url:
     """The parts of a URL."""
 
     text: str
-    """All of it, as a person wrote it."""
+    """The whole URL, as the user wrote it."""
     scheme: str
-    """In lower case, without the colon."""
+    """Lower case, without the colon."""
     host: str
-    """Empty where there is none."""
+    """Empty if the URL has none."""
     port: int | None
-    """None where there is none."""
+    """None if the URL has none."""
     path: str
-    """Of a device or a file; nothing in it is unquoted."""
+    """Filename of a device or a file. Percent-encoding is not decoded."""
     options: Mapping[str, str]
-    """What follows the question mark."""
+    """The query: options after the question mark."""
 
     def fail(self, came: str, allowed: str) -> SonarError:
-        """The error to raise about this URL."""
+        """The error for this URL, for the caller to raise."""
         return SonarError(f"{shown(self.text)}: {came}; allowed is {allowed}")
 
     def check_options(self, *known: str) -> None:
-        """An error if there is any other option.
+        """Reject unknown options.
 
         Raises:
-            SonarError: it names the option and those that are known.
+            SonarError: names the unknown option and the allowed ones.
         """
         for name in self.options:
             if name not in known:
@@ -118,10 +118,10 @@ class Url:
                 raise self.fail(f"option '{shown(name)}' came", allowed)
 
     def number(self, name: str, default: float, low: float, high: float) -> float:
-        """An option that is a number.
+        """The value of a numeric option.
 
         Raises:
-            SonarError: it is none, or not within low and high.
+            SonarError: not a number, or outside [low, high].
         """
         text = self.options.get(name, "")
         try:
@@ -136,11 +136,11 @@ class Url:
         """Host and port.
 
         Args:
-            default_host: where the URL has none; None if it has to have one.
-            lowest_port: 0 where any free port will do.
+            default_host: used if the URL has no host; None: the URL must have one.
+            lowest_port: 0 if port 0 (any free port) is allowed.
 
         Raises:
-            SonarError: one of them is missing, or there is a path.
+            SonarError: host or port is missing, or the URL has a path.
         """
         host = self.host or default_host
         if not host or self.port is None or self.port < lowest_port or self.path not in ("", "/"):
@@ -152,39 +152,39 @@ class Url:
 Opener = Callable[..., Source]
 
 _BUILT_IN: dict[str, str] = {
-    "serial": "transport_terminals:open_serial",
-    "tcp": "transport_sources:open_tcp",
-    "udp": "transport_sources:open_udp",
-    "pty": "transport_terminals:open_pty",
-    "file": "recording:open_file",
+    "serial": "transport_serial:open_serial",
+    "tcp": "transport_clients:open_tcp",
+    "udp": "transport_clients:open_udp",
+    "pty": "transport_serial:open_pty",
+    "file": "recorder:open_recording",
 }
-"""Scheme: module of this package and opener, imported once it is needed."""
+"""Scheme to ``module:opener`` of this package; imported on first use."""
 _registered: dict[str, Opener] = {}
 
 
-def register(scheme: str, opener: Opener) -> None:
-    """Make a scheme known, or replace one, in this process.
+def register_transport(scheme: str, opener: Opener) -> None:
+    """Register the opener of a scheme in this process; replaces an existing one.
 
     Args:
-        scheme: in lower case, without the colon.
+        scheme: lower case, without the colon.
         opener: called as ``opener(url, on_event=..., reconnect=..., silence=...)`` with a ``Url``.
     """
     _registered[scheme] = opener
 
 
 def open_source(
-    url: str, *, on_event: OnEvent | None = None, reconnect: bool = True, silence: float = SILENCE
+    url: str, *, on_event: OnEvent | None = None, reconnect: bool = True, silence: float = SILENCE_TIMEOUT
 ) -> Source:
-    """Open a stream of bytes.
+    """Open a source of bytes.
 
     Args:
         url: see ``EXAMPLES``.
-        on_event: told of every ``Event``, in the thread that reads.
-        reconnect: try again, after 0.1 s and then twice as long up to 5 s, when a link breaks; else that is the end.
-        silence: seconds without a byte that make an event.
+        on_event: called for every ``LinkEvent``, in the reading thread.
+        reconnect: reconnect with exponential backoff (0.1 s to 5 s) when a link breaks; False: end the stream.
+        silence: seconds without a byte that count as a ``silent`` event.
 
     Raises:
-        SonarError: no such URL, or it cannot be opened; one line.
+        SonarError: an invalid URL, or a device that cannot be opened.
     """
     parsed = parse_url(url)
     opener = _opener(parsed)
@@ -192,10 +192,10 @@ def open_source(
 
 
 def parse_url(text: str) -> Url:
-    """The parts of a URL; whether its scheme is known is not looked at.
+    """Split a URL into its parts. The scheme is not checked.
 
     Raises:
-        SonarError: it is none.
+        SonarError: the text is not a URL.
     """
     scheme, colon, rest = text.partition(":")
     if not colon or not scheme.replace("-", "").isalnum() or not scheme.isascii() or not text.isprintable():
@@ -209,32 +209,20 @@ def parse_url(text: str) -> Url:
     except ValueError:
         allowed = "?NAME=VALUE&NAME=VALUE, each name once"
         raise SonarError(f"{shown(text)}: '?{shown(query)}' came; allowed is {allowed}") from None
-    place, path = "", rest
+    authority, path = "", rest
     if rest.startswith("//"):
-        place, slash, path = rest[2:].partition("/")
+        authority, slash, path = rest[2:].partition("/")
         path = slash + path
-    host, port = _host_and_port(text, place)
+    host, port = _host_and_port(text, authority)
     return Url(text, scheme.lower(), host, port, path, options)
 
 
-def shown(text: object) -> str:
-    """One printable line for a message."""
-    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
-    return line if len(line) <= 120 else f"{line[:120]}..."
-
-
-def reason(failure: Exception) -> str:
-    """What went wrong, in the words of the operating system or of a library, on one line."""
-    text = getattr(failure, "strerror", None) or str(failure) or type(failure).__name__
-    return shown(text.partition(" (while")[0].splitlines()[0])  # socket adds the address, which is in the URL
-
-
-def _host_and_port(text: str, place: str) -> tuple[str, int | None]:
-    host, colon, port = place.rpartition(":")
-    if not colon or place.endswith("]"):  # the colons of [::1] are its own
-        host, port = place, ""
+def _host_and_port(text: str, authority: str) -> tuple[str, int | None]:
+    host, colon, port = authority.rpartition(":")
+    if not colon or authority.endswith("]"):  # the colons in [::1] separate no port
+        host, port = authority, ""
     bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-    if (colon and host is not place and not port) or (port and not (port.isascii() and port.isdecimal())):
+    if (colon and host is not authority and not port) or (port and not (port.isascii() and port.isdecimal())):
         raise SonarError(f"{shown(text)}: port '{shown(port)}' came; allowed is a whole number from 0 to 65535")
     if port and int(port[:9]) > 65535:
         raise SonarError(f"{shown(text)}: port {shown(port)} came; allowed is a whole number from 0 to 65535")
@@ -251,13 +239,13 @@ def _opener(url: Url) -> Opener:
     if url.scheme in _BUILT_IN:
         module, name = _BUILT_IN[url.scheme].split(":")
         return getattr(import_module(f".{module}", __package__), name)
-    offered = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
-    if url.scheme not in offered:
-        known = [EXAMPLES.get(name, f"{name}:") for name in (*EXAMPLES, *sorted({*_registered, *offered}))]
+    registered_elsewhere = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+    if url.scheme not in registered_elsewhere:
+        known = [EXAMPLES.get(name, f"{name}:") for name in (*EXAMPLES, *sorted({*_registered, *registered_elsewhere}))]
         raise url.fail(f"scheme '{url.scheme}' came", ", ".join(dict.fromkeys(known)))
-    opener: Any = offered[url.scheme].load()
+    opener: Any = registered_elsewhere[url.scheme].load()
     return opener
 
 
-def _ignore(event: Event) -> None:
+def _ignore(event: LinkEvent) -> None:
     pass

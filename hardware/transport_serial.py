@@ -1,4 +1,4 @@
-"""Links over terminals: serial ports, and the near end of a pty."""
+"""Client transports over terminals: serial ports and ptys."""
 
 import errno
 import os
@@ -9,22 +9,22 @@ from typing import Any
 
 from .errors import SonarError
 from .transport_base import OnEvent, Source, Url
-from .transport_clients import AT_ONCE, Link
+from .transport_clients import SETTINGS, ReconnectingSource
 
 
-class TerminalLink(Link):
-    """A serial port or the near end of a pty. One that was pulled is opened again once its name is there again."""
+class TerminalSource(ReconnectingSource):
+    """A serial port or the client end of a pty. An unplugged port is reopened once its device file exists again."""
 
     _file: int | None = None
     _port: Any = None
     _baud: int | None = None
 
     def __init__(self, url: Url, *, baud: int | None, on_event: OnEvent, reconnect: bool, silence: float):
-        """Open it.
+        """Open the terminal.
 
         Args:
-            url: its path is the device.
-            baud: bits per second of a serial port; None for a pty, which has no speed.
+            url: its path is the device file.
+            baud: bits per second of a serial port; None for a pty.
             on_event: see ``open_source``.
             reconnect: see ``open_source``.
             silence: see ``open_source``.
@@ -32,7 +32,7 @@ class TerminalLink(Link):
         self._baud = baud
         super().__init__(url, on_event=on_event, reconnect=reconnect, silence=silence)
 
-    def _open(self) -> None:
+    def _connect(self) -> None:
         if self._baud is None:
             self._file = os.open(self._parsed.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
             if not os.isatty(self._file):
@@ -47,10 +47,10 @@ class TerminalLink(Link):
             raise OSError(errno.EIO, str(failure)) from None
         self._file = self._port.fileno()
 
-    def _shut(self) -> None:
+    def _disconnect(self) -> None:
         port, file = self._port, self._file
         self._port = self._file = None
-        with suppress(OSError):  # of a device that is gone
+        with suppress(OSError):  # the device is unplugged
             if port is not None:
                 port.close()
             elif file is not None:
@@ -63,7 +63,7 @@ class TerminalLink(Link):
     def _receive(self) -> bytes | None:
         assert self._file is not None
         try:
-            data = os.read(self._file, AT_ONCE)
+            data = os.read(self._file, SETTINGS.read_size)
         except BlockingIOError:
             return None
         if not data:
@@ -72,17 +72,17 @@ class TerminalLink(Link):
 
 
 def open_pty(url: Url, *, on_event: OnEvent, reconnect: bool, silence: float) -> Source:
-    """``pty:PATH``. See ``open_source``."""
+    """Opener of ``pty:PATH``. See ``open_source``."""
     url.check_options()
     _check_path(url)
-    return TerminalLink(url, baud=None, on_event=on_event, reconnect=reconnect, silence=silence)
+    return TerminalSource(url, baud=None, on_event=on_event, reconnect=reconnect, silence=silence)
 
 
 def open_serial(url: Url, *, on_event: OnEvent, reconnect: bool, silence: float) -> Source:
-    """``serial:///dev/ttyUSB0?baud=921600``. See ``open_source``.
+    """Opener of ``serial:///dev/ttyUSB0?baud=921600``. See ``open_source``.
 
     Raises:
-        SonarError: also where the extra ``live`` is missing.
+        SonarError: an invalid URL, a device that cannot be opened, or a missing extra ``live``.
     """
     url.check_options("baud")
     _check_path(url)
@@ -90,7 +90,7 @@ def open_serial(url: Url, *, on_event: OnEvent, reconnect: bool, silence: float)
     if baud != int(baud):
         raise url.fail(f"baud {baud:g} came", "a whole number")
     _serialx(url.text)
-    return TerminalLink(url, baud=int(baud), on_event=on_event, reconnect=reconnect, silence=silence)
+    return TerminalSource(url, baud=int(baud), on_event=on_event, reconnect=reconnect, silence=silence)
 
 
 def _check_path(url: Url) -> None:

@@ -1,4 +1,4 @@
-"""The device's side of tcp, udp and pty: what the emulator sends to. One client at a time."""
+"""Server transports (device side) for tcp, udp and pty, used by the emulator. One client at a time."""
 
 import errno
 import fcntl
@@ -12,50 +12,65 @@ import time
 import tty
 from abc import ABC, abstractmethod
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-from .errors import SonarError
-from .transport_base import Url, parse_url, reason
+from .errors import SonarError, reason
+from .transport_base import Url, parse_url
 from .transport_clients import GOODBYE
 
-LOOK = 0.05
-"""Seconds between two looks at what cannot be waited for."""
-LINGER = 2.0
-"""Seconds that a client has to take what was sent, once the device is done."""
-SETTLED = 0.25
-"""Seconds without anything unread after which a pty's client has everything."""
-STALE = 3.0
-"""Seconds without a hello after which a udp client gives way to another one."""
-LEFT = getattr(select, "POLLRDHUP", 0)
-"""What Linux reports of a client that closed its connection."""
+
+@dataclass(frozen=True)
+class ServerSettings:
+    """Timing of the servers. All values are chosen by hand."""
+
+    poll_interval: float = 0.05
+    """Seconds between two checks of the stop event and of states that cannot be waited for."""
+    linger_time: float = 2.0
+    """Seconds that a client has to read the last bytes before the server closes."""
+    pty_quiet_time: float = 0.25
+    """A pty's client has read everything when nothing was unread for this time, seconds."""
+    udp_client_timeout: float = 3.0
+    """Seconds without a hello after which a udp client can be replaced by another one."""
+    datagrams_per_pause: int = 16
+    """A udp server pauses after this many datagrams, because udp has no flow control."""
+    datagram_pause: float = 0.0005
+    """Duration of that pause, seconds."""
+
+
+SETTINGS = ServerSettings()
+DISCARD_SIZE = 1 << 12
+"""Bytes read and discarded at once; a device ignores its input."""
+PEER_CLOSED = getattr(select, "POLLRDHUP", 0)
+"""Poll event of a connection that the client closed; Linux only."""
 
 
 class Sink(ABC):
-    """Where a device sends its frames. Not for several threads."""
+    """A sink for the frames of a device. Not thread-safe."""
 
     url: str
-    """With the real port, or the real path of the pty: what a client opens."""
+    """The URL that a client opens, with the actual port or pty."""
 
     @abstractmethod
     def wait_client(self, stop: threading.Event) -> bool:
-        """Wait until there is a client; True at once where there is one. False once ``stop`` is set."""
+        """Wait for a client. True if there is one, False if ``stop`` was set."""
 
     @abstractmethod
     def send(self, data: bytes, stop: threading.Event) -> bool:
-        """Send all of it to the client, waiting while it does not take it.
+        """Send all bytes to the client; block while it does not read.
 
         Returns:
-            False if the client left before it had all, or ``stop`` was set.
+            False if the client disconnected before it had everything, or ``stop`` was set.
         """
 
     @abstractmethod
     def hang_up(self) -> None:
-        """Break the link as a pulled plug does; the next client is waited for under the same URL."""
+        """Drop the client abruptly, like an unplugged cable. The next client can connect at the same URL."""
 
     @abstractmethod
     def close(self) -> None:
-        """End in order: the client gets what was sent, if it takes it within ``LINGER``."""
+        """Close. The client has ``linger_time`` to read the last bytes."""
 
     def __enter__(self) -> "Sink":
         return self
@@ -65,7 +80,7 @@ class Sink(ABC):
 
 
 class TcpSink(Sink):
-    """A server. Further clients wait until the one that is served has left."""
+    """A tcp server. Further clients wait until the current one has disconnected."""
 
     def __init__(self, url: Url):
         host, port = url.address(default_host="127.0.0.1", lowest_port=0)
@@ -73,13 +88,13 @@ class TcpSink(Sink):
         self._server = socket.create_server(address[:2], family=family, backlog=4)
         self._server.setblocking(False)
         self._client: socket.socket | None = None
-        self.url = _address(url, host, self._server)
+        self.url = _bound_url(url, host, self._server)
 
     def wait_client(self, stop: threading.Event) -> bool:
         """See ``Sink``."""
         while self._client is None and not stop.is_set():
-            if _ready(self._server.fileno(), select.POLLIN, LOOK):
-                with suppress(OSError):  # it left again
+            if _poll(self._server.fileno(), select.POLLIN, SETTINGS.poll_interval):
+                with suppress(OSError):  # it disconnected again
                     self._client, _ = self._server.accept()
                     self._client.setblocking(False)
                     self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -87,21 +102,23 @@ class TcpSink(Sink):
 
     def send(self, data: bytes, stop: threading.Event) -> bool:
         """See ``Sink``."""
-        rest = memoryview(data)
-        while self._client is not None and rest and not stop.is_set():
+        remaining = memoryview(data)
+        while self._client is not None and remaining and not stop.is_set():
             try:
-                events = _ready(self._client.fileno(), select.POLLOUT | select.POLLIN | LEFT, LOOK)
-                if events & (LEFT | select.POLLHUP | select.POLLERR):
+                events = _poll(
+                    self._client.fileno(), select.POLLOUT | select.POLLIN | PEER_CLOSED, SETTINGS.poll_interval
+                )
+                if events & (PEER_CLOSED | select.POLLHUP | select.POLLERR):
                     raise ConnectionResetError
                 if events & select.POLLIN:
-                    self._client.recv(1 << 12)  # a device does not listen
+                    self._client.recv(DISCARD_SIZE)
                 if events & select.POLLOUT:
-                    rest = rest[self._client.send(rest) :]
+                    remaining = remaining[self._client.send(remaining) :]
             except BlockingIOError:
                 continue
             except OSError:
                 self._drop()
-        return not rest
+        return not remaining
 
     def _drop(self) -> None:
         if self._client is not None:
@@ -117,19 +134,22 @@ class TcpSink(Sink):
     def close(self) -> None:
         """See ``Sink``."""
         if self._client is not None:
-            # Closing with something unread would send RST, and the client would lose what it has not read yet.
+            # Closing a socket with unread input would send RST, and the client would lose what it has not read.
             with suppress(OSError):
                 self._client.shutdown(socket.SHUT_WR)
-                end = time.monotonic() + LINGER
+                end = time.monotonic() + SETTINGS.linger_time
                 while (left := end - time.monotonic()) > 0:
-                    if _ready(self._client.fileno(), select.POLLIN, left) and not self._client.recv(1 << 12):
+                    if _poll(self._client.fileno(), select.POLLIN, left) and not self._client.recv(DISCARD_SIZE):
                         break
             self._drop()
         self._server.close()
 
 
 class UdpSink(Sink):
-    """A frame a datagram to whoever said hello; to another one only after that one left or fell silent."""
+    """One frame per datagram, sent to the client that sent a hello.
+
+    Another client takes its place only after a goodbye or ``udp_client_timeout``.
+    """
 
     def __init__(self, url: Url):
         host, port = url.address(default_host="127.0.0.1", lowest_port=0)
@@ -144,41 +164,41 @@ class UdpSink(Sink):
         self._client: tuple | None = None
         self._hello_at = 0.0
         self._sent = 0
-        self.url = _address(url, host, self._socket)
+        self.url = _bound_url(url, host, self._socket)
 
     def _listen(self) -> None:
         with suppress(BlockingIOError):
             while True:
                 try:
-                    data, sender = self._socket.recvfrom(1 << 12)
-                except ConnectionError:  # what an earlier datagram ran into
+                    data, sender = self._socket.recvfrom(DISCARD_SIZE)
+                except ConnectionError:  # ICMP error of an earlier datagram
                     continue
                 now = time.monotonic()
                 if data == GOODBYE:
                     self._client = None if sender == self._client else self._client
-                elif self._client in (None, sender) or now > self._hello_at + STALE:
+                elif self._client in (None, sender) or now > self._hello_at + SETTINGS.udp_client_timeout:
                     self._client, self._hello_at = sender, now
 
     def wait_client(self, stop: threading.Event) -> bool:
         """See ``Sink``."""
         self._listen()
         while self._client is None and not stop.is_set():
-            if _ready(self._socket.fileno(), select.POLLIN, LOOK):
+            if _poll(self._socket.fileno(), select.POLLIN, SETTINGS.poll_interval):
                 self._listen()
         return self._client is not None
 
     def send(self, data: bytes, stop: threading.Event) -> bool:
         """See ``Sink``."""
         self._listen()
-        # Nothing tells a sender of datagrams that they come too fast; leave the client time to take them.
+        # udp has no flow control: give the client time to read.
         self._sent += 1
-        if self._sent % 16 == 0:
-            time.sleep(0.0005)
+        if self._sent % SETTINGS.datagrams_per_pause == 0:
+            time.sleep(SETTINGS.datagram_pause)
         while self._client is not None and not stop.is_set():
             try:
                 self._socket.sendto(data, self._client)
             except BlockingIOError:
-                _ready(self._socket.fileno(), select.POLLOUT, LOOK)
+                _poll(self._socket.fileno(), select.POLLOUT, SETTINGS.poll_interval)
             except OSError:
                 self._client = None
             else:
@@ -195,9 +215,9 @@ class UdpSink(Sink):
 
 
 class PtySink(Sink):
-    """The far end of a pty; the near end is in raw mode, so that bytes stay what they are.
+    """The device end of a pty. The client end is in raw mode, so that bytes pass unchanged.
 
-    With ``pty:PATH`` that path becomes a link to the near end, the same one after ``hang_up``.
+    With ``pty:PATH``, PATH is a symbolic link to the client end. It stays valid after ``hang_up``.
     """
 
     def __init__(self, url: Url):
@@ -206,108 +226,108 @@ class PtySink(Sink):
         self._link = Path(url.path) if url.path else None
         self._master: int | None = None
         self._client = False
-        self._plug_in()
-        self.url = f"pty:{self._link or self._near}"
+        self._open_pty()
+        self.url = f"pty:{self._link or self._client_end}"
 
-    def _plug_in(self) -> None:
+    def _open_pty(self) -> None:
         self._master, slave = os.openpty()
         try:
             tty.setraw(slave, when=termios.TCSANOW)
-            self._near = os.ttyname(slave)
+            self._client_end = os.ttyname(slave)
             os.set_blocking(self._master, False)
             if self._link is not None:
                 if self._link.is_symlink() and os.readlink(self._link).startswith("/dev/pts/"):
-                    self._link.unlink()  # of a device that was here before
-                self._link.symlink_to(self._near)
+                    self._link.unlink()  # left by an earlier emulator
+                self._link.symlink_to(self._client_end)
         except OSError:
-            self._pull()
+            self._close_pty()
             raise
         finally:
-            os.close(slave)  # a near end that nobody holds shows as HUP: that is how a client is seen
+            os.close(slave)  # a client end that nobody has open reports POLLHUP; this detects clients
 
-    def _pull(self) -> None:
+    def _close_pty(self) -> None:
         if self._master is not None:
             os.close(self._master)
             self._master = None
 
     def wait_client(self, stop: threading.Event) -> bool:
         """See ``Sink``."""
-        if self._client and not self._hung_up():
+        if self._client and not self._has_no_client():
             return True
         self._client = False
         while not stop.is_set():
-            if not self._hung_up():
-                # Whoever opens a terminal sets it up first, and may throw away what is there by then.
-                stop.wait(2 * LOOK)
+            if not self._has_no_client():
+                # A client configures the terminal first, which may discard input that is already there.
+                stop.wait(2 * SETTINGS.poll_interval)
                 self._client = True
                 return True
-            stop.wait(LOOK)
+            stop.wait(SETTINGS.poll_interval)
         return False
 
     def send(self, data: bytes, stop: threading.Event) -> bool:
         """See ``Sink``."""
         assert self._master is not None
-        rest = memoryview(data)
-        while self._client and rest and not stop.is_set():
-            events = _ready(self._master, select.POLLOUT | select.POLLIN, LOOK)
+        remaining = memoryview(data)
+        while self._client and remaining and not stop.is_set():
+            events = _poll(self._master, select.POLLOUT | select.POLLIN, SETTINGS.poll_interval)
             try:
                 if events & (select.POLLHUP | select.POLLERR):
                     self._client = False
                     break
                 if events & select.POLLIN:
-                    os.read(self._master, 1 << 12)  # a device does not listen
+                    os.read(self._master, DISCARD_SIZE)
                 if events & select.POLLOUT:
-                    written = os.write(self._master, rest)
-                    rest = rest[written:]
+                    written = os.write(self._master, remaining)
+                    remaining = remaining[written:]
                     if not written:
-                        stop.wait(LOOK)
+                        stop.wait(SETTINGS.poll_interval)
             except BlockingIOError:
                 stop.wait(0.001)
             except OSError:
                 self._client = False
-        return not rest
+        return not remaining
 
     def hang_up(self) -> None:
         """See ``Sink``."""
-        self._pull()
+        self._close_pty()
         self._client = False
-        self._plug_in()
+        self._open_pty()
 
     def close(self) -> None:
         """See ``Sink``."""
         if self._master is not None:
-            # The kernel hands bytes on in steps, so that none are to be seen for a moment although more will follow.
-            end, seen = time.monotonic() + LINGER, time.monotonic()
-            while self._client and (now := time.monotonic()) < min(end, seen + SETTLED):
-                seen = now if self._unread() else seen
-                self._client = not self._hung_up()
-                time.sleep(LOOK / 5)
-            self._pull()
-        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self._near:
+            # The kernel forwards bytes in steps: for a moment none are unread although more will follow.
+            end, last_unread = time.monotonic() + SETTINGS.linger_time, time.monotonic()
+            while self._client and (now := time.monotonic()) < min(end, last_unread + SETTINGS.pty_quiet_time):
+                last_unread = now if self._has_unread() else last_unread
+                self._client = not self._has_no_client()
+                time.sleep(SETTINGS.poll_interval / 5)
+            self._close_pty()
+        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self._client_end:
             self._link.unlink()
 
-    def _hung_up(self) -> bool:
+    def _has_no_client(self) -> bool:
         assert self._master is not None
-        return bool(_ready(self._master, 0, 0.0) & select.POLLHUP)
+        return bool(_poll(self._master, 0, 0.0) & select.POLLHUP)
 
-    def _unread(self) -> bool:
-        """There is something that the client has not taken."""
-        near = os.open(self._near, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    def _has_unread(self) -> bool:
+        """Whether there are bytes that the client has not read."""
+        client_end = os.open(self._client_end, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
-            return fcntl.ioctl(near, termios.FIONREAD, bytes(4)) != bytes(4)
+            return fcntl.ioctl(client_end, termios.FIONREAD, bytes(4)) != bytes(4)
         finally:
-            os.close(near)
+            os.close(client_end)
 
 
 def listen(url: str) -> Sink:
-    """Be the device behind a URL.
+    """Open a server for a URL.
 
     Args:
-        url: ``tcp://HOST:PORT`` or ``udp://HOST:PORT``, 127.0.0.1 without HOST, any free port with PORT 0; ``pty:``, or
-            ``pty:PATH`` for a link to it.
+        url: ``tcp://HOST:PORT`` or ``udp://HOST:PORT`` (default host 127.0.0.1; port 0: any free port), ``pty:``, or
+            ``pty:PATH`` for a symbolic link to the pty.
 
     Raises:
-        SonarError: no such URL, or nothing can be opened there; one line.
+        SonarError: an invalid URL, or an address that cannot be opened.
     """
     parsed = parse_url(url)
     sinks = {"tcp": TcpSink, "udp": UdpSink, "pty": PtySink}
@@ -322,12 +342,12 @@ def listen(url: str) -> Sink:
         raise SonarError(f"{parsed.text}: {reason(failure)}{taken}; needed is a free address of this machine") from None
 
 
-def _address(url: Url, host: str, bound: socket.socket) -> str:
+def _bound_url(url: Url, host: str, bound: socket.socket) -> str:
     name = f"[{host}]" if ":" in host else host
     return f"{url.scheme}://{name}:{bound.getsockname()[1]}"
 
 
-def _ready(descriptor: int, events: int, timeout: float) -> int:
+def _poll(descriptor: int, events: int, timeout: float) -> int:
     poll = select.poll()
     poll.register(descriptor, events)
     found = poll.poll(timeout * 1000)

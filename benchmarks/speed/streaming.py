@@ -60,7 +60,7 @@ def device(speed: float, seconds: float) -> None:
     with listen("tcp://127.0.0.1:0") as sink:
         print(f"listening on {sink.url}", flush=True)
         done = emulate(endless(seconds * speed / SCAN), sink, speed=speed)
-        print(f"latest {done.latest:.3f}", flush=True)
+        print(f"latest {done.max_delay:.3f}", flush=True)
 
 
 def memory() -> float:

@@ -1,19 +1,19 @@
-"""Compiled programs, kept between runs, so that only the first one waits for the compiler."""
+"""Persistent cache of compiled XLA programs, so that only the first run waits for the compiler."""
 
 import os
 from pathlib import Path
 
-SWITCH = "JAXSONAR_CACHE"
-"""Environment variable; ``off`` keeps nothing."""
+CACHE_VARIABLE = "JAXSONAR_CACHE"
+"""Environment variable; the value ``off`` disables the cache."""
 
 
 def use_compilation_cache() -> None:
-    """Keep compiled programs in a folder that only this user may write to, unless JAX was told where.
+    """Configure JAX's persistent compilation cache, unless it is configured already.
 
-    ``~/.cache/jaxsonar/compiled``, or below ``XDG_CACHE_HOME``; ``JAX_COMPILATION_CACHE_DIR`` names another folder,
-    ``JAXSONAR_CACHE=off`` keeps nothing.
+    The folder is ``~/.cache/jaxsonar/compiled``, or below ``XDG_CACHE_HOME``; only this user may write to it.
+    ``JAX_COMPILATION_CACHE_DIR`` selects another folder, and ``JAXSONAR_CACHE=off`` disables the cache.
     """
-    if os.environ.get(SWITCH, "").lower() == "off":
+    if os.environ.get(CACHE_VARIABLE, "").lower() == "off":
         return
     import jax
 
@@ -23,9 +23,9 @@ def use_compilation_cache() -> None:
     folder = Path(home) / "jaxsonar" / "compiled"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        seen = folder.stat()
-        if seen.st_uid != os.getuid() or seen.st_mode & 0o022:
-            return  # what lies there is run: it must be nobody else's
+        status = folder.stat()
+        if status.st_uid != os.getuid() or status.st_mode & 0o022:
+            return  # cached programs are executed, so nobody else may write to the folder
     except (OSError, RuntimeError):
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))

@@ -1,4 +1,4 @@
-"""What all GeoJSON files of this project share: a FeatureCollection in metres, features named when they are wrong."""
+"""Reading and writing of GeoJSON FeatureCollections in metres; errors name the feature."""
 
 import json
 import os
@@ -14,57 +14,68 @@ from jaxsonar.hardware.errors import SonarError
 T = TypeVar("T")
 
 
-def read_features(path: str | os.PathLike[str], read: Callable[[dict[str, Any], str, Any], T], *, what: str) -> list[T]:
-    """Read a FeatureCollection, feature by feature.
+def read_features(
+    filename: str | os.PathLike[str], read: Callable[[dict[str, Any], str, Any], T], *, what: str
+) -> list[T]:
+    """Read a FeatureCollection.
 
     Args:
-        path: the file.
-        read: makes something of a feature's properties, the name of its geometry and the geometry's coordinates; its
-            errors get the file and the feature's number in front.
-        what: what the file should hold, for the message ("a room").
+        filename: the file.
+        read: converts one feature, given its properties, the type of its geometry and the coordinates. The file and the
+            index of the feature are prepended to its errors.
+        what: expected content, for the message ("a room").
+
+    Returns:
+        The converted features, in order.
 
     Raises:
-        SonarError: the file cannot be read or is none, or ``read`` refused a feature.
+        SonarError: the file cannot be read, is not a FeatureCollection, or ``read`` rejected a feature.
     """
-    content = read_bytes(path, what=f"{what}, GeoJSON")
-    place = shown(path)
+    content = read_bytes(filename, what=f"{what}, GeoJSON")
+    where = shown(filename)
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as failure:
-        raise SonarError(f"{place}: no JSON: {reason(failure)}; allowed is a GeoJSON FeatureCollection") from None
+        raise SonarError(f"{where}: no JSON: {reason(failure)}; allowed is a GeoJSON FeatureCollection") from None
     features = document.get("features") if isinstance(document, dict) else None
     if not (isinstance(document, dict) and document.get("type") == "FeatureCollection" and isinstance(features, list)):
-        raise SonarError(f"{place}: no FeatureCollection came; allowed is a GeoJSON FeatureCollection with features")
+        raise SonarError(f"{where}: no FeatureCollection came; allowed is a GeoJSON FeatureCollection with features")
     found = []
     for index, entry in enumerate(features):
         try:
-            found.append(read(*_opened(entry)))
+            found.append(read(*_feature_parts(entry)))
         except SonarError as error:
-            raise SonarError(f"{place}: feature {index}: {error}") from None
+            raise SonarError(f"{where}: feature {index}: {error}") from None
     return found
 
 
-def write_features(features: Sequence[dict[str, Any]], path: str | os.PathLike[str]) -> None:
-    """Write a FeatureCollection, a feature a line, whole or not at all; ``-`` is standard output.
+def write_features(features: Sequence[dict[str, Any]], filename: str | os.PathLike[str]) -> None:
+    """Write a FeatureCollection with one feature per line, atomically; ``-`` is standard output.
 
     Raises:
         SonarError: the file cannot be written.
     """
     body = ",\n".join(json.dumps(entry, ensure_ascii=False, allow_nan=False) for entry in features)
-    with open_output(path) as file:
+    with open_output(filename) as file:
         file.write(f'{{"type": "FeatureCollection", "features": [\n{body}\n]}}\n')
 
 
 def feature(form: str, coordinates: Any, /, **properties: Any) -> dict[str, Any]:
-    """One feature: a geometry's name and coordinates, and what is known about it."""
+    """A GeoJSON feature.
+
+    Args:
+        form: type of the geometry ("LineString").
+        coordinates: coordinates of the geometry.
+        properties: properties of the feature.
+    """
     return {"type": "Feature", "properties": properties, "geometry": {"type": form, "coordinates": coordinates}}
 
 
 def lines_of(form: str, coordinates: Any) -> Iterator[tuple[Any, bool]]:
-    """Every list of positions in a geometry of lines or polygons, and whether it is a ring.
+    """All lists of positions in a geometry of lines or polygons, each with True if it is a closed ring.
 
     Raises:
-        SonarError: another geometry, or coordinates that are not nested as they should be.
+        SonarError: another geometry, or wrongly nested coordinates.
     """
     depth = {"LineString": 0, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}.get(form)
     if depth is None:
@@ -79,10 +90,10 @@ def lines_of(form: str, coordinates: Any) -> Iterator[tuple[Any, bool]]:
 
 
 def positions(line: Any) -> Float[np.ndarray, "positions 2"]:
-    """The positions of one line, metres; a third coordinate is left out.
+    """The positions of one line, metres. A third coordinate is dropped.
 
     Raises:
-        SonarError: something else than pairs of finite numbers.
+        SonarError: positions that are not pairs of finite numbers.
     """
     if not isinstance(line, list):
         raise SonarError(f"{line!r:.40} instead of a list of positions; allowed are lists of [x, y]")
@@ -90,13 +101,13 @@ def positions(line: Any) -> Float[np.ndarray, "positions 2"]:
         pair = position[:2] if isinstance(position, list) else []
         if len(pair) < 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
             raise SonarError(f"position {position!r:.60}; allowed is [x, y] in metres")
-        if not all(abs(v) < 1e12 for v in pair):  # NaN fails too, and integers too large for a float
+        if not all(abs(v) < 1e12 for v in pair):  # also rejects NaN, and integers too large for a float
             raise SonarError(f"position {position!r:.60}; allowed are finite numbers, metres")
     return np.array([position[:2] for position in line], dtype=np.float64).reshape(-1, 2)
 
 
-def _opened(entry: Any) -> tuple[dict[str, Any], str, Any]:
-    """Properties, name of the geometry and coordinates of one feature."""
+def _feature_parts(entry: Any) -> tuple[dict[str, Any], str, Any]:
+    """Properties, type of the geometry and coordinates of one feature."""
     if not isinstance(entry, dict) or entry.get("type") != "Feature":
         raise SonarError("no Feature came; allowed are Feature objects")
     properties, geometry = entry.get("properties"), entry.get("geometry")

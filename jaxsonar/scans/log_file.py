@@ -2,7 +2,7 @@
 
 import os
 
-from jaxsonar.hardware.recorder_base import mark_of
+from jaxsonar.hardware.recorder_base import recording_marker
 from jaxsonar.scans.scan_log import Log, log_format
 
 
@@ -17,7 +17,7 @@ def load_log(path: str | os.PathLike[str]) -> Log:
         SonarError: the file cannot be read or holds what no log can; one line with file, row, column and what is
             allowed.
     """
-    if mark_of(path).exists():
+    if recording_marker(path).exists():
         from jaxsonar.scans.recording_journal import load_cut_short
 
         return load_cut_short(path)

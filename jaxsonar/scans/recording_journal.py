@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jaxsonar.fileio.atomic_files import read_bytes, shown
 from jaxsonar.hardware.recorder import CsvRecorder, open_recorder
-from jaxsonar.hardware.recorder_base import Recorder, mark_of
+from jaxsonar.hardware.recorder_base import Recorder, recording_marker
 from jaxsonar.scans.scan_log import Log, log_format
 
 
@@ -31,11 +31,11 @@ class ParquetRecorder(CsvRecorder):
         self._target = Path(path)
         # An empty log first: a missing extra or folder shows now, and what was there before is gone.
         write_parquet(Log.from_scans([]), path)
-        super().__init__(journal_of(path), mark=mark_of(path))
+        super().__init__(journal_of(path), marker=recording_marker(path))
 
     def close(self) -> None:
         """Turn the journal into Parquet, and take it away."""
-        if not self._files:
+        if not self._descriptors:
             return
         from jaxsonar.scans.csv_log import read_csv
         from jaxsonar.scans.parquet_log import write_parquet
@@ -76,7 +76,7 @@ def load_cut_short(path: str | os.PathLike[str]) -> Log:
     if parquet and _later(path, source):
         return read_parquet(path)  # only the journal was left to be taken away
     text = read_bytes(source, what="a scan log (CSV)")
-    said = read_bytes(mark_of(path), what="the size of a log").strip()
+    said = read_bytes(recording_marker(path), what="the size of a log").strip()
     size = int(said) if said.isdigit() else 0
     whole = text[:size] if len(text) >= size else _without_last_scan(text)
     log = read_csv_text(source, whole) if b"\n" in whole else Log.from_scans([])

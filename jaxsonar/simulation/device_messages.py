@@ -10,7 +10,7 @@ from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.messages import ECHO, Group, Message, Pose
-from jaxsonar.hardware.protocol import FARTHEST, LARGEST_ANGLE, LONGEST_TIME_US
+from jaxsonar.hardware.protocol import MAX_POSITION, MAX_ANGLE, MAX_TIME_OF_FLIGHT_US
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
 from jaxsonar.simulation.simulator import simulate
@@ -105,10 +105,10 @@ def _check_log(log: Log, ring: Ring) -> None:
     if wrong.any():
         allowed = f"0 to {LARGEST['scan'] - 1}"
         raise SonarError(f"log: scan {log.scan[wrong][0]} came; allowed for a device is {allowed}")
-    far = (np.abs(log.pose) > [FARTHEST, FARTHEST, LARGEST_ANGLE]).any(axis=1)
+    far = (np.abs(log.pose) > [MAX_POSITION, MAX_POSITION, MAX_ANGLE]).any(axis=1)
     if far.any():
         came = f"scan {log.scan[far][0]}: pose {tuple(log.pose[far][0].tolist())}"
-        allowed = f"x and y up to {FARTHEST:g} m, theta up to {LARGEST_ANGLE:g} rad"
+        allowed = f"x and y up to {MAX_POSITION:g} m, theta up to {MAX_ANGLE:g} rad"
         raise SonarError(f"log: {came} came; allowed for a device are {allowed}")
 
 
@@ -160,10 +160,10 @@ def _echoes(log: Log) -> np.ndarray:
     with np.errstate(over="ignore", under="ignore"):
         echoes["time_us"] = log.range * (2e6 / REFERENCE_SPEED_OF_SOUND)
         echoes["amplitude"] = log.amplitude
-    wrong = ~(echoes["time_us"] > 0) | ~(echoes["time_us"] <= LONGEST_TIME_US) | np.isinf(echoes["amplitude"])
+    wrong = ~(echoes["time_us"] > 0) | ~(echoes["time_us"] <= MAX_TIME_OF_FLIGHT_US) | np.isinf(echoes["amplitude"])
     if wrong.any():
         came = f"range {log.range[wrong][0]:g} m, amplitude {log.amplitude[wrong][0]:g}"
-        farthest = LONGEST_TIME_US * REFERENCE_SPEED_OF_SOUND / 2e6
+        farthest = MAX_TIME_OF_FLIGHT_US * REFERENCE_SPEED_OF_SOUND / 2e6
         raise SonarError(f"log: {came} came; allowed for a device are up to {farthest:.0f} m and 32-bit amplitudes")
     return echoes
 

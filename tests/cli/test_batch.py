@@ -15,7 +15,7 @@ from jaxsonar import Log, load_log, load_ring
 from jaxsonar.batch_jobs.inputs import find_inputs
 from jaxsonar.batch_jobs.shards import shards_of
 from jaxsonar.cli import app as cli
-from jaxsonar.fileio.compilation_cache import SWITCH, use_compilation_cache
+from jaxsonar.fileio.compilation_cache import CACHE_VARIABLE, use_compilation_cache
 from jaxsonar.scans.rosbag_log import bag_scans
 from jaxsonar.simulation.device_messages import log_messages
 
@@ -227,10 +227,10 @@ def test_the_compilation_cache_can_be_turned_off(tmp_path, monkeypatch):
     try:
         jax.config.update("jax_compilation_cache_dir", None)
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-        monkeypatch.setenv(SWITCH, "off")
+        monkeypatch.setenv(CACHE_VARIABLE, "off")
         use_compilation_cache()
         assert not list(tmp_path.iterdir())
-        monkeypatch.delenv(SWITCH)
+        monkeypatch.delenv(CACHE_VARIABLE)
         use_compilation_cache()
         assert kept.jax_compilation_cache_dir == str(tmp_path / "jaxsonar" / "compiled")
         assert Path(kept.jax_compilation_cache_dir).stat().st_mode & 0o777 == 0o700

@@ -344,7 +344,7 @@ def test_messages_come_in_time(office, log):
     assert due[-1] > 0.25
     assert late.min() >= 0
     assert np.median(late) < 0.1
-    assert late.max() == pytest.approx(served.latest, abs=0.1)
+    assert late.max() == pytest.approx(served.max_delay, abs=0.1)
 
 
 def test_slow_is_slower_than_fast(office, log):
@@ -459,7 +459,7 @@ def test_the_same_seed_makes_the_same_faults(office, log):
 
     def passed(seed):
         link = FaultInjector(FaultSettings(corrupt=0.2, drop=0.2, reorder=0.2, seed=seed))
-        return [piece for data in frames for piece in link.transmit(data)] + link.rest()
+        return [piece for data in frames for piece in link.transmit(data)] + link.flush()
 
     assert passed(1) == passed(1)
     assert passed(1) != passed(2)
@@ -474,8 +474,8 @@ def test_each_fault_does_what_it_says():
     assert all(bad.transmit(data) != [data] for data in frames)
     pairs = [swapped.transmit(data) for data in frames[:5]]
     assert pairs == [[], [frames[1], frames[0]], [], [frames[3], frames[2]], []]
-    assert swapped.rest() == [frames[4]]
-    assert swapped.rest() == []
+    assert swapped.flush() == [frames[4]]
+    assert swapped.flush() == []
     assert (none.damaged, lost.dropped, bad.damaged, swapped.swapped) == (0, 200, 200, 3)
 
 
@@ -506,10 +506,10 @@ def test_a_device_that_stalls(office, log):
 
 def test_stalls_come_every_so_often():
     link = FaultInjector(FaultSettings(stall=1.0, every=10.0))
-    pauses = [(k / 10, link.pause(k / 10)) for k in range(500)]
+    pauses = [(k / 10, link.stall_duration(k / 10)) for k in range(500)]
     assert [when for when, pause in pauses if pause] == [10.0, 20.0, 30.0, 40.0]
     late = FaultInjector(FaultSettings(stall=1.0, every=10.0))
-    assert [late.pause(when) for when in (9.9, 35.0, 39.0, 40.0, 41.0)] == [0.0, 1.0, 0.0, 1.0, 0.0]
+    assert [late.stall_duration(when) for when in (9.9, 35.0, 39.0, 40.0, 41.0)] == [0.0, 1.0, 0.0, 1.0, 0.0]
 
 
 @pytest.mark.parametrize(
@@ -544,4 +544,4 @@ def test_faults_that_are_none(faults):
 
 
 def test_the_end_is_said_often_enough_for_a_bad_line():
-    assert emulator.ENDINGS > 1
+    assert emulator.END_FRAMES > 1

@@ -145,7 +145,7 @@ def cut(data, where):
     return [data[a:b] for a, b in pairwise(edges)]
 
 
-noise = st.one_of(st.binary(max_size=60), st.binary(max_size=9).map(frame), st.just(b"\0"), st.just(encode_end(1, 2)))
+noise = st.one_of(st.binary(max_size=60), st.binary(max_size=9).map(encode_frame), st.just(b"\0"), st.just(encode_end(1, 2)))
 
 
 @settings(max_examples=300)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from jaxsonar.hardware.drop_oldest_queue import DropOldestQueue
 from jaxsonar.hardware.messages import ECHO, Group, Pose
-from jaxsonar.hardware.scan_assembler import MOST_ECHOES, MOST_GROUPS, REFERENCE_SPEED_OF_SOUND, ScanAssembler
+from jaxsonar.hardware.scan_assembler import REFERENCE_SPEED_OF_SOUND, SETTINGS, ScanAssembler
 from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND as RING_REFERENCE
 
 GROUPS, PERIOD_US = 8, 11_700
@@ -129,7 +129,7 @@ def test_a_lost_group_does_not_cost_a_pose():
 def test_a_sender_that_says_unknown_things_keeps_its_poses():
     sent = [m for m in device(3) if m.sequence % 5 != 2 or isinstance(m, Group)]
     assembler = ScanAssembler()
-    assembler.skipped = True
+    assembler.unknown_messages = True
     scans, _ = assembled(sent, assembler)
     assert all(np.isfinite(scan.pose).all() for scan in scans)
 
@@ -185,7 +185,7 @@ def test_sequence_numbers_and_their_overflow():
 
 def test_an_incomplete_scan_is_handed_on_in_time():
     sent = device(1)[:-4]
-    assembler = ScanAssembler(waited=0.5)
+    assembler = ScanAssembler(timeout=0.5)
     for message in sent:
         assert assembler.push(message, 10.0) == []
     assert assembler.expire(10.4) == []
@@ -201,7 +201,7 @@ def test_hostile_groups_need_no_room():
     for k in range(3000):
         assembler.push(Group(k, k, (k * 7919) % 2**32, k % 500, 500 if k % 2 else 40_000, float("nan"), echoes), 0.0)
     assert assembler.counts.impossible == 3000
-    assert MOST_GROUPS < 500
+    assert SETTINGS.max_groups < 500
     for k in range(3000):  # a new scan with every group
         assembler.push(Group(3000 + k, 3000 + k, k * 1000, 0, 8, float("nan"), echoes), 0.0)
     assert len(assembler.flush()) <= 3
@@ -214,7 +214,7 @@ def test_a_scan_of_too_many_echoes_keeps_those_that_came_first():
     for k in range(8):
         assembler.push(Group(k, k, 0, k, 8, float("nan"), echoes), 0.0)
     (scan,) = assembler.flush()
-    assert len(scan.echoes) == MOST_ECHOES == 4 * 4096
+    assert len(scan.echoes) == SETTINGS.max_echoes == 4 * 4096
     assert (scan.missing, assembler.counts.impossible) == (4, 4)
 
 

@@ -9,9 +9,8 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from jaxsonar.hardware import SonarError
+from jaxsonar.hardware import SonarError, transport_clients
 from jaxsonar.hardware import transport_base as transports
-from jaxsonar.hardware import transport_clients as transport_sources
 from jaxsonar.hardware.transport_base import EndOfStream, LinkEvent, Source, open_source, parse_url
 from jaxsonar.hardware.transport_servers import listen
 
@@ -371,9 +370,9 @@ def test_back_off_doubles_up_to_a_limit(monkeypatch):
     with Device("tcp://127.0.0.1:0") as device:
         events, tell = events_of()
         source = open_source(device.url, on_event=tell)
-        assert isinstance(source, transport_sources.ReconnectingSource)
-        monkeypatch.setattr(transport_sources, "time", Clock)
-        monkeypatch.setattr(transport_sources.TcpSource, "_open", refuse)
+        assert isinstance(source, transport_clients.ReconnectingSource)
+        monkeypatch.setattr(transport_clients, "time", Clock)
+        monkeypatch.setattr(transport_clients.TcpSource, "_connect", refuse)
         source._lost(ConnectionResetError(104, "Connection reset by peer"))
         while now[0] < 30:
             assert source.read(0.3) is None

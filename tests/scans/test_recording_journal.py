@@ -306,7 +306,7 @@ def test_a_reader_that_is_stopped_has_written_everything(tmp_path):
 
 def test_a_patient_reader_drops_nothing_and_ends_after_so_many_scans():
     queue: DropOldestQueue[RawScan] = DropOldestQueue(4)
-    reader = ReaderThread(Given(encode(m) for m in messages(300)), queue, patient=True, scans=200)
+    reader = ReaderThread(Given(encode(m) for m in messages(300)), queue, block_when_full=True, scans=200)
     reader.start()
     scans = []
     while not queue.ended:
@@ -325,7 +325,7 @@ def test_a_device_that_runs_ahead_of_its_clock_is_waited_for_and_a_live_one_is_n
     for message in sent:  # a scan is 0.1 s, or as long as it takes to come
         object.__setattr__(message, "time_us", message.time_us * (9 if played_back else 0) + message.sequence * 100)
     queue: DropOldestQueue[RawScan] = DropOldestQueue(16)
-    reader = ReaderThread(Given(map(encode, sent), pause=0.0002), queue, patient=None)
+    reader = ReaderThread(Given(map(encode, sent), pause=0.0002), queue, block_when_full=None)
     reader.start()
     time.sleep(2.0)
     taken = []
