@@ -16,15 +16,15 @@ from benchmarks.speed.timing import Contestant
 
 def of_merging(options: Options) -> list[Metric]:
     """``benchmarks.mapping.segment_merging``: walls from segments, against single linkage by SciPy, which only makes the clusters."""
-    from jaxsonar.mapping.build_map import condense
     from jaxsonar.mapping.hough_merging import single_linkage
-    from jaxsonar.mapping.segment_fusion import fuse
+    from jaxsonar.mapping.observations import merge_cells
+    from jaxsonar.mapping.segment_fusion import fuse_segments
 
     size = options.pick(gate=2_000, quick=3_000, full=10_000)
     pieces, _ = merging.building(size)
-    middle = pieces.segments.mean(axis=1)
+    middle = pieces.endpoints.mean(axis=1)
     entered = {
-        "fuse": Contestant(lambda: fuse(condense(pieces), gap=merging.GAP), size),
+        "fuse": Contestant(lambda: fuse_segments(merge_cells(pieces), gap=merging.GAP), size),
         "linkage": Contestant(lambda: single_linkage(middle, merging.CUT), size),
         "scipy": Contestant(lambda: fcluster(linkage(middle, "single"), merging.CUT, "distance"), size),
     }
@@ -39,7 +39,7 @@ def of_merging(options: Options) -> list[Metric]:
         for count in sizes:
             many, _ = merging.building(count)
             start = time.process_time()
-            fuse(condense(many), gap=merging.GAP)
+            fuse_segments(merge_cells(many), gap=merging.GAP)
             curve.append((count, time.process_time() - start))
         metrics.append(Metric("merging.fuse.exponent", exponent(curve), ""))
         metrics += [Metric(f"merging.fuse@{count}", seconds, "s") for count, seconds in curve]

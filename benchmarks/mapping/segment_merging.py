@@ -22,10 +22,11 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import KDTree
 
 from jaxsonar.geometry.se2 import wrap_angle
-from jaxsonar.mapping.build_map import condense
-from jaxsonar.mapping.hough_merging import merge_as_paper, single_linkage
-from jaxsonar.mapping.segment_fusion import fuse
-from jaxsonar.mapping.wall_segments import SIGMA_OFFSET, SIGMA_THETA, Pieces
+from jaxsonar.mapping.hough_merging import merge_by_hough, single_linkage
+from jaxsonar.mapping.observations import merge_cells
+from jaxsonar.mapping.segment_fusion import fuse_segments
+from jaxsonar.mapping.settings import SETTINGS
+from jaxsonar.mapping.wall_segments import WallSegments
 
 ROOM = np.array([6.0, 4.0])
 """Metres; of every room, wall to wall."""
@@ -38,12 +39,12 @@ CLUTTER = 0.1
 GAP, CUT = 0.5, 0.4
 NEAR, TURNED = 0.1, math.radians(5.0)
 """Metres and radians up to which a found wall is a true one."""
-WAYS = ("condense + fuse", "merge_as_paper", "single_linkage", "scipy linkage(single)")
+WAYS = ("merge_cells + fuse_segments", "merge_by_hough", "single_linkage", "scipy linkage(single)")
 PEER_UP_TO = 10_000
 """Segments; the peer keeps half of their distances squared in memory, 0.4 GB for these."""
 
 
-def building(segments: int, *, thick: float = THICK, seed: int = 0) -> tuple[Pieces, np.ndarray]:
+def building(segments: int, *, thick: float = THICK, seed: int = 0) -> tuple[WallSegments, np.ndarray]:
     """Segments of local models in a square of rooms, and the walls (walls, 2, 2) of those; both faces are walls."""
     rng = np.random.default_rng(seed)
     strays = int(CLUTTER * segments)
@@ -59,29 +60,33 @@ def building(segments: int, *, thick: float = THICK, seed: int = 0) -> tuple[Pie
     size = np.linalg.norm(walls[wall, 1] - walls[wall, 0], axis=-1)
     own = length[: len(wall)]
     place = own / 2 + rng.random(len(wall)) * (size - own)
-    centre = walls[wall, 0] + place[:, None] * along + rng.normal(0, SIGMA_OFFSET, len(wall))[:, None] * normal
-    theta = np.arctan2(normal[:, 1], normal[:, 0]) + rng.normal(0, SIGMA_THETA, len(wall))
+    centre = (
+        walls[wall, 0]
+        + place[:, None] * along
+        + rng.normal(0, SETTINGS.segments.offset_sd, len(wall))[:, None] * normal
+    )
+    theta = np.arctan2(normal[:, 1], normal[:, 0]) + rng.normal(0, SETTINGS.segments.theta_sd, len(wall))
     centre = np.concatenate([centre, rng.uniform(0, 1, (strays, 2)) * (corner.max(axis=0) + ROOM)])
     theta = np.concatenate([theta, rng.uniform(-np.pi, np.pi, strays)])
     order = rng.permutation(segments)
     row = np.arange(segments)
-    pieces = Pieces(
+    pieces = WallSegments(
         centre=centre[order],
         theta=wrap_angle(theta[order]),
-        ends=0.5 * length[order, None] * np.array([-1.0, 1.0]),
-        info_offset=np.full(segments, SIGMA_OFFSET**-2),
-        info_theta=np.full(segments, SIGMA_THETA**-2),
-        misfit=np.zeros(segments),
+        extent=0.5 * length[order, None] * np.array([-1.0, 1.0]),
+        info_offset=np.full(segments, SETTINGS.segments.offset_sd**-2),
+        info_theta=np.full(segments, SETTINGS.segments.theta_sd**-2),
+        chi_squared=np.zeros(segments),
         count=np.ones(segments, np.int64),
         echoes=np.full(segments, 6),
-        distance=rng.uniform(0.5, 4, segments),
-        latest=row / 10,
+        viewing_distance=rng.uniform(0.5, 4, segments),
+        last_seen=row / 10,
         scans=(row, row // 4),
     )
     return pieces, walls
 
 
-def true_walls_found(pieces: Pieces, walls: np.ndarray) -> int:
+def true_walls_found(pieces: WallSegments, walls: np.ndarray) -> int:
     """How many true walls have a found one on their line that covers most of them."""
     long = pieces.take(pieces.length > 1.0)
     if not len(long):
@@ -108,10 +113,10 @@ def measure(way: str, segments: int, thick: float) -> dict[str, float | str]:
     """One way on one building: seconds, MB above what the segments need, and what was found."""
     small, _ = building(1000)
     pieces, walls = building(segments, thick=thick)
-    midpoint = pieces.segments.mean(axis=1)
+    midpoint = pieces.endpoints.mean(axis=1)
     runs = {
-        "condense + fuse": lambda pieces: fuse(condense(pieces), gap=GAP)[0],
-        "merge_as_paper": lambda pieces: merge_as_paper(pieces, cut=CUT),
+        "merge_cells + fuse_segments": lambda pieces: fuse_segments(merge_cells(pieces), gap=GAP)[0],
+        "merge_by_hough": lambda pieces: merge_by_hough(pieces, linkage_distance=CUT),
         "single_linkage": lambda pieces: single_linkage(midpoint[: len(pieces)], CUT),
         "scipy linkage(single)": lambda pieces: fcluster(linkage(midpoint[: len(pieces)], "single"), CUT, "distance"),
     }
@@ -123,7 +128,7 @@ def measure(way: str, segments: int, thick: float) -> dict[str, float | str]:
         return {"failure": f"{type(failure).__name__}: {failure}"}
     result: dict[str, float | str] = {"seconds": time.perf_counter() - start, "memory": peak() - before}
     result["true"] = len(walls)
-    if isinstance(found, Pieces):
+    if isinstance(found, WallSegments):
         result |= {
             "found": true_walls_found(found, walls),
             "walls": len(found),

@@ -38,9 +38,9 @@ from jaxsonar import GlobalMap, SonarError
 from jaxsonar.estimation.trajectory import Trajectory, errors
 from jaxsonar.evaluation.map_accuracy import evaluate
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder
-from jaxsonar.geometry.se2 import relative, to_world, wrap_angle
-from jaxsonar.graph_slam.slam import Tie
-from jaxsonar.mapping.global_map import map_of
+from jaxsonar.geometry.se2 import relative, transform_points, wrap_angle
+from jaxsonar.graph_slam.slam import LoopClosure
+from jaxsonar.mapping.floor_plan import map_from_room
 
 WAYS: dict[str, dict[str, Any]] = {"smoothed": {"smooth": True}, "front end": {"smooth": False}}
 """What ``run_slam`` is told, besides how wrong the odometry is, which the bound knows, too."""
@@ -60,19 +60,19 @@ class Run:
     trajectory: Trajectory
     """Of the scans that could be placed, by their stamps."""
     world: GlobalMap
-    closures: Sequence[Tie]
+    closures: Sequence[LoopClosure]
     step_ms: Float[np.ndarray, " scans"]
     """Of everything that a scan costs while the robot drives."""
 
 
 def run_slam(scene: Scene, seed: int, way: str) -> Run:
     """The one call of the library's SLAM."""
-    from jaxsonar.estimation.odometry_noise import Slip
+    from jaxsonar.estimation.odometry_noise import OdometryNoise
     from jaxsonar.graph_slam.slam import slam
 
-    slip = Slip(place=DISTANCE, heading=TURN, turn=DISTANCE)
+    slip = OdometryNoise(position_per_meter=DISTANCE, heading_per_meter=TURN, heading_per_radian=DISTANCE)
     choices = WAYS[way] if scene.wheels else {}  # placed by the ranges, there is no front end
-    got = slam(scene.ring, scene.log(seed), slip=slip, live=True, **choices)
+    got = slam(scene.ring, scene.log(seed), odometry_noise=slip, live=True, **choices)
     return Run(got.trajectory, got.world, got.closures, np.asarray(got.step_ms))
 
 
@@ -82,7 +82,7 @@ def run_one_scan(scene: Scene, seed: int) -> Trajectory:
 
     sd = np.array([GUESS[0], GUESS[0], GUESS[1]])
     start = scene.poses[0] + sd * np.random.default_rng(seed).standard_normal(3)
-    return localize(scene.ring, map_of(scene.room), scene.log(seed), start=start.tolist()).trajectory
+    return localize(scene.ring, map_from_room(scene.room), scene.log(seed), start=start.tolist()).trajectory
 
 
 @dataclass(frozen=True)
@@ -181,9 +181,9 @@ def outcome(scene: Scene, way: str, least: Bound, *, seed: int = 0) -> Outcome:
     )
 
 
-def wrong(poses: Float[np.ndarray, "scans 3"], tie: Tie) -> bool:
+def wrong(poses: Float[np.ndarray, "scans 3"], tie: LoopClosure) -> bool:
     """Whether a closure says something else than the truth does, in what it determines."""
-    off = tie.pose - relative(poses[tie.first], poses[tie.second])
+    off = tie.first_from_second - relative(poses[tie.first], poses[tie.second])
     off[2] = wrap_angle(float(off[2]))
     off = tie.determined @ (tie.determined.T @ off)
     return bool(np.hypot(off[0], off[1]) > WRONG[0] or abs(off[2]) > WRONG[1])
@@ -191,7 +191,7 @@ def wrong(poses: Float[np.ndarray, "scans 3"], tie: Tie) -> bool:
 
 def _map_measures(scene: Scene, world: GlobalMap, frame: Float[np.ndarray, "3"]) -> dict[str, float]:
     """Of a map, after it was moved by ``frame``."""
-    found = evaluate(to_world(frame, world.segments), scene.room.walls)
+    found = evaluate(transform_points(frame, world.segments), scene.room.walls)
     heard = np.unique(scene.heard.reflector[scene.heard.kind == 0])
     covered = found.reference_covered[heard] >= found.reference_length[heard] / 2
     return {

@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
                 log,
                 start=options.start,
                 sigma=options.sigma,
-                slip=odometry_noise_of(options.odometry),
+                odometry_noise=odometry_noise_of(options.odometry),
                 progress=progress,
             )
     except SonarError as error:
@@ -88,14 +88,14 @@ def _load_known_map(path: str) -> "GlobalMap":
     from jaxsonar.fileio.atomic_files import shown
     from jaxsonar.floor_plans.room_geojson import load_room
     from jaxsonar.hardware.errors import SonarError
-    from jaxsonar.mapping.global_map import map_of
+    from jaxsonar.mapping.floor_plan import map_from_room
     from jaxsonar.mapping.map_geojson import load_map
 
     try:
         world = load_map(path)
     except SonarError as no_map:
         try:
-            world = map_of(load_room(path))
+            world = map_from_room(load_room(path))
         except SonarError:
             raise no_map from None
     if not len(world):

@@ -15,7 +15,7 @@ from jaxsonar.detection.settings import check_method, check_sigma, hough_setting
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.graph_slam.slam import Tracker
-from jaxsonar.graph_slam.submap_evidence import Journey
+from jaxsonar.graph_slam.submap_evidence import SubmapEvidence
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import assemble_map, check_merging, required_scans
 from jaxsonar.mapping.global_map import GlobalMap
@@ -35,7 +35,7 @@ class MapState:
     """The path of the window that is being gathered; empty without windows."""
     waiting: tuple[Scan, ...]
     """Scans of that window that are not in the evidence yet."""
-    journey: Journey | None = None
+    submap_evidence: SubmapEvidence | None = None
     """Where poses are estimated: the scans by submap; their evidence is gathered when a map is asked for."""
 
 
@@ -59,7 +59,7 @@ class StepInfo:
 class Mapper:
     """Builds a map scan by scan: ``state, info = mapper.step(state, scan)``; ``mapper.map(state)`` is the map so far.
 
-    With ``slip`` the poses of the scans are odometry, and the robot's own are estimated step by step (``slam``); the
+    With ``odometry_noise`` the poses of the scans are odometry, and the robot's own are estimated step by step (``slam``); the
     scans are kept then, because closing a loop moves them.
 
     The evidence adds up, so the order of the scans does not matter, and the map is that of ``build_map`` on the same
@@ -87,13 +87,13 @@ class Mapper:
         check_merging(self.merging)
         check_window(self.window)
         if self.odometry_noise is not None and (self.window is not None or self.merging == "paper"):
-            raise SonarError("mapper: slip came with a window or the paper's merging; allowed is either")
+            raise SonarError("mapper: odometry_noise came with a window or the paper's merging; allowed is either")
         object.__setattr__(self, "settings", hough_settings(self.ring, self.settings, window=self.window))
 
     def start(self) -> MapState:
         """A state that knows nothing."""
         nothing = MapEvidence.empty()
-        return MapState(nothing, WindowBuffer(), (), None if self._tracker is None else Journey(self._tracker.start()))
+        return MapState(nothing, WindowBuffer(), (), None if self._tracker is None else SubmapEvidence(self._tracker.start()))
 
     def step(
         self,
@@ -107,18 +107,18 @@ class Mapper:
 
         Args:
             state: so far.
-            scan: its pose is right, or odometry (``slip``).
+            scan: its pose is right, or odometry (``odometry_noise``).
             model: its local model, if it is known already; not with windows.
             path_pose: of a robot that moved during the scan, as ``local_model`` takes it; not with windows.
 
         Raises:
             SonarError: a sensor number that the ring does not have.
         """
-        if state.journey is not None and self._tracker is not None:
-            journey, step = state.journey.after(self._tracker, scan, model=model, path_pose=path_pose)
+        if state.submap_evidence is not None and self._tracker is not None:
+            journey, step = state.submap_evidence.step(self._tracker, scan, model=model, path_pose=path_pose)
             segments = [transform_points(step.pose, line.segment) for line in step.model.lines]
             info = StepInfo(step.model, np.array(segments).reshape(-1, 2, 2), "", step.pose, step.covariance)
-            return replace(state, journey=journey), info
+            return replace(state, submap_evidence=journey), info
         if self.window is None:
             if not np.isfinite(scan.pose).all():
                 return state, _nothing("no pose")
@@ -157,14 +157,14 @@ class Mapper:
 
     def map(self, state: MapState) -> GlobalMap:
         """The map so far."""
-        evidence = state.evidence if state.journey is None else state.journey.evidence(self.ring) or state.evidence
+        evidence = state.evidence if state.submap_evidence is None else state.submap_evidence.evidence(self.ring) or state.evidence
         return assemble_map(evidence, merging=self.merging, min_scans=required_scans(self.window))
 
     def trajectory(self, state: MapState) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:
         """Where poses are estimated: those of all scans so far, and their covariances with respect to the first one."""
-        if state.journey is None or self._tracker is None:
-            raise SonarError("mapper: no poses are estimated; allowed is a mapper with slip")
-        return self._tracker.poses(state.journey.tracked)
+        if state.submap_evidence is None or self._tracker is None:
+            raise SonarError("mapper: no poses are estimated; allowed is a mapper with odometry_noise")
+        return self._tracker.poses(state.submap_evidence.tracker_state)
 
     @cached_property
     def _tracker(self) -> Tracker | None:

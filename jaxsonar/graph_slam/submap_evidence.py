@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.geometry.se2 import compose, wrap_angle
-from jaxsonar.graph_slam.slam import Step, Tracker, TrackerState
+from jaxsonar.graph_slam.slam import TrackerStep, Tracker, TrackerState
 from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
@@ -20,40 +20,40 @@ Part = tuple[tuple[Scan, LocalModel], ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Journey:
+class SubmapEvidence:
     """Scans so far, by submap, and where these lie."""
 
-    tracked: TrackerState
-    parts: tuple[Part, ...] = ((),)
+    tracker_state: TrackerState
+    scans: tuple[Part, ...] = ((),)
     """The last one is of the submap that is being made."""
-    seen: dict[int, tuple[Float[np.ndarray, "3"], int, MapEvidence]] = field(default_factory=dict)
+    cache: dict[int, tuple[Float[np.ndarray, "3"], int, MapEvidence]] = field(default_factory=dict)
     """What submaps amounted to when they were last looked at: their pose and number of scans then; only a memory."""
 
-    def after(self, tracker: Tracker, scan: Scan, **given) -> tuple["Journey", Step]:
+    def step(self, tracker: Tracker, scan: Scan, **given) -> tuple["SubmapEvidence", TrackerStep]:
         """The journey with one scan more (``Tracker.step``, whose arguments these are)."""
-        tracked, step = tracker.step(self.tracked, scan, **given)
-        parts = (*self.parts[:-1], (*self.parts[-1], (scan, step.model)))
-        if len(tracked.graph.submaps) > len(self.tracked.graph.submaps):
+        tracked, step = tracker.step(self.tracker_state, scan, **given)
+        parts = (*self.scans[:-1], (*self.scans[-1], (scan, step.model)))
+        if len(tracked.graph.submaps) > len(self.tracker_state.graph.submaps):
             parts = (*parts, ())
-        return Journey(tracked, parts, self.seen), step
+        return SubmapEvidence(tracked, parts, self.cache), step
 
     def evidence(self, ring: Ring) -> MapEvidence | None:
         """What all scans say of the walls, from where they were taken as far as that is known now; None without any."""
         whole = None
-        for number, part in enumerate(self.parts):
+        for number, part in enumerate(self.scans):
             if not part:
                 continue
-            base = compose(self.tracked.start, self.tracked.graph.poses[number])
-            known = self.seen.get(number)
+            base = compose(self.tracker_state.start, self.tracker_state.graph.poses[number])
+            known = self.cache.get(number)
             if known is None or known[1] != len(part) or _apart(base, known[0]):
                 known = (base, len(part), self._of(ring, number, base))
-                self.seen[number] = known
+                self.cache[number] = known
             whole = known[2] if whole is None else whole.union(known[2])
         return whole
 
     def _of(self, ring: Ring, number: int, base: Float[np.ndarray, "3"]) -> MapEvidence:
-        submaps, part = self.tracked.graph.submaps, self.parts[number]
-        poses = submaps[number].poses if number < len(submaps) else np.array(self.tracked.track.poses)
+        submaps, part = self.tracker_state.graph.submaps, self.scans[number]
+        poses = submaps[number].poses if number < len(submaps) else np.array(self.tracker_state.submap.poses)
         # A submap begins with the scan that the one before ends with.
         world = compose(base, poses[-len(part) :])
         scans = [replace(scan, pose=pose) for (scan, _), pose in zip(part, world, strict=True)]

@@ -1,4 +1,4 @@
-"""From pieces of walls to walls: pieces that continue or cover one another and agree add up, until none do."""
+"""Fusion of wall segments into walls: segments that continue or overlap one another and agree are fused iteratively."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,243 +9,247 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
 from jaxsonar.mapping.observations import unique_pairs
-from jaxsonar.mapping.wall_segments import Pieces, add_up
+from jaxsonar.mapping.settings import SETTINGS
+from jaxsonar.mapping.wall_segments import WallSegments
 
-OFFSET_GATE = 0.06
-"""Metres; pieces of one wall lie at most this far off one another, across the wall."""
-TURN_GATE = 3.0
-"""Standard deviations by which their directions may differ."""
-OFFSET_FLOOR = 0.005
-"""Metres; how well an offset can agree at best: walls are not quite straight, nor is odometry."""
-MOST_FLOOR = 0.02
-"""Metres; however far poses are off."""
-TURN_PER_OFFSET = 2.2
-"""Radians per metre; how well a direction can agree at best, for how well an offset can."""
-BOTH_SIDES = 0.04
-"""Metres; faces seen from opposite sides and less than this apart are one thin wall, else two."""
-BESIDE = 0.025
-"""Metres; nothing stands this little before a wall: what is this near to its line is it, however well it is known."""
-Opening = Callable[[Float[np.ndarray, "gaps 2 2"], Float[np.ndarray, " gaps"]], Bool[np.ndarray, " gaps"]]
-"""Tells of gaps (both ends, metres, and the direction of the wall's normal) whether they are openings."""
-OUTLYING = 3.0
-"""Standard deviations from which on a piece is off its wall by more than noise."""
-_ROUNDS = 5
-_LEVER = 2.0  # metres that a radian counts for, when neighbors are looked for
-_NEAREST = 12
+OpeningTest = Callable[[Float[np.ndarray, "gaps 2 2"], Float[np.ndarray, " gaps"]], Bool[np.ndarray, " gaps"]]
+"""Decides which gaps are openings. Arguments: both ends of each gap (metres) and the normal of its wall (radians)."""
 
 
-def fuse(
-    pieces: Pieces, *, gap: float, floor: float = OFFSET_FLOOR, opening: Opening | None = None, beside: float = 0.0
-) -> tuple[Pieces, Int[np.ndarray, " pieces"]]:
-    """Walls from pieces: in rounds, those that are each other's best match add up, until no two of them match.
+def fuse_segments(
+    segments: WallSegments,
+    *,
+    gap: float,
+    systematic_error: float = SETTINGS.fusion.offset_floor,
+    is_opening: OpeningTest | None = None,
+    near_wall: float = 0.0,
+) -> tuple[WallSegments, Int[np.ndarray, " segments"]]:
+    """Walls from segments. In each iteration, segments that are each other's best match are fused, until none match.
 
-    Two pieces match if they face the same way, their directions agree, they lie on one line (``OFFSET_GATE``), and not
-    more than ``gap`` metres of that line lies between them. The result does not depend on the order of the pieces, and
-    fusing it again changes nothing.
+    Two segments match if they face the same way, have the same direction, lie on one line, and the gap between them is
+    at most ``gap``. The result does not depend on the order of the segments, and fusing it again does not change it.
 
     Args:
-        pieces: pieces of walls.
-        gap: metres.
-        floor: how well offsets can agree at best, metres (``common_floor``).
-        opening: if given, tells which gaps, from end to end, are openings and stay open.
-        beside: a piece whose ends are this near to the line of a longer one matches it as well, metres.
+        segments: wall segments.
+        gap: largest gap that is closed, metres.
+        systematic_error: standard deviation of an offset due to pose errors, metres (``estimate_systematic_error``).
+        is_opening: decides which gaps stay open although they are short enough.
+        near_wall: a segment whose ends are this close to the line of a longer segment matches it as well, metres.
 
     Returns:
-        The walls, and which of them each piece belongs to.
+        The walls, and the row of the wall that each segment belongs to.
     """
-    wall_of = np.arange(len(pieces))
-    seen, pieces = pieces.scans, replace(pieces, scans=(wall_of[:0], wall_of[:0]))  # added up once, at the end
+    wall_of = np.arange(len(segments))
+    scans, walls = segments.scans, replace(segments, scans=(wall_of[:0], wall_of[:0]))  # scans are merged once, below
     pairs, cost = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
-    changed, thorough = np.ones(len(pieces), dtype=bool), False
-    while len(pieces) > 1:
-        # Only pieces that changed can match anew; first with the nearest, at last with all of them.
-        new = _neighbors(pieces, changed, gap, floor, nearest=None if thorough else _NEAREST)
-        badness, between = _compared(pieces, new, gap, floor)
-        if beside:
-            badness = np.minimum(badness, np.maximum(_width(pieces, new) / beside, between / gap))
+    changed, exhaustive = np.ones(len(walls), dtype=bool), False
+    while len(walls) > 1:
+        # New matches involve a changed segment. First search the nearest neighbors, finally all of them.
+        nearest = None if exhaustive else SETTINGS.fusion.nearest
+        new = _candidate_pairs(walls, changed, gap, systematic_error, nearest=nearest)
+        badness, between = _compare(walls, new, gap, systematic_error)
+        if near_wall:
+            offset = _largest_offset(walls, new)
+            badness = np.minimum(badness, np.maximum(offset / near_wall, between / gap))
         new, badness, between = new[badness <= 1], badness[badness <= 1], between[badness <= 1]
-        if opening is not None and (between > 0).any():
+        if is_opening is not None and (between > 0).any():
             apart = np.flatnonzero(between > 0)
-            shut = np.delete(np.arange(len(new)), apart[opening(*gaps(pieces, new[apart]))])
-            new, badness = new[shut], badness[shut]
-        pairs, once = np.unique(np.concatenate([pairs, new]), axis=0, return_index=True)
-        cost = np.concatenate([cost, badness])[once]
+            closed = np.delete(np.arange(len(new)), apart[is_opening(*_gaps_between(walls, new[apart]))])
+            new, badness = new[closed], badness[closed]
+        pairs, unique = np.unique(np.concatenate([pairs, new]), axis=0, return_index=True)
+        cost = np.concatenate([cost, badness])[unique]
         if len(pairs):
-            group = mutual(pairs, cost, len(pieces))
-            pieces, wall_of = add_up(pieces, group), group[wall_of]
+            group = mutual_best(pairs, cost, len(walls))
+            walls, wall_of = walls.fuse(group), group[wall_of]
             changed = np.bincount(group) > 1
             pairs = group[pairs]
-            kept = ~changed[pairs].any(axis=1)
-            pairs, cost = np.sort(pairs[kept], axis=1), cost[kept]
-        elif thorough:
+            unchanged = ~changed[pairs].any(axis=1)
+            pairs, cost = np.sort(pairs[unchanged], axis=1), cost[unchanged]
+        elif exhaustive:
             break
         else:
-            changed, thorough = np.ones(len(pieces), dtype=bool), True
-    return replace(pieces, scans=unique_pairs(wall_of[seen[0]], seen[1])), wall_of
+            changed, exhaustive = np.ones(len(walls), dtype=bool), True
+    return replace(walls, scans=unique_pairs(wall_of[scans[0]], scans[1])), wall_of
 
 
-def common_floor(pieces: Pieces, *, gap: float) -> float:
-    """How well offsets can agree at best, metres: more than ``OFFSET_FLOOR`` where poses are off by more.
+def estimate_systematic_error(segments: WallSegments, *, gap: float) -> float:
+    """Standard deviation of offsets that their covariances do not explain, metres; the effect of pose errors.
 
-    The pieces of a wall then differ by more than their covariances tell, in most walls, and even the nearest of them.
+    It is twice the excess scatter of the median segment about its wall, between the limits in the settings. Walls and
+    error are estimated in turn until the error no longer grows.
 
     Args:
-        pieces: pieces of walls.
-        gap: metres, as for ``fuse``.
+        segments: wall segments.
+        gap: as for ``fuse_segments``.
     """
-    floor = OFFSET_FLOOR
+    error = SETTINGS.fusion.offset_floor
     while True:
-        walls, _ = fuse(pieces, gap=gap, floor=floor)
+        walls, _ = fuse_segments(segments, gap=gap, systematic_error=error)
         walls = walls.take(walls.count > 1)
         if not len(walls):
-            return floor
-        excess = np.maximum(walls.misfit - 2 * (walls.count - 1), 0) / walls.info_offset
-        order = np.argsort(excess, kind="stable")
-        half = np.searchsorted(np.cumsum(walls.count[order]), walls.count.sum() / 2)
-        wanted = min(2 * float(np.sqrt(excess[order[half]])), MOST_FLOOR)
-        if wanted < 1.1 * floor:
-            return floor
-        floor = wanted
+            return error
+        excess_variance = np.maximum(walls.chi_squared - 2 * (walls.count - 1), 0) / walls.info_offset
+        order = np.argsort(excess_variance, kind="stable")
+        median = np.searchsorted(np.cumsum(walls.count[order]), walls.count.sum() / 2)
+        larger = min(2 * float(np.sqrt(excess_variance[order[median]])), SETTINGS.fusion.max_systematic_error)
+        if larger < 1.1 * error:
+            return error
+        error = larger
 
 
-def settle(
-    pieces: Pieces, wall_of: Int[np.ndarray, " pieces"], walls: Pieces, *, floor: float = OFFSET_FLOOR
-) -> Pieces:
-    """The walls again, each piece counting for as much as it agrees with its wall.
+def robust_refit(
+    segments: WallSegments,
+    wall_of: Int[np.ndarray, " segments"],
+    walls: WallSegments,
+    *,
+    systematic_error: float = SETTINGS.fusion.offset_floor,
+) -> WallSegments:
+    """The walls, estimated again with outlying segments down-weighted (iteratively reweighted least squares).
 
-    A line with echoes of another reflector in it is farther off than its covariance tells. Where a piece deviates by
-    more than ``OUTLYING`` standard deviations of one of its lines, its information is divided by the square of the
-    excess.
+    A line with echoes of another reflector is farther off than its covariance says. If a segment deviates from its wall
+    by more than ``outlier_gate`` standard deviations, its information is divided by the square of the excess.
 
     Args:
-        pieces: pieces of walls.
-        wall_of: which wall each belongs to.
-        walls: their sums, to begin with.
-        floor: as for ``fuse``; what it exceeds ``OFFSET_FLOOR`` by is no piece's own fault.
+        segments: wall segments.
+        wall_of: row of the wall that each segment belongs to.
+        walls: their fusions, the starting point.
+        systematic_error: as for ``fuse_segments``; the part above ``offset_floor`` does not count as a deviation.
     """
-    slack = floor - OFFSET_FLOOR
-    offset = pieces.count / pieces.info_offset + slack**2
-    angle = pieces.count / pieces.info_theta + (TURN_PER_OFFSET * slack) ** 2
-    for _ in range(_ROUNDS):
-        off, turn = deviations(pieces, walls, wall_of)
-        share = np.minimum(1, OUTLYING**2 / np.maximum(off**2 / offset + turn**2 / angle, 1e-9))
-        weighed = replace(pieces, info_offset=share * pieces.info_offset, info_theta=share * pieces.info_theta)
-        walls = add_up(weighed, wall_of)
+    settings = SETTINGS.fusion
+    slack = systematic_error - settings.offset_floor
+    offset_variance = segments.count / segments.info_offset + slack**2
+    theta_variance = segments.count / segments.info_theta + (settings.angle_per_offset * slack) ** 2
+    for _ in range(settings.refit_iterations):
+        offset = ((segments.centre - walls.centre[wall_of]) * walls.normal[wall_of]).sum(-1)
+        angle = (segments.theta - walls.theta[wall_of] + np.pi / 2) % np.pi - np.pi / 2
+        squared = offset**2 / offset_variance + angle**2 / theta_variance
+        weight = np.minimum(1, settings.outlier_gate**2 / np.maximum(squared, 1e-9))
+        weighted = replace(segments, info_offset=weight * segments.info_offset, info_theta=weight * segments.info_theta)
+        walls = weighted.fuse(wall_of)
     return walls
 
 
-def mismatch(pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"], *, gap: float) -> Float[np.ndarray, " pairs"]:
-    """How badly the pieces of each pair agree: 0 for the same piece twice, 1 at the first gate, more beyond it."""
-    return _compared(pieces, pairs, gap, OFFSET_FLOOR)[0]
+def mismatch(segments: WallSegments, pairs: Int[np.ndarray, "pairs 2"], *, gap: float) -> Float[np.ndarray, " pairs"]:
+    """How badly the segments of each pair agree: 0 for identical segments, 1 at the first gate, more beyond it."""
+    return _compare(segments, pairs, gap, SETTINGS.fusion.offset_floor)[0]
 
 
-def _compared(
-    pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"], gap: float, floor: float
+def _compare(
+    segments: WallSegments, pairs: Int[np.ndarray, "pairs 2"], gap: float, systematic_error: float
 ) -> tuple[Float[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]:
-    """The mismatch of each pair, and how much of their line lies between them, metres."""
+    """The mismatch of each pair, and the length of the gap between its segments, metres (0 if they overlap)."""
+    settings = SETTINGS.fusion
     a, b = pairs.T
-    turn = wrap_angle(pieces.theta[b] - pieces.theta[a])
-    opposite = np.abs(turn) > np.pi / 2
-    turn = np.where(opposite, wrap_angle(turn + np.pi), turn)
-    variance = 1 / pieces.info_theta
-    # What does not average out: what a single line errs by (its echoes are not all its own), and the floor.
-    single = pieces.count / pieces.info_offset
-    least = floor**2 + np.maximum(single[a], single[b])
-    turn_floor = TURN_PER_OFFSET**2 * least
+    angle = wrap_angle(segments.theta[b] - segments.theta[a])
+    opposite = np.abs(angle) > np.pi / 2
+    angle = np.where(opposite, wrap_angle(angle + np.pi), angle)
+    variance = 1 / segments.info_theta
+    # Errors that do not average out: those of a single line (it contains foreign echoes), and the systematic error.
+    single = segments.count / segments.info_offset
+    offset_floor = systematic_error**2 + np.maximum(single[a], single[b])
+    theta_floor = settings.angle_per_offset**2 * offset_floor
 
-    # The common line, as ``add_up`` would draw it, and how far the ends of both pieces are from it.
-    share = pieces.info_theta[b] / (pieces.info_theta[a] + pieces.info_theta[b])
-    theta = pieces.theta[a] + share * turn
-    tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
-    normal = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-    offset = pieces.centre[b] - pieces.centre[a]
+    # The common line, as WallSegments.fuse would place it, and the distance of both centres across it.
+    share = segments.info_theta[b] / (segments.info_theta[a] + segments.info_theta[b])
+    theta = segments.theta[a] + share * angle
+    tangent, normal = tangent_of(theta), unit(theta)
+    offset = segments.centre[b] - segments.centre[a]
     along, across = (offset * tangent).sum(-1), (offset * normal).sum(-1)
-    info_a, info_b = pieces.info_offset[a], pieces.info_offset[b]
-    together = info_a * info_b / (info_a + info_b)
-    angles = pieces.info_theta[a] + pieces.info_theta[b]
-    bend = -together * along * across / (angles + together * along**2)
-    apart = np.abs(across + bend * along)
-    segments = pieces.segments
-    first = ((segments[a] - pieces.centre[a][:, None]) * tangent[:, None]).sum(-1)
-    second = ((segments[b] - pieces.centre[a][:, None]) * tangent[:, None]).sum(-1)
+    info_a, info_b = segments.info_offset[a], segments.info_offset[b]
+    info_both = info_a * info_b / (info_a + info_b)
+    rotation = -info_both * along * across / (segments.info_theta[a] + segments.info_theta[b] + info_both * along**2)
+    apart = np.abs(across + rotation * along)
+    # The gap between the two, along the common line.
+    endpoints = segments.endpoints
+    first = ((endpoints[a] - segments.centre[a][:, None]) * tangent[:, None]).sum(-1)
+    second = ((endpoints[b] - segments.centre[a][:, None]) * tangent[:, None]).sum(-1)
     between = np.maximum(first.min(-1) - second.max(-1), second.min(-1) - first.max(-1))
     between = np.maximum(between, 0)
-    # How far either must be turned to lie on the common line, in standard deviations.
-    turns = np.abs(np.stack([share * turn + bend, (share - 1) * turn + bend]))
-    turns = (turns / np.sqrt(variance[[a, b]] + turn_floor)).max(axis=0)
-    turns = np.maximum(turns, np.abs(turn) / np.sqrt(variance[a] + variance[b] + 2 * turn_floor)) / TURN_GATE
-    spread = np.sqrt(1 / info_a + 1 / info_b + least)
-    offset_gate = np.where(opposite, BOTH_SIDES, np.minimum(OFFSET_GATE, TURN_GATE * spread))
+    # Angles by which each must be rotated onto the common line, and the angle between both, as fractions of the gate.
+    turns = np.abs(np.stack([share * angle + rotation, (share - 1) * angle + rotation]))
+    turns = (turns / np.sqrt(variance[[a, b]] + theta_floor)).max(axis=0)
+    turns = np.maximum(turns, np.abs(angle) / np.sqrt(variance[a] + variance[b] + 2 * theta_floor)) / settings.gate
+    spread = np.sqrt(1 / info_a + 1 / info_b + offset_floor)
+    same_side_gate = np.minimum(settings.max_offset, settings.gate * spread)
+    offset_gate = np.where(opposite, settings.max_thickness, same_side_gate)
     return np.maximum.reduce([apart / offset_gate, turns, between / gap]), between
 
 
-def deviations(
-    pieces: Pieces, walls: Pieces, wall_of: Int[np.ndarray, " pieces"]
-) -> tuple[Float[np.ndarray, " pieces"], Float[np.ndarray, " pieces"]]:
-    """How far each piece's centre is off its wall, metres, and how far it is turned, radians, in [-pi/2, pi/2]."""
-    off = ((pieces.centre - walls.centre[wall_of]) * walls.normal[wall_of]).sum(-1)
-    return off, (pieces.theta - walls.theta[wall_of] + np.pi / 2) % np.pi - np.pi / 2
-
-
-def _width(pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"]) -> Float[np.ndarray, " pairs"]:
-    """How far the ends of the shorter piece of each pair are off the line of the longer one at most, metres."""
+def _largest_offset(segments: WallSegments, pairs: Int[np.ndarray, "pairs 2"]) -> Float[np.ndarray, " pairs"]:
+    """Larger distance of the two ends of the shorter segment of each pair from the line of the longer one, metres."""
     a, b = pairs.T
-    a, b = np.where(pieces.length[a] < pieces.length[b], [b, a], [a, b])
-    offset = pieces.segments[b] - pieces.centre[a][:, None]
-    return np.abs((offset * pieces.normal[a][:, None]).sum(-1)).max(axis=-1)
+    a, b = np.where(segments.length[a] < segments.length[b], [b, a], [a, b])
+    offset = segments.endpoints[b] - segments.centre[a][:, None]
+    return np.abs((offset * segments.normal[a][:, None]).sum(-1)).max(axis=-1)
 
 
-def gaps(
-    pieces: Pieces, pairs: Int[np.ndarray, "pairs 2"]
+def _gaps_between(
+    segments: WallSegments, pairs: Int[np.ndarray, "pairs 2"]
 ) -> tuple[Float[np.ndarray, "pairs 2 2"], Float[np.ndarray, " pairs"]]:
-    """What lies between two pieces, from the end of one to the nearest end of the other, and its normal."""
+    """The nearest ends of the two segments of each pair, metres, and the normal of the first one, radians."""
     a, b = pairs.T
-    ends = pieces.segments
+    ends = segments.endpoints
     apart = np.linalg.norm(ends[a][:, :, None] - ends[b][:, None], axis=-1).reshape(-1, 4)
     nearest = apart.argmin(axis=1)
-    return np.stack([ends[a, nearest // 2], ends[b, nearest % 2]], axis=1), pieces.theta[a]
+    return np.stack([ends[a, nearest // 2], ends[b, nearest % 2]], axis=1), segments.theta[a]
 
 
-def _neighbors(
-    pieces: Pieces, changed: Bool[np.ndarray, " pieces"], gap: float, floor: float, *, nearest: int | None
+def _candidate_pairs(
+    segments: WallSegments,
+    changed: Bool[np.ndarray, " segments"],
+    gap: float,
+    systematic_error: float,
+    *,
+    nearest: int | None,
 ) -> Int[np.ndarray, "pairs 2"]:
-    """Pairs that may match, one of them changed: pieces with samples near each other in place and direction."""
-    parts = np.maximum(np.ceil(pieces.length / gap).astype(np.int64), 1) + 1
-    piece = np.repeat(np.arange(len(pieces)), parts)
-    share = (np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts)) / (parts[piece] - 1)
-    start, end = pieces.segments[piece, 0], pieces.segments[piece, 1]
-    place = start + share[:, None] * (end - start)
-    double = 2 * pieces.theta[piece]  # both sides of a wall have one direction
-    direction = 0.5 * _LEVER * np.stack([np.cos(double), np.sin(double)], axis=-1)
-    points = np.concatenate([place, direction], axis=-1)
-    turn_floor = TURN_PER_OFFSET**2 * (floor**2 + (pieces.count / pieces.info_offset).max())
-    steepest = TURN_GATE * np.sqrt(2 / pieces.info_theta.min() + 2 * turn_floor)
-    reach = float(np.hypot(1.6 * gap + OFFSET_GATE, _LEVER * min(steepest, np.pi / 2)))
-    tree, asking = KDTree(points), np.flatnonzero(changed[piece])
-    if nearest is None and len(asking) == len(points):
-        one, other = tree.query_pairs(reach, output_type="ndarray").reshape(-1, 2).T
+    """Pairs that may match, at least one of them changed: segments with samples close in position and direction.
+
+    With ``nearest``, only that many neighbors of each sample are considered.
+    """
+    settings = SETTINGS.fusion
+    samples = np.maximum(np.ceil(segments.length / gap).astype(np.int64), 1) + 1
+    segment = np.repeat(np.arange(len(segments)), samples)
+    share = (np.arange(len(segment)) - np.repeat(np.cumsum(samples) - samples, samples)) / (samples[segment] - 1)
+    start, end = segments.endpoints[segment, 0], segments.endpoints[segment, 1]
+    position = start + share[:, None] * (end - start)
+    direction = 0.5 * settings.angle_scale * unit(2 * segments.theta[segment])  # both sides of a wall are one direction
+    points = np.concatenate([position, direction], axis=-1)
+    theta_floor = settings.angle_per_offset**2 * (systematic_error**2 + (segments.count / segments.info_offset).max())
+    largest_angle = settings.gate * np.sqrt(2 / segments.info_theta.min() + 2 * theta_floor)
+    angular_distance = settings.angle_scale * min(largest_angle, np.pi / 2)
+    radius = float(np.hypot(1.6 * gap + settings.max_offset, angular_distance))
+    tree, queries = KDTree(points), np.flatnonzero(changed[segment])
+    if nearest is None and len(queries) == len(points):
+        one, other = tree.query_pairs(radius, output_type="ndarray").reshape(-1, 2).T
     elif nearest is None:
-        found = tree.query_ball_point(points[asking], reach)
-        one = np.repeat(asking, [len(near) for near in found])
+        found = tree.query_ball_point(points[queries], radius)
+        one = np.repeat(queries, [len(near) for near in found])
         other = np.array([k for near in found for k in near], dtype=np.int64)
     else:
-        near = np.asarray(tree.query(points[asking], k=min(nearest, len(points)), distance_upper_bound=reach)[1])
+        near = tree.query(points[queries], k=min(nearest, len(points)), distance_upper_bound=radius)[1]
+        near = np.asarray(near)
         row, rank = np.nonzero(near < len(points))
-        one, other = asking[row], near[row, rank]
-    one, other = np.sort([piece[one], piece[other]], axis=0)
-    flat = np.unique((one * len(pieces) + other)[one < other])
-    return np.stack([flat // len(pieces), flat % len(pieces)], axis=-1)
+        one, other = queries[row], near[row, rank]
+    one, other = np.sort([segment[one], segment[other]], axis=0)
+    flat = np.unique((one * len(segments) + other)[one < other])
+    return np.stack([flat // len(segments), flat % len(segments)], axis=-1)
 
 
-def mutual(
-    pairs: Int[np.ndarray, "pairs 2"], cost: Float[np.ndarray, " pairs"], pieces: int
-) -> Int[np.ndarray, " pieces"]:
-    """Group of each piece: two that are each other's best match share one."""
-    best = np.full(pieces, np.inf)
+def mutual_best(
+    pairs: Int[np.ndarray, "pairs 2"], cost: Float[np.ndarray, " pairs"], items: int
+) -> Int[np.ndarray, " items"]:
+    """Group number of each item; two items share a group if each is the other's partner of lowest cost.
+
+    Args:
+        pairs: numbers of the two items of each pair.
+        cost: cost of each pair.
+        items: number of items.
+    """
+    best = np.full(items, np.inf)
     for side in (0, 1):
         np.minimum.at(best, pairs[:, side], cost)
     chosen = pairs[(cost == best[pairs[:, 0]]) & (cost == best[pairs[:, 1]])]
-    graph = coo_array((np.ones(len(chosen), np.int8), (chosen[:, 0], chosen[:, 1])), shape=(pieces, pieces))
+    graph = coo_array((np.ones(len(chosen), np.int8), (chosen[:, 0], chosen[:, 1])), shape=(items, items))
     return connected_components(graph, directed=False)[1]

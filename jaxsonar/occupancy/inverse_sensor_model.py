@@ -1,4 +1,4 @@
-"""What one scan says about the cells around the robot: each direct path that listens is a look into its cone."""
+"""The inverse sensor model: what the direct echoes of one scan say about the grid cells around the robot."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -7,46 +7,47 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
-from jaxsonar.geometry.se2 import rotation, to_world, wrap_angle
+from jaxsonar.geometry.se2 import rotation, transform_points, wrap_angle
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.occupancy.wall_visibility import KnownWalls, beyond_ends, explained, sight
+from jaxsonar.occupancy.settings import SETTINGS
+from jaxsonar.occupancy.wall_visibility import WallMap, estimate_extensions, explained_by_walls, visible_range
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
-MARGIN = 0.04
-"""Metres; so much nearer than its echo a look leaves cells alone, for errors of ranges and poses."""
-SURE = 2 / 3
-"""Share of a cone in which silence counts. Towards its border a sensor is deaf to all but large walls: 6 dB one way is
-12 dB there and back, over the inner two thirds it is 5 dB."""
-SHADE = np.radians(15.0)
-"""Radians; an echo that no wall explains comes from something as wide as a wall, so it hides so much on each side of
-the cone too: those looks go by it obliquely, and would not hear a wall there."""
+LAYERS = ("free", "occluded", "arcs", "walls", "footprint")
+"""What is counted for each cell; see the properties of ``OccupancyGrid``."""
 
 
-class Eyes(NamedTuple):
-    """The direct paths of a ring as plain arrays, and the outline of the robot that carries them."""
+class TransducerArrays(NamedTuple):
+    """The direct paths of a ring as NumPy arrays, and the outline of the robot."""
 
-    position: np.ndarray  # (sensors, 2)
-    heading: np.ndarray  # (sensors,)
-    half: np.ndarray  # (sensors,) half a cone, radians
+    position: Float[np.ndarray, "sensors 2"]
+    """Robot frame, metres."""
+    heading: Float[np.ndarray, " sensors"]
+    """Robot frame, radians."""
+    half_width: Float[np.ndarray, " sensors"]
+    """Half of each cone, radians."""
     max_range: float
-    reach: float  # from the robot's origin, metres
-    body: np.ndarray  # (edges, 3): inside where a x + b y + c <= 0; no edges where the sensors enclose no area
+    """Maximum range, metres."""
+    max_distance: float
+    """Largest distance from the robot's origin at which a cell can be observed, metres."""
+    outline: Float[np.ndarray, "edges 3"]
+    """Convex hull of the sensors: (a, b, c) with a x + b y + c <= 0 inside. No edges if it encloses no area."""
 
     @classmethod
-    def of(cls, ring: Ring) -> "Eyes":
-        """Those of a ring."""
-        position, half = np.asarray(ring.position), np.minimum(np.asarray(ring.beam) / 2, np.pi / 2)
+    def of(cls, ring: Ring) -> "TransducerArrays":
+        """The arrays of a ring."""
+        position, half_width = np.asarray(ring.position), np.minimum(np.asarray(ring.beam) / 2, np.pi / 2)
         try:
-            body = ConvexHull(position).equations
-        except (QhullError, ValueError):  # a bumper, or fewer than three sensors
-            body = np.zeros((0, 3))
-        reach = float(np.linalg.norm(position, axis=-1).max()) + ring.max_range
-        return cls(position, np.asarray(ring.heading), half, ring.max_range, reach, body)
+            outline = ConvexHull(position).equations
+        except (QhullError, ValueError):  # sensors on a line, or fewer than three sensors
+            outline = np.zeros((0, 3))
+        max_distance = float(np.linalg.norm(position, axis=-1).max()) + ring.max_range
+        return cls(position, np.asarray(ring.heading), half_width, ring.max_range, max_distance, outline)
 
 
 def first_echoes(ring: Ring, log: Log) -> Float[np.ndarray, "scans sensors"]:
-    """The nearest direct echo of each sensor, metres; infinite where it heard none within the maximum range."""
+    """Range of the first direct echo of each sensor, metres; inf without an echo within the maximum range."""
     direct = log.tx == log.rx
     sensor, scan = log.tx[direct], log.echo_scan[direct]
     if sensor.max(initial=0) >= ring.count:
@@ -59,116 +60,145 @@ def first_echoes(ring: Ring, log: Log) -> Float[np.ndarray, "scans sensors"]:
     return first
 
 
-def evidence(
-    eyes: Eyes,
+def inverse_sensor_model(
+    sensors: TransducerArrays,
     pose: Float[np.ndarray, " 3"],
-    first: Float[np.ndarray, " sensors"],
+    first_echo: Float[np.ndarray, " sensors"],
     listening: Bool[np.ndarray, " sensors"],
-    walls: KnownWalls,
+    walls: WallMap,
     corner: Int[np.ndarray, " 2"],
     size: int,
 ) -> Int[np.ndarray, "5 size size"]:
-    """What one scan says about the square of cells around the robot that starts with cell ``corner``.
+    """Counts that one scan adds to the square of cells around the robot, one layer for each of ``LAYERS``.
 
-    Free, hidden, arcs, walls, driven: the layers of ``OccupancyGrid.counts``.
+    Args:
+        sensors: the ring.
+        pose: world_from_robot, metres and radians.
+        first_echo: range of the first echo of each sensor, metres; inf for none.
+        listening: which sensors were active.
+        walls: the known walls around the robot.
+        corner: first cell (column, row) of the square, in cells of the world.
+        size: side of the square, cells.
     """
-    resolution = walls.resolution
-    position, heading = to_world(pose, eyes.position[listening]), eyes.heading[listening] + pose[2]
-    half, first = eyes.half[listening], first[listening]
-    known = explained(position, heading, half, first, walls) | (first <= 0)
+    resolution, max_range = walls.resolution, sensors.max_range
+    position = transform_points(pose, sensors.position[listening])
+    heading = sensors.heading[listening] + pose[2]
+    half_width, first_echo = sensors.half_width[listening], first_echo[listening]
+    explained = explained_by_walls(position, heading, half_width, first_echo, walls) | (first_echo <= 0)
 
-    # An echo that a wall explains says nothing about what is behind it, so that those looks end there.
-    limit = np.where(known, np.minimum(first, eyes.max_range), eyes.max_range)
-    disc, place = _disc(eyes.max_range, resolution, size), position / resolution - corner
-    look, cell, distance, off_axis = _cells_in_cones(disc, place, heading, half + SHADE, limit, size)
-    beyond = beyond_ends(position, heading, SURE * half, np.minimum(first, eyes.max_range), walls)
-    open_until = sight(position, heading, half + SHADE, eyes.max_range, walls, beyond)
-    rays = open_until.shape[1]
-    half, first, seen = half[look], first[look], np.ones(len(look), bool)
-    if rays:
-        ray = ((off_axis / (half + SHADE) + 1) * (rays / 2)).astype(int)
-        seen = distance < open_until[look, np.minimum(ray, rays - 1)]
-    off_axis, unexplained = np.abs(off_axis), seen & ~known[look]
-    thick = resolution / np.sqrt(2)  # a circle through a cell is no farther from its centre than its corners are
-    # Cells that the inner cone touches, so that no ring of unknown cells stays around a robot that stands.
-    touched = distance * np.sin(np.maximum(off_axis - SURE * half, 0)) <= thick
-    free = seen & touched & (distance < first - thick - MARGIN)
-    arcs = unexplained & (off_axis <= half) & (np.abs(distance - first) <= thick)
-    # Beyond the tangent of any point of the arc; outside the cone that is the tangent at the arc's end.
-    hidden = unexplained & (distance * np.cos(np.maximum(off_axis - half, 0)) > first + thick)
-    counts = np.zeros((5, size, size), int)
-    for layer, what in enumerate((free, hidden, arcs)):
-        counts[layer].flat = np.bincount(cell[what], minlength=size**2)
+    # Cells of each beam. An echo of a known wall says nothing about the cells behind the wall, so the beam ends there.
+    limit = np.where(explained, np.minimum(first_echo, max_range), max_range)
+    polar, in_square = _polar_cells(max_range, resolution, size), position / resolution - corner
+    width = half_width + SETTINGS.shadow
+    beam, cell, distance, off_axis = _cells_in_beams(polar, in_square, heading, width, limit, size)
+    # A beam sees a cell only in front of the known walls, including their possible extensions.
+    certain = SETTINGS.certain * half_width
+    extension = estimate_extensions(position, heading, certain, np.minimum(first_echo, max_range), walls)
+    visible_until = visible_range(position, heading, width, max_range, walls, extension)
+    sectors = visible_until.shape[1]
+    half_width, first_echo, certain = half_width[beam], first_echo[beam], certain[beam]
+    visible = np.ones(len(beam), bool)
+    if sectors:
+        sector = ((off_axis / width[beam] + 1) * (sectors / 2)).astype(int)
+        visible = distance < visible_until[beam, np.minimum(sector, sectors - 1)]
+    off_axis, unexplained = np.abs(off_axis), visible & ~explained[beam]
+    # Half the diagonal of a cell: the largest distance of a curve through a cell from the cell's centre.
+    tolerance = resolution / np.sqrt(2)
+    # Cells that the inner cone touches count as free, so that no ring of unknown cells remains around the robot.
+    touched = distance * np.sin(np.maximum(off_axis - certain, 0)) <= tolerance
+    free = visible & touched & (distance < first_echo - tolerance - SETTINGS.range_margin)
+    arcs = unexplained & (off_axis <= half_width) & (np.abs(distance - first_echo) <= tolerance)
+    # Occluded cells lie beyond the tangent of the arc; outside of the cone, beyond the tangent at the arc's end.
+    depth = distance * np.cos(np.maximum(off_axis - half_width, 0))
+    occluded = unexplained & (depth > first_echo + tolerance)
+    counts = np.zeros((len(LAYERS), size, size), int)
+    for layer, chosen in zip(counts, (free, occluded, arcs), strict=False):
+        layer.flat = np.bincount(cell[chosen], minlength=size**2)
+    free_layer, _, _, wall_layer, footprint_layer = counts
     column, row = (walls.cells - corner).T
-    counts[0, row, column] = 0
-    counts[3, row, column] = 1
-    column, row = _under(eyes, pose, corner, size, resolution).T
-    counts[4, row, column] = 1
+    free_layer[row, column] = 0
+    wall_layer[row, column] = 1
+    column, row = _footprint_cells(sensors, pose, corner, size, resolution).T
+    footprint_layer[row, column] = 1
     return counts
 
 
-class _Disc(NamedTuple):
-    """Cells around a point, for 4 x 4 places of the point in its own cell, by direction: a cone is a slice."""
+class _PolarCells(NamedTuple):
+    """The cells around a point, sorted by direction so that a cone is a slice.
+
+    Each row belongs to one of 4 x 4 positions of the point within its own cell.
+    """
 
     angle: np.ndarray  # (16, 2 cells) directions, radians, ascending over two turns
     distance: np.ndarray  # (16, 2 cells) metres
-    cell: np.ndarray  # (16, 2 cells) index in a square of ``size`` rows, relative to the point's own cell
+    cell: np.ndarray  # (16, 2 cells) flat index in a square with ``size`` columns, relative to the point's own cell
 
 
 @lru_cache(maxsize=2)
-def _disc(max_range: float, resolution: float, size: int) -> _Disc:
+def _polar_cells(max_range: float, resolution: float, size: int) -> _PolarCells:
     far = max_range / resolution + 1
     column, row = np.meshgrid(*[np.arange(-int(far), int(far) + 1)] * 2)
     inside = np.hypot(column, row) <= far
     column, row = column[inside], row[inside]
-    place = np.arange(16)[:, None]
-    dx = (column + 0.5 - (place % 4 + 0.5) / 4) * resolution
-    dy = (row + 0.5 - (place // 4 + 0.5) / 4) * resolution
+    quarter = np.arange(16)[:, None]
+    dx = (column + 0.5 - (quarter % 4 + 0.5) / 4) * resolution
+    dy = (row + 0.5 - (quarter // 4 + 0.5) / 4) * resolution
     angle = np.arctan2(dy, dx)
     order = np.argsort(angle, axis=1, kind="stable")
     angle, distance = (np.take_along_axis(values, order, axis=1) for values in (angle, np.hypot(dx, dy)))
     cell = (row * size + column)[order]
-    return _Disc(
+    return _PolarCells(
         np.concatenate([angle, angle + 2 * np.pi], axis=1), np.tile(distance, 2), np.tile(cell.astype(np.int64), 2)
     )
 
 
-def _cells_in_cones(
-    disc: _Disc, position: np.ndarray, heading: np.ndarray, half: np.ndarray, limit: np.ndarray, size: int
+def _cells_in_beams(
+    polar: _PolarCells,
+    position: Float[np.ndarray, "beams 2"],
+    heading: Float[np.ndarray, " beams"],
+    half_width: Float[np.ndarray, " beams"],
+    limit: Float[np.ndarray, " beams"],
+    size: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cells that each look looks at: (look, cell of the square, distance in metres, angle off the axis in radians).
+    """Cells of each beam: (beam, cell of the square, distance in metres, angle off the axis in radians).
 
     Args:
-        disc: cells around a sensor.
-        position: (looks, 2) in cells from the corner of the square; known to a quarter of a cell.
-        heading: (looks,) radians.
-        half: (looks,) half of each cone, radians.
-        limit: (looks,) how far each look goes, metres.
-        size: rows of the square.
+        polar: cells around a point.
+        position: of the sensors, in cells from the corner of the square; used to a quarter of a cell.
+        heading: of the sensors, radians.
+        half_width: of the beams, radians.
+        limit: end of each beam, metres.
+        size: side of the square, cells.
     """
     own = np.floor(position)
-    place = np.floor((position - own) * 4).astype(int)
-    place = place[:, 1] * 4 + place[:, 0]
-    begin = wrap_angle(heading - half)
-    ends = [np.searchsorted(disc.angle[k], (a, b)) for k, a, b in zip(place, begin, begin + 2 * half, strict=True)]
-    first, last = np.array(ends, dtype=int).reshape(-1, 2).T
-    look = np.repeat(np.arange(len(place)), last - first)
+    quarter = np.floor((position - own) * 4).astype(int)
+    quarter = quarter[:, 1] * 4 + quarter[:, 0]
+    begin = wrap_angle(heading - half_width)
+    end = begin + 2 * half_width
+    slices = [np.searchsorted(polar.angle[k], (a, b)) for k, a, b in zip(quarter, begin, end, strict=True)]
+    first, last = np.array(slices, dtype=int).reshape(-1, 2).T
+    beam = np.repeat(np.arange(len(quarter)), last - first)
     before = np.cumsum(last - first) - (last - first)
-    index = np.arange(len(look)) + (place * disc.angle.shape[1] + first - before)[look]
-    distance = disc.distance.ravel()[index]
-    near = distance <= limit[look]
-    look, index, distance = look[near], index[near], distance[near]
-    off_axis = disc.angle.ravel()[index] - (begin + half)[look]
-    return look, disc.cell.ravel()[index] + (own @ (1, size)).astype(int)[look], distance, off_axis
+    index = np.arange(len(beam)) + (quarter * polar.angle.shape[1] + first - before)[beam]
+    distance = polar.distance.ravel()[index]
+    near = distance <= limit[beam]
+    beam, index, distance = beam[near], index[near], distance[near]
+    off_axis = polar.angle.ravel()[index] - (begin + half_width)[beam]
+    return beam, polar.cell.ravel()[index] + (own @ (1, size)).astype(int)[beam], distance, off_axis
 
 
-def _under(eyes: Eyes, pose: np.ndarray, corner: np.ndarray, size: int, resolution: float) -> np.ndarray:
-    """Cells that the robot itself stands on, counted from ``corner``: inside the outline of its sensors, or theirs."""
-    if len(eyes.body):
-        wide = int(np.ceil(np.linalg.norm(eyes.position, axis=-1).max() / resolution)) + 1
-        cells = np.stack(np.meshgrid(*[np.arange(size // 2 - wide, size // 2 + wide + 1)] * 2), axis=-1).reshape(-1, 2)
-        inside = ((cells + corner + 0.5) * resolution - pose[:2]) @ rotation(pose[2])
-        cells = cells[(inside @ eyes.body[:, :2].T + eyes.body[:, 2] <= 0).all(axis=1)]
+def _footprint_cells(
+    sensors: TransducerArrays, pose: Float[np.ndarray, " 3"], corner: np.ndarray, size: int, resolution: float
+) -> Int[np.ndarray, "cells 2"]:
+    """Cells (column, row) under the robot, relative to ``corner``.
+
+    These are the cells inside the outline of the sensors; if there is none, the cells of the sensors.
+    """
+    if len(sensors.outline):
+        half = int(np.ceil(np.linalg.norm(sensors.position, axis=-1).max() / resolution)) + 1
+        cells = np.stack(np.meshgrid(*[np.arange(size // 2 - half, size // 2 + half + 1)] * 2), axis=-1).reshape(-1, 2)
+        p_robot = ((cells + corner + 0.5) * resolution - pose[:2]) @ rotation(pose[2])
+        cells = cells[(p_robot @ sensors.outline[:, :2].T + sensors.outline[:, 2] <= 0).all(axis=1)]
         if len(cells):
             return cells
-    return np.floor(to_world(pose, eyes.position) / resolution).astype(int) - corner
+    return np.floor(transform_points(pose, sensors.position) / resolution).astype(int) - corner

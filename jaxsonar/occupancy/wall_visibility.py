@@ -1,148 +1,166 @@
-"""What known walls explain of the echoes, and what they hide: lines of sight for occupancy grids."""
+"""Visibility of known walls: which echoes they explain, and how far each beam can see."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsonar.floor_plans.room import crossings, point_to_walls
-from jaxsonar.geometry.se2 import wrap_angle
-
-EXPLAINED = 0.08
-"""Metres; an echo this near to the range at which a known wall, end or corner must answer is the wall's."""
-BEYOND_END = 0.3
-"""Metres; walls answer beyond the ends that a map knows: those are the outermost feet of perpendiculars (section 5)."""
-BEYOND_CONE = np.radians(5.0)
-"""Radians; a wall is strong enough to be heard a little outside the cone."""
-HIDDEN = 1.0
-"""Metres; so far a wall may go on beyond its ends where nobody could hear it, and hides what is behind."""
-TOUCHES = 0.05
-"""Metres; a wall whose end is this near to another wall ends there."""
-NO_WALL = 0.2
-"""Metres; so far around the foot of a sensor that would have heard a wall, and did not, there is none."""
+from jaxsonar.geometry.se2 import unit, wrap_angle
+from jaxsonar.geometry.segments import crossings, lengths, point_to_segments
+from jaxsonar.occupancy.settings import SETTINGS
 
 
-class KnownWalls(NamedTuple):
-    """Known walls, where they meet, and the cells they go through."""
+class WallMap(NamedTuple):
+    """Known walls, their ends and corners, and the grid cells that they cross."""
 
-    segments: np.ndarray  # (walls, 2, 2)
-    points: np.ndarray  # (points, 2): ends, and corners of walls that go on a little
-    cells: np.ndarray  # (cells, 2) column and row in the world, each once
-    may_go_on: np.ndarray  # (walls, 2) metres beyond start and end: none where the end is on another wall
+    segments: Float[np.ndarray, "walls 2 2"]
+    """Start and end points, world frame, metres."""
+    points: Float[np.ndarray, "points 2"]
+    """Ends of walls, and crossings of walls that extend a little beyond their ends, metres."""
+    cells: np.ndarray
+    """Cells (column, row) that a wall crosses, world frame, without repetition."""
+    extension_limit: Float[np.ndarray, "walls 2"]
+    """Largest length by which each wall may extend beyond its start and its end, metres; 0 where it meets another."""
     resolution: float
+    """Side of a cell, metres."""
 
     @classmethod
-    def of(cls, walls: np.ndarray, resolution: float) -> "KnownWalls":
-        """Walls without length are left out."""
-        length = np.linalg.norm(walls[:, 1] - walls[:, 0], axis=-1)
+    def of(cls, walls: Float[np.ndarray, "walls 2 2"], resolution: float) -> "WallMap":
+        """The map of these walls. Walls without length are left out."""
+        length = lengths(walls)
         walls, length = walls[length > 0], length[length > 0]
+        # Corners: crossings on both walls, or a little beyond their ends.
         share, other = crossings(walls, walls)
-        spare = BEYOND_END / length[:, None]
+        spare = SETTINGS.beyond_end / length[:, None]
         meet = (np.abs(share - 0.5) <= 0.5 + spare) & (np.abs(other - 0.5) <= 0.5 + spare.T)
         first, _ = np.nonzero(np.triu(meet))
         corners = walls[first, 0] + share[np.triu(meet)][:, None] * (walls[first, 1] - walls[first, 0])
-        # Samples a quarter of a cell apart miss no more than a clipped corner of a cell.
+        # Cells: samples a quarter of a cell apart miss at most a clipped corner of a cell.
         samples = (4 * length / resolution).astype(int) + 2
         wall = np.repeat(np.arange(len(walls)), samples)
         step = np.arange(samples.sum()) - np.repeat(np.cumsum(samples) - samples, samples)
         along = (step / (samples[wall] - 1))[:, None]
-        marks = walls[wall, 0] + along * (walls[wall, 1] - walls[wall, 0])
-        cells = np.unique(np.floor(marks / resolution).astype(int), axis=0)
-        gap = point_to_walls(walls.reshape(-1, 2), walls)
+        positions = walls[wall, 0] + along * (walls[wall, 1] - walls[wall, 0])
+        cells = np.unique(np.floor(positions / resolution).astype(int), axis=0)
+        # Ends that touch another wall cannot extend.
+        gap = point_to_segments(walls.reshape(-1, 2), walls)
         gap[np.arange(len(gap)), np.arange(len(gap)) // 2] = np.inf
-        may_go_on = np.where(gap.min(axis=1, initial=np.inf) <= TOUCHES, 0.0, HIDDEN).reshape(-1, 2)
-        return cls(walls, np.concatenate([walls.reshape(-1, 2), corners]), cells, may_go_on, resolution)
+        touches = gap.min(axis=1, initial=np.inf) <= SETTINGS.touches
+        extension_limit = np.where(touches, 0.0, SETTINGS.max_extension).reshape(-1, 2)
+        return cls(walls, np.concatenate([walls.reshape(-1, 2), corners]), cells, extension_limit, resolution)
 
-    def near(self, place: np.ndarray, reach: float) -> "KnownWalls":
-        """Those within reach of a place, metres, if they go on as far as they may."""
-        walls = (point_to_walls(place[None], self.segments) <= reach + HIDDEN)[0]
-        points = np.linalg.norm(self.points - place, axis=-1) <= reach + EXPLAINED
-        cells = np.linalg.norm((self.cells + 0.5) * self.resolution - place, axis=-1) <= reach
-        return KnownWalls(
-            self.segments[walls], self.points[points], self.cells[cells], self.may_go_on[walls], self.resolution
+    def near(self, position: Float[np.ndarray, "2"], radius: float) -> "WallMap":
+        """The part of the map within a radius of a position, metres, with the walls extended as far as possible."""
+        walls = (point_to_segments(position[None], self.segments) <= radius + SETTINGS.max_extension)[0]
+        points = np.linalg.norm(self.points - position, axis=-1) <= radius + SETTINGS.explained
+        cells = np.linalg.norm((self.cells + 0.5) * self.resolution - position, axis=-1) <= radius
+        return WallMap(
+            self.segments[walls], self.points[points], self.cells[cells], self.extension_limit[walls], self.resolution
         )
 
 
-def explained(
-    position: np.ndarray, heading: np.ndarray, half: np.ndarray, first: np.ndarray, walls: KnownWalls
-) -> Bool[np.ndarray, " looks"]:
-    """Which first echoes come at the range of a known wall, its end or a corner, from within the cone."""
-    foot, along, length = _feet(position, walls)
-    on_wall = np.abs(along - length / 2) <= length / 2 + BEYOND_END
-    points = np.broadcast_to(walls.points, (len(position), *walls.points.shape))
-    distance, off_axis = _seen(position, heading, np.concatenate([foot, points], axis=1))
-    there = np.concatenate([on_wall, np.ones(points.shape[:2], bool)], axis=1)
-    there &= np.abs(distance - first[:, None]) <= EXPLAINED
-    return (there & (off_axis <= half[:, None] + BEYOND_CONE)).any(axis=1)
-
-
-def beyond_ends(
-    position: np.ndarray, heading: np.ndarray, sure: np.ndarray, silent: np.ndarray, walls: KnownWalls
-) -> Float[np.ndarray, "walls 2"]:
-    """How far each wall may go on beyond its start and its end, metres, as far as one scan can tell.
-
-    A map knows walls only as far as the feet of sensors reached. Where such a foot would be, but the sensor was silent,
-    the wall has ended: so an open door stays open for who looks squarely through it.
+def explained_by_walls(
+    position: Float[np.ndarray, "beams 2"],
+    heading: Float[np.ndarray, " beams"],
+    half_width: Float[np.ndarray, " beams"],
+    first_echo: Float[np.ndarray, " beams"],
+    walls: WallMap,
+) -> Bool[np.ndarray, " beams"]:
+    """Which first echoes match the range of a known wall, wall end or corner within the cone.
 
     Args:
-        position: (looks, 2) metres.
-        heading: (looks,) radians.
-        sure: (looks,) half of the cone in which a wall is heard for certain, radians.
-        silent: (looks,) how far nothing was heard, metres.
-        walls: the walls around.
+        position: of the sensors, world frame, metres.
+        heading: of the sensors, radians.
+        half_width: of the cones, radians.
+        first_echo: range of the first echo, metres; inf for none.
+        walls: the known walls.
     """
-    foot, along, length = _feet(position, walls)
-    distance, off_axis = _seen(position, heading, foot)
-    missed = (off_axis <= sure[:, None]) & (distance + EXPLAINED < silent[:, None])
-    beyond = np.stack([-along, along - length], axis=-1)
-    ends = np.where(missed[..., None] & (beyond > 0), np.maximum(beyond - NO_WALL, 0), np.inf)
-    return np.minimum(ends.min(axis=0, initial=np.inf), walls.may_go_on)
+    foot, along, length = _footpoints(position, walls)
+    on_wall = np.abs(along - length / 2) <= length / 2 + SETTINGS.beyond_end
+    points = np.broadcast_to(walls.points, (len(position), *walls.points.shape))
+    distance, off_axis = _range_and_angle(position, heading, np.concatenate([foot, points], axis=1))
+    match = np.concatenate([on_wall, np.ones(points.shape[:2], bool)], axis=1)
+    match &= np.abs(distance - first_echo[:, None]) <= SETTINGS.explained
+    return (match & (off_axis <= half_width[:, None] + SETTINGS.beyond_cone)).any(axis=1)
 
 
-def sight(
-    position: np.ndarray,
-    heading: np.ndarray,
-    half: np.ndarray,
-    max_range: float,
-    walls: KnownWalls,
-    beyond: Float[np.ndarray, "walls 2"],
-) -> Float[np.ndarray, "looks rays"]:
-    """How far each look sees between rays across its cone, metres: to a wall, or to the maximum range.
+def estimate_extensions(
+    position: Float[np.ndarray, "beams 2"],
+    heading: Float[np.ndarray, " beams"],
+    half_width: Float[np.ndarray, " beams"],
+    silent_until: Float[np.ndarray, " beams"],
+    walls: WallMap,
+) -> Float[np.ndarray, "walls 2"]:
+    """Largest length by which each wall can extend beyond its start and its end, metres, according to one scan.
 
-    The rays are a cell apart at the far end, and between two of them the nearer wall counts. No rays without walls.
+    A map contains walls up to the outermost footpoint. If the extended wall would have a footpoint of a sensor, but the
+    sensor heard nothing, then the wall has ended before. So an open door stays open for a robot that looks through it
+    at a right angle.
 
     Args:
-        position: (looks, 2) metres.
-        heading: (looks,) radians.
-        half: (looks,) half of each cone, radians.
+        position: of the sensors, world frame, metres.
+        heading: of the sensors, radians.
+        half_width: half of the part of each cone in which a wall is always heard, radians.
+        silent_until: range up to which nothing was heard, metres.
+        walls: the known walls.
+    """
+    foot, along, length = _footpoints(position, walls)
+    distance, off_axis = _range_and_angle(position, heading, foot)
+    missed = (off_axis <= half_width[:, None]) & (distance + SETTINGS.explained < silent_until[:, None])
+    beyond = np.stack([-along, along - length], axis=-1)
+    limit = np.where(missed[..., None] & (beyond > 0), np.maximum(beyond - SETTINGS.no_wall, 0), np.inf)
+    return np.minimum(limit.min(axis=0, initial=np.inf), walls.extension_limit)
+
+
+def visible_range(
+    position: Float[np.ndarray, "beams 2"],
+    heading: Float[np.ndarray, " beams"],
+    half_width: Float[np.ndarray, " beams"],
+    max_range: float,
+    walls: WallMap,
+    extension: Float[np.ndarray, "walls 2"],
+) -> Float[np.ndarray, "beams sectors"]:
+    """Distance to the nearest wall, at most the maximum range, for sectors of each beam, metres.
+
+    A sector lies between two rays; the rays are one cell apart at the maximum range. The nearer of the walls on the two
+    rays counts. Without walls there are no sectors.
+
+    Args:
+        position: of the sensors, world frame, metres.
+        heading: of the sensors, radians.
+        half_width: of the beams, radians.
         max_range: metres.
-        walls: the walls around.
-        beyond: how far they go on beyond their starts and ends, metres.
+        walls: the known walls.
+        extension: length by which they extend beyond their starts and ends, metres.
     """
     if not len(walls.segments):
         return np.zeros((len(position), 0))
-    rays = int(np.ceil(2 * half.max(initial=0) * max_range / walls.resolution)) + 1
-    turn = heading[:, None] + half[:, None] * np.linspace(-1, 1, rays + 1)
-    ends = position[:, None] + max_range * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    sectors = int(np.ceil(2 * half_width.max(initial=0) * max_range / walls.resolution)) + 1
+    angle = heading[:, None] + half_width[:, None] * np.linspace(-1, 1, sectors + 1)
+    ends = position[:, None] + max_range * unit(angle)
     starts = np.broadcast_to(position[:, None], ends.shape)
     share, other = crossings(np.stack([starts, ends], axis=-2).reshape(-1, 2, 2), walls.segments)
-    before, after = (beyond / np.linalg.norm(walls.segments[:, 1] - walls.segments[:, 0], axis=-1)[:, None]).T
+    before, after = (extension / lengths(walls.segments)[:, None]).T
     hit = (share >= 0) & (other >= -before - 1e-9) & (other <= 1 + after + 1e-9)
-    reach = np.where(hit, share, np.inf).min(axis=1).reshape(turn.shape) * max_range
-    return np.minimum(reach[:, 1:], reach[:, :-1])
+    distance = np.where(hit, share, np.inf).min(axis=1).reshape(angle.shape) * max_range
+    return np.minimum(distance[:, 1:], distance[:, :-1])
 
 
-def _feet(position: np.ndarray, walls: KnownWalls) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Foot of the perpendicular from each look to the line of each wall, metres along it, and the wall's length."""
-    start, way = walls.segments[:, 0], walls.segments[:, 1] - walls.segments[:, 0]
-    length = np.linalg.norm(way, axis=-1)
-    tangent = way / length[:, None]
-    along = ((position[:, None] - start) * tangent).sum(-1)
-    return start + along[..., None] * tangent, along, length
+def _footpoints(
+    position: Float[np.ndarray, "beams 2"], walls: WallMap
+) -> tuple[Float[np.ndarray, "beams walls 2"], Float[np.ndarray, "beams walls"], Float[np.ndarray, " walls"]]:
+    """Footpoint of each sensor on the line of each wall, its position along the wall, and the wall's length, metres."""
+    start, along = walls.segments[:, 0], walls.segments[:, 1] - walls.segments[:, 0]
+    length = np.linalg.norm(along, axis=-1)
+    tangent = along / length[:, None]
+    foot_along = ((position[:, None] - start) * tangent).sum(-1)
+    return start + foot_along[..., None] * tangent, foot_along, length
 
 
-def _seen(position: np.ndarray, heading: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (metres) and angle off the axis (radians, without sign) at which each look has its points."""
-    to = point - position[:, None]
-    off_axis = np.abs(wrap_angle(np.arctan2(to[..., 1], to[..., 0]) - heading[:, None]))
-    return np.linalg.norm(to, axis=-1), off_axis
+def _range_and_angle(
+    position: Float[np.ndarray, "beams 2"], heading: Float[np.ndarray, " beams"], points: Float[np.ndarray, "beams n 2"]
+) -> tuple[Float[np.ndarray, "beams n"], Float[np.ndarray, "beams n"]]:
+    """Distance (metres) and absolute angle off the axis (radians) of the points from the sensors."""
+    to_point = points - position[:, None]
+    off_axis = np.abs(wrap_angle(np.arctan2(to_point[..., 1], to_point[..., 0]) - heading[:, None]))
+    return np.linalg.norm(to_point, axis=-1), off_axis

@@ -74,7 +74,7 @@ SETS = [
 
 @pytest.mark.parametrize("points", SETS, ids=lambda points: points.__name__)
 @settings(max_examples=25, phases=[Phase.generate])
-@given(seed=SEEDS, n=st.integers(2, 50), linkage_distance=st.sampled_from([0.05, 0.4, 2.0]))
+@given(seed=SEEDS, n=st.integers(2, 50), cut=st.sampled_from([0.05, 0.4, 2.0]))
 def test_single_linkage_is_that_of_scipy(points, seed, n, cut):
     found = points(np.random.default_rng(seed), n)
     cluster = single_linkage(found, cut)

@@ -254,7 +254,7 @@ def test_feet_beyond_the_corner_are_taken_back():
     assert walls.length == pytest.approx([2.0], abs=1e-6)
 
 
-@pytest.mark.parametrize("position", [[2.0, 0.1], [3.6, 0.0], [1.0, 0.0], [0.8, 0.3]])
+@pytest.mark.parametrize("place", [[2.0, 0.1], [3.6, 0.0], [1.0, 0.0], [0.8, 0.3]])
 def test_other_points_end_nothing(place):
     walls = walls_of([[0, 0], [1.6, 0]])
     assert snap_endpoints(walls, points_at(place), shut).endpoints.tolist() == walls.endpoints.tolist()

@@ -14,9 +14,10 @@ from jaxsonar.geometry.se2 import rotation
 from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import build_map
-from jaxsonar.occupancy.nav2_map import grid_image_path, save_nav2
+from jaxsonar.occupancy.nav2_map import grid_image_filename, save_nav2
 from jaxsonar.occupancy.occupancy_grid import FREE, NO_WALLS, OCCUPIED, UNKNOWN, OccupancyGrid, occupancy
-from jaxsonar.occupancy.wall_visibility import HIDDEN, NO_WALL, KnownWalls, beyond_ends
+from jaxsonar.occupancy.settings import SETTINGS
+from jaxsonar.occupancy.wall_visibility import WallMap, estimate_extensions
 from jaxsonar.simulation.office import load_office
 
 QUARTER = np.pi / 2
@@ -282,17 +283,17 @@ def test_an_open_door_stays_open_for_who_looks_squarely_through_it(faw_ring):
 
 
 def test_a_wall_goes_on_until_somebody_would_have_heard_it_or_it_meets_another():
-    walls = KnownWalls.of(np.array([[[0.0, 1.0], [2.0, 1.0]], [[2.0, 1.02], [2.0, -1.0]]]), 0.05)
+    walls = WallMap.of(np.array([[[0.0, 1.0], [2.0, 1.0]], [[2.0, 1.02], [2.0, -1.0]]]), 0.05)
     position, sure = np.array([[-0.5, 0.0], [-0.8, 0.0]]), np.full(2, 0.2)
     far, up = np.full(2, 2.0), np.full(2, QUARTER)
 
     def beyond(heading=up, silent=far):
-        return beyond_ends(position, heading, sure, silent, walls)
+        return estimate_extensions(position, heading, sure, silent, walls)
 
-    np.testing.assert_allclose(beyond()[0], [0.5 - NO_WALL, 0.0])  # the nearer foot counts
-    np.testing.assert_allclose(beyond(heading=up + np.array([0.3, 0.1]))[0], [0.8 - NO_WALL, 0.0])
+    np.testing.assert_allclose(beyond()[0], [0.5 - SETTINGS.no_wall, 0.0])  # the nearer foot counts
+    np.testing.assert_allclose(beyond(heading=up + np.array([0.3, 0.1]))[0], [0.8 - SETTINGS.no_wall, 0.0])
     for unheard in (beyond(heading=-up), beyond(silent=far / 2)):
-        np.testing.assert_allclose(unheard, [[HIDDEN, 0.0], [0.0, HIDDEN]])
+        np.testing.assert_allclose(unheard, [[SETTINGS.max_extension, 0.0], [0.0, SETTINGS.max_extension]])
 
 
 def test_free_cells_are_those_that_can_be_reached_from_where_the_robot_drove(rng):
@@ -300,7 +301,7 @@ def test_free_cells_are_those_that_can_be_reached_from_where_the_robot_drove(rng
     counts[0] = 4 * (rng.random((40, 50)) < 0.6)
     counts[4, [0, 20, 21], [0, 25, 25]] = 1
     grid = OccupancyGrid(0.05, (0, 0), counts, np.zeros((40, 50), np.uint16), 1)
-    reached, more = grid.driven > 0, True
+    reached, more = grid.footprint > 0, True
     while more:
         wide = np.pad(reached, 1)
         wide = wide[:-2, 1:-1] | wide[2:, 1:-1] | wide[1:-1, :-2] | wide[1:-1, 2:]
@@ -383,7 +384,7 @@ def test_another_suffix_is_refused_before_anything_is_written(tmp_path, office_g
     with pytest.raises(SonarError, match=r"allowed for a grid is \.yaml or \.yml"):
         save_nav2(office_grid, tmp_path / name)
     assert not list(tmp_path.iterdir())
-    assert grid_image_path("a/map.YAML").name == "map.pgm"
+    assert grid_image_filename("a/map.YAML").name == "map.pgm"
 
 
 def test_what_no_grid_can_hold_is_refused_in_one_line(faw_ring):

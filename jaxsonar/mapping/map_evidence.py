@@ -1,0 +1,130 @@
+"""The evidence that scans contribute to a map. Evidence adds up in any order, so maps can be built scan by scan."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.mapping.free_space import DirectionalFreeSpace, observe_free_space
+from jaxsonar.mapping.observations import concatenate, merge_cells
+from jaxsonar.mapping.point_landmarks import PointLandmarks, aggregate_points
+from jaxsonar.mapping.settings import SETTINGS
+from jaxsonar.mapping.wall_segments import WallSegments, aggregate_segments
+from jaxsonar.scans.flat_echoes import FlatEchoes
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.ring import Ring
+
+
+@dataclass(frozen=True, eq=False)
+class MapEvidence:
+    """Observed segments and points, and the free space in which walls were not heard.
+
+    The evidence of two logs is the union of their evidence; the order of the scans does not matter.
+    """
+
+    segments: WallSegments
+    """Segments of local models, world frame."""
+    points: PointLandmarks
+    """Corners and edges of local models, world frame."""
+    free_space: DirectionalFreeSpace
+    """Where walls would have been heard and were not."""
+    robot_cells: Int[np.ndarray, "cells 2"]
+    """Cells (5 cm) of the robot's positions at which local models were made, without repetition."""
+    models: int
+    """Number of local models with a pose."""
+
+    @classmethod
+    def empty(cls) -> "MapEvidence":
+        """The evidence of no scans."""
+        no_poses = np.zeros((0, 3))
+        segments, points = aggregate_segments([], no_poses), aggregate_points([], no_poses)
+        return cls(segments, points, DirectionalFreeSpace(), np.zeros((0, 2), np.int64), 0)
+
+    def union(self, other: "MapEvidence") -> "MapEvidence":
+        """The evidence of both."""
+        return MapEvidence(
+            concatenate([self.segments, other.segments]),
+            concatenate([self.points, other.points]),
+            self.free_space.union(other.free_space),
+            np.unique(np.concatenate([self.robot_cells, other.robot_cells]), axis=0),
+            self.models + other.models,
+        )
+
+    def condensed(self) -> "MapEvidence":
+        """The evidence with the observations of each cell fused; its size grows with the floor, not with the scans."""
+        most = SETTINGS.evidence.listed_scans
+        segments, points = merge_cells(self.segments, max_scans=most), merge_cells(self.points, max_scans=most)
+        return replace(self, segments=segments, points=points)
+
+    @property
+    def linkage_distance(self) -> float:
+        """Largest distance between the midpoints of neighboring segments of one wall, metres (paper, section 5).
+
+        It is derived from the spacing of the robot's positions, which does not depend on the order of the scans.
+        """
+        settings = SETTINGS.evidence
+        if len(self.robot_cells) < 2:
+            return settings.max_gap
+        position = self.robot_cells * settings.position_cell
+        to_nearest = KDTree(position).query(position, k=2)[0][:, 1]
+        return max(settings.min_gap, settings.linkage_per_spacing * float(np.median(to_nearest)))
+
+    @property
+    def gap(self) -> float:
+        """Largest gap between two segments of one wall, metres."""
+        return min(self.linkage_distance, SETTINGS.evidence.max_gap)
+
+
+def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> MapEvidence:
+    """The evidence of local models and of missing echoes.
+
+    Args:
+        ring: the sensors.
+        log: the scans that the models come from, with their poses. Scans and models without a pose are left out.
+        models: local models in the order of the log. A model of a window represents all scans since the previous one.
+    """
+    models = list(models)
+    row_of_scan = {int(number): row for row, number in enumerate(log.scan)}
+    rows = np.array([row_of_scan[model.scan] for model in models], dtype=np.int64)
+    poses = log.pose[rows]
+    has_pose = np.all(np.isfinite(poses), axis=1)
+    # Observed walls, corners and edges.
+    segments, points = aggregate_segments(models, poses), aggregate_points(models, poses)
+    # Free space, limited by the walls that each model shows.
+    lines = [len(model.lines) if posed else 0 for model, posed in zip(models, has_pose, strict=True)]
+    walls_of_model = np.split(segments.endpoints, np.cumsum(lines)[:-1])
+    free_space = _free_space(ring, log, rows, walls_of_model)
+    # Where the robot was.
+    robot_cells = np.round(poses[has_pose, :2] / SETTINGS.evidence.position_cell).astype(np.int64)
+    return MapEvidence(segments, points, free_space, np.unique(robot_cells, axis=0), int(has_pose.sum()))
+
+
+def _free_space(
+    ring: Ring, log: Log, rows: Int[np.ndarray, " models"], walls_of_model: list[Float[np.ndarray, "_ 2 2"]]
+) -> DirectionalFreeSpace:
+    """The free space that the scans up to the last model observe.
+
+    Args:
+        ring: the sensors.
+        log: the scans.
+        rows: row of the last scan of each model, ascending.
+        walls_of_model: segments that each model shows, world frame, metres.
+    """
+    flat, _ = FlatEchoes.from_log(ring, log)
+    distance = np.asarray(ring.corrected(flat.reported, *ring.paths[flat.path].T))
+    posed = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1))
+    posed = posed[posed <= rows.max(initial=-1)]
+    time = np.where(np.isnan(log.stamp), log.scan, log.stamp)
+    free_space = DirectionalFreeSpace()
+    for first in range(0, len(posed), SETTINGS.evidence.block_scans):
+        block = posed[first : first + SETTINGS.evidence.block_scans]
+        echo = np.arange(int(flat.start[block[0]]), int(flat.start[block[-1] + 1]))
+        echo = echo[(distance[echo] > 0) & (distance[echo] < ring.max_range) & np.isin(flat.scan[echo], block)]
+        scan = np.searchsorted(block, flat.scan[echo])
+        walls = [walls_of_model[k] for k in np.searchsorted(rows, block)]
+        cells, who = observe_free_space(ring, log.pose[block], scan, flat.path[echo], distance[echo], walls)
+        free_space = free_space.updated(cells, time[block][who])
+    return free_space

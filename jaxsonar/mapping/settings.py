@@ -1,0 +1,217 @@
+"""Numeric settings of map building, one frozen dataclass per algorithm.
+
+``SETTINGS`` holds the values in use. Unless a field says otherwise, its value was chosen by hand on simulated and
+recorded rooms.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class SegmentSettings:
+    """Wall segments of single local models."""
+
+    offset_sd: float = 0.01
+    """Standard deviation of the offset of a line without covariance (Hough detector), metres: half a cell, and the
+    effect of arcs that are cut off at the border of the cone."""
+    theta_sd: float = float(np.radians(3.0))
+    """Standard deviation of the direction of such a line, radians."""
+    merge_cell: float = 0.05
+    """Segments whose centres lie in one square cell of this size are stored as one fused segment, metres."""
+    merge_angle: float = float(np.radians(6.0))
+    """Size of the cells in direction, radians."""
+
+
+@dataclass(frozen=True)
+class PointSettings:
+    """Corners and edges."""
+
+    merge_cell: float = 0.05
+    """Observations first seen in one square cell of this size are stored as one fused observation, metres."""
+    gate: float = 3.0
+    """Largest Mahalanobis distance between two observations of one point."""
+    position_floor: float = 0.02
+    """Standard deviation added to the difference of two observations, metres: corners are not perfectly sharp, and
+    odometry is not perfect."""
+    max_distance: float = 0.3
+    """Observations farther apart than this belong to two points, however large their covariances are, metres."""
+    max_normalized_misfit: float = 2.0
+    """A point whose observations scatter by more than this (chi-squared per degree of freedom) is not static."""
+    min_range: float = 0.1
+    """Smallest distance between a point and the robot's centre, metres. Guards a division."""
+    min_kind_probability: float = 1e-4
+    """Probability that a single observation leaves to the other kind at least."""
+
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """Collection of evidence from local models."""
+
+    min_scans: int = 2
+    """Scans that must have seen a wall, a corner or an edge."""
+    position_cell: float = 0.05
+    """Cell size for the positions at which local models were made, metres."""
+    linkage_per_spacing: float = 1.5
+    """Linkage distance of the paper's clustering as a multiple of the median distance between neighboring local models
+    (paper, section 5)."""
+    min_gap: float = 0.4
+    """Lower limit of the linkage distance, metres; less than the width of a door."""
+    max_gap: float = 0.7
+    """Upper limit of the gap that fusion closes between two segments, metres; more than two neighboring scans leave
+    unobserved of a wall between them."""
+    bridged_gap: float = 1.0
+    """Largest part of a wall that may be occluded, metres. A gap that was seen through stays open, however small."""
+    max_coordinate: float = 1e8
+    """Largest distance of a pose from the world's origin along x or y, metres; cell numbers overflow beyond it."""
+    listed_scans: int = 32
+    """Number of scan numbers that are kept per observation when a map is built scan by scan (the latest ones)."""
+    block_scans: int = 64
+    """Scans whose free space is computed in one vectorized step; limits memory."""
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """Fusion of segments into walls."""
+
+    max_offset: float = 0.06
+    """Segments of one wall lie at most this far apart, measured perpendicular to the wall, metres."""
+    gate: float = 3.0
+    """Largest difference of offsets and of directions, standard deviations."""
+    offset_floor: float = 0.005
+    """Smallest systematic error of an offset, metres: walls are not perfectly straight, and odometry is not perfect."""
+    max_systematic_error: float = 0.02
+    """Largest systematic error that is attributed to the poses, metres."""
+    angle_per_offset: float = 2.2
+    """Systematic error of a direction per systematic error of an offset, radians per metre."""
+    max_thickness: float = 0.04
+    """Segments seen from opposite sides are one thin wall if they are closer than this, else two walls, metres."""
+    near_wall: float = 0.025
+    """A segment whose ends are this close to the line of a longer wall belongs to it, however small its covariance is,
+    metres; nothing stands this close in front of a wall."""
+    outlier_gate: float = 3.0
+    """A segment that deviates from its wall by more than this is down-weighted, standard deviations."""
+    refit_iterations: int = 5
+    """Iterations of the robust refit."""
+    angle_scale: float = 2.0
+    """Weight of directions against positions in the search for neighbors, metres per radian."""
+    nearest: int = 12
+    """Number of neighbors that the first search for candidate pairs considers; a full search follows."""
+
+
+@dataclass(frozen=True)
+class ArtifactSettings:
+    """Removal of segments that are not walls, and of walls that are no longer there."""
+
+    min_wall_length: float = 0.6
+    """Segments of at least this length are always walls, metres."""
+    corner_radius: float = 0.15
+    """Largest distance between a corner and the centre of the short line that it causes, metres."""
+    same_direction: float = float(np.radians(12.0))
+    """Lines that differ by less than this have the same direction, radians."""
+    perpendicular: float = float(np.radians(10.0))
+    """Tolerance for a short wall that stands perpendicular on the end of a long one, radians."""
+    min_opening: float = 0.12
+    """Part of a gap that must have been seen through before the gap counts as an opening, metres."""
+    behind: float = 0.06
+    """Distance behind the wall's line at which a segment proves an opening, metres."""
+    min_remainder: float = 0.15
+    """Shortest part of a segment that is kept after a part of it was removed, metres."""
+    unseen_end: float = 0.15
+    """Length by which a wall may extend beyond its last footpoint without a corner that ends it, metres."""
+    max_extension: float = 1.5
+    """Largest distance from the last footpoint of a wall to the corner that ends it, metres."""
+    gap_samples: int = 16
+    """Points of a gap at which the free space is looked up."""
+
+
+@dataclass(frozen=True)
+class EndpointSettings:
+    """Wall ends at corners and edges."""
+
+    max_overshoot: float = 0.2
+    """Length by which the footpoints may lie beyond the true end of a wall, metres; echoes of the edge are sometimes
+    assigned to the wall."""
+    alignment_floor: float = 0.01
+    """Standard deviation of the distance between a wall's line and the corner that ends it, metres."""
+    constraint_sd: float = 0.005
+    """Standard deviation that a corner adds when it constrains a wall's line, metres."""
+    max_point_sd: float = 0.1
+    """A point with a larger standard deviation ends no wall, metres."""
+    face_margin: float = 0.1
+    """Distance from the ends of a wall, and from other walls, at which its face begins, metres."""
+    face_depth: float = 0.03
+    """A point closer to the line of a wall than this lies on its face, metres."""
+
+
+@dataclass(frozen=True)
+class FreeSpaceSettings:
+    """Directional free space from missing echoes."""
+
+    cell: float = 0.1
+    """Side of a cell of the floor, metres."""
+    directions: int = 36
+    """Number of sectors into which the directions of wall normals are divided."""
+    remembered: int = 3
+    """Number of latest times that each cell and direction stores. A wall that this many later scans saw through is
+    gone."""
+    margin: float = 0.10
+    """A wall must be closer than the first echo by this much before it counts as missed, metres."""
+    certain: float = 0.85
+    """Fraction of the cone's width, and of the maximum range, within which a wall is always heard."""
+    extension: float = 1.0
+    """Length by which a wall is assumed to extend beyond its ends, where it occludes what is behind it, metres."""
+    facing: float = float(np.radians(15.0))
+    """A ray within this angle of a wall's normal faces the wall, radians."""
+    tile_cells: int = 32
+    """Cells along the side of a storage tile."""
+    rays: int = 17
+    """Rays sampled across a cone."""
+    arc_points: int = 33
+    """Points sampled on the arc of an echo."""
+
+    @property
+    def sector(self) -> float:
+        """Width of a sector of directions, radians."""
+        return 2 * np.pi / self.directions
+
+
+@dataclass(frozen=True)
+class HoughMergingSettings:
+    """The paper's merging in parameter space."""
+
+    rho_cell: float = 0.10
+    """Cell size in rho, metres (paper, section 5; the cell size in theta is 0.0628 rad)."""
+    threshold: float = 0.1
+    """Threshold on the low-passed number of lines. A single line leaves a quarter in its cell and must not be lost."""
+    max_rho_cells: int = 8192
+    """Largest accumulator; larger clusters get coarser cells."""
+    cells_per_step: int = 2_000_000
+    """Accumulator cells that are processed in one compiled step; limits memory."""
+
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """All settings of map building."""
+
+    segments: SegmentSettings = field(default_factory=SegmentSettings)
+    """Wall segments of single local models."""
+    points: PointSettings = field(default_factory=PointSettings)
+    """Corners and edges."""
+    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
+    """Collection of evidence."""
+    fusion: FusionSettings = field(default_factory=FusionSettings)
+    """Fusion of segments into walls."""
+    artifacts: ArtifactSettings = field(default_factory=ArtifactSettings)
+    """Removal of what is not a wall."""
+    endpoints: EndpointSettings = field(default_factory=EndpointSettings)
+    """Wall ends at corners and edges."""
+    free_space: FreeSpaceSettings = field(default_factory=FreeSpaceSettings)
+    """Directional free space."""
+    hough: HoughMergingSettings = field(default_factory=HoughMergingSettings)
+    """The paper's merging."""
+
+
+SETTINGS = MappingSettings()
+"""The settings in use."""
