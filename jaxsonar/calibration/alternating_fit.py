@@ -12,16 +12,17 @@ from jaxtyping import Float
 
 from jaxsonar import kernels
 from jaxsonar.detection.extract import local_models
-from jaxsonar.estimation.alternation import AGAIN, alternated
-from jaxsonar.estimation.landmark_map import seen_world, surroundings
-from jaxsonar.estimation.odometry_noise import Share
-from jaxsonar.estimation.robust_adjustment import Data, Settled, State, settle
+from jaxsonar.estimation.alternation import AGAIN, alternate
+from jaxsonar.estimation.batch_data import BatchData
+from jaxsonar.estimation.landmark_map import map_with_tentative_points, landmark_map_of
+from jaxsonar.estimation.odometry_noise import ProportionalNoise
+from jaxsonar.estimation.robust_adjustment import AdjustmentResult, AdjustmentState, gnc_adjust
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.registration.sequential import place_parts
+from jaxsonar.registration.sequential import register_scans
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.sensors.ring_parameters import RingModes
+from jaxsonar.sensors.ring_parameters import ParameterBasis
 
 PINNED = 0.001
 """Metres; the mean range offset is estimated where its standard deviation is at most this."""
@@ -35,29 +36,29 @@ _MISFIT = 1.5  # sigma; of wall to wall echoes where walls do meet as the map sa
 _KEEPS = 0.97  # of the echoes that were explained with corners of their own
 
 
-class Fitted(NamedTuple):
+class CalibrationFit(NamedTuple):
     """A ring that fits scans, their poses and a map."""
 
     logs: list[Log]
     """One for every world."""
-    data: Data
-    worlds: list[GlobalMap]
-    settled: Settled
+    data: BatchData
+    maps: list[GlobalMap]
+    adjustment: AdjustmentResult
 
     @property
-    def used(self) -> int:
+    def explained_count(self) -> int:
         """Echoes that are explained."""
-        return int(self.settled.used.sum())
+        return int(self.adjustment.used.sum())
 
 
 @dataclass(frozen=True)
-class Plan:
+class CalibrationProblem:
     """What is asked for."""
 
     ring: Ring
     """Where the modes begin."""
-    modes: RingModes
-    estimate: bool
+    basis: ParameterBasis
+    poses_free: bool
     """Whether poses are estimated; those of the logs are odometry then."""
     odometry: float
     """Share of the way and of the turn that it is wrong by."""
@@ -65,14 +66,14 @@ class Plan:
     """Noise of the ranges, metres."""
     window: float | None
     """Metres of path for a local model."""
-    say: Callable[[str], None]
+    progress: Callable[[str], None]
 
     @property
-    def held(self) -> RingModes:
+    def basis_without_mean(self) -> ParameterBasis:
         """The modes without the mean offset."""
-        return self.modes.only(*(name for name in self.modes.names if name != "mean"))
+        return self.basis.only(*(name for name in self.basis.names if name != "mean"))
 
-    def fitted(self, near: Ring, logs: Sequence[Log]) -> Fitted:
+    def fit(self, near: Ring, logs: Sequence[Log]) -> CalibrationFit:
         """Ring, poses and map that fit, the mean offset held; poses, where they are estimated, are found first.
 
         Args:
@@ -80,46 +81,46 @@ class Plan:
             logs: as they came.
         """
         best = None
-        for blur, margin in _PLACINGS if self.estimate and self.window is None else _PLACINGS[:1]:
-            fit = self._fitted(near, *self._placed(near, logs, blur, margin))
+        for blur, margin in _PLACINGS if self.poses_free and self.window is None else _PLACINGS[:1]:
+            fit = self._fit_registered(near, *self._register(near, logs, blur, margin))
             if best is None or _better(fit, best):
-                best, near = fit, moved_ring(self.ring, self.modes, fit.settled.state)
-            if len(best.logs) == len(logs) and best.data.scans == sum(len(log) for log in logs):
+                best, near = fit, ring_of(self.ring, self.basis, fit.adjustment.state)
+            if len(best.logs) == len(logs) and best.data.scan_count == sum(len(log) for log in logs):
                 break
         assert best is not None
         return best
 
-    def _fitted(self, near: Ring, logs: list[Log], measured: list[Float[np.ndarray, "_ 3"]]) -> Fitted:
+    def _fit_registered(self, near: Ring, logs: list[Log], measured: list[Float[np.ndarray, "_ 3"]]) -> CalibrationFit:
         """Ring, poses and reflectors settle around the map; the map is made anew with that ring, and so on."""
-        data = Data.of(self.ring, logs, measured, Share(self.odometry))
-        start = State(_coordinates(self.held, _change(self.ring, near)), data.poses, surroundings([], tied=False))
+        data = BatchData.from_logs(self.ring, logs, measured, ProportionalNoise(self.odometry))
+        start = AdjustmentState(_coordinates(self.basis_without_mean, _change(self.ring, near)), data.poses, landmark_map_of([], tie_corners=False))
 
-        def mapped(state: State) -> list[GlobalMap]:
-            ring = near if state is start else moved_ring(self.ring, self.held, state)
-            worlds = [seen_world(ring, one, window=self.window) for one in data.placed(logs, state.poses)]
+        def mapped(state: AdjustmentState) -> list[GlobalMap]:
+            ring = near if state is start else ring_of(self.ring, self.basis_without_mean, state)
+            worlds = [map_with_tentative_points(ring, one, window=self.window) for one in data.logs_with_poses(logs, state.poses)]
             if not any(len(world) for world in worlds):
                 raise SonarError(
                     "calibration: no wall found; allowed are scans of a place with straight walls in reach"
                 )
             return worlds
 
-        found = alternated(
+        found = alternate(
             start,
-            mapped=mapped,
-            settle=lambda state, widest: self.settle(data, state, self.held, widest),
-            widest=_WIDE_PLACED if self.estimate else _WIDE,
-            say=self.say,
+            build_maps=mapped,
+            adjust=lambda state, widest: self.adjust(data, state, self.basis_without_mean, widest),
+            initial_scale=_WIDE_PLACED if self.poses_free else _WIDE,
+            progress=self.progress,
         )
         if found is None:
             raise SonarError("calibration: no echo fits the walls; is it the right ring, are poses and units right?")
-        return Fitted(logs, data, *found)
+        return CalibrationFit(logs, data, *found)
 
-    def settle(self, data: Data, state: State, modes: RingModes, widest: float) -> Settled:
+    def adjust(self, data: BatchData, state: AdjustmentState, modes: ParameterBasis, widest: float) -> AdjustmentResult:
         """In double precision."""
         with jax.enable_x64(True):
-            return settle(self.ring, data, modes, state, widest=widest, poses_free=self.estimate, sigma=self.sigma)
+            return gnc_adjust(self.ring, data, modes, state, initial_scale=widest, poses_free=self.poses_free, sigma=self.sigma)
 
-    def _placed(
+    def _register(
         self, ring: Ring, logs: Sequence[Log], blur: float, margin: float
     ) -> tuple[list[Log], list[Float[np.ndarray, "_ 3"]]]:
         """Logs with poses from their local models, and their odometry; as they came where poses are given.
@@ -128,67 +129,67 @@ class Plan:
         odometry alone must do.
         """
         placed, measured = list(logs), [log.pose for log in logs]
-        if self.estimate and self.window is None:
-            self.say("placing the scans")
+        if self.poses_free and self.window is None:
+            self.progress("placing the scans")
             placed, measured = [], []
             for log in logs:
                 odometry = log.pose if np.isfinite(log.pose).any() else None
                 models = list(local_models(ring, log))
-                parts = place_parts(models, odometry, slip=self.odometry, margin=margin, blur=blur)
+                parts = register_scans(models, odometry, odometry_sd=self.odometry, margin=margin, noise_scale=blur)
                 enough = [part for part in parts if np.isfinite(part[:, 0]).sum() >= LEAST_SCANS]
                 placed += [replace(log, pose=part) for part in enough]
                 measured += [log.pose] * len(enough)
         check_poses(placed)
         return placed, measured
 
-    def pinned(self, alone: Fitted) -> tuple[Fitted, str]:
+    def fit_mean_offset(self, alone: CalibrationFit) -> tuple[CalibrationFit, str]:
         """The same with the mean offset free, where wall to wall echoes pin it; or as it is, and why."""
-        around = surroundings(alone.worlds, tied=True)
-        if not (np.asarray(around.candidates.reflection.kind) == kernels.SECOND).any():
+        around = landmark_map_of(alone.maps, tie_corners=True)
+        if not (np.asarray(around.candidates.reflection.kind) == kernels.SECOND_ORDER).any():
             return (
                 alone,
                 "no two walls of the map end at a common right-angled corner",
             )
-        state = alone.settled.state._replace(around=around)
-        tied = self.settle(alone.data, state, self.modes, 2 * AGAIN)
-        second = tied.used & (np.asarray(tied.problem.heard.reflection.kind) == kernels.SECOND)
+        state = alone.adjustment.state._replace(landmark_map=around)
+        tied = self.adjust(alone.data, state, self.basis, 2 * AGAIN)
+        second = tied.used & (np.asarray(tied.problem.factors.reflection.kind) == kernels.SECOND_ORDER)
         count = int(second.sum())
-        sd = float(np.sqrt(covariance(tied)[: self.ring.count, : self.ring.count].mean()))
+        sd = float(np.sqrt(parameter_covariance(tied)[: self.ring.count, : self.ring.count].mean()))
         if count < _LEAST_SECOND or sd > PINNED:
             return alone, f"{count} wall to wall echoes pin it to {1e3 * sd:.1f} mm only; needed is {1e3 * PINNED:g} mm"
         misfit = float(np.sqrt(np.mean(tied.residual[second] ** 2))) / tied.sigma
-        if misfit > _MISFIT or tied.used.sum() < _KEEPS * alone.used:
+        if misfit > _MISFIT or tied.used.sum() < _KEEPS * alone.explained_count:
             return alone, f"wall to wall echoes do not fit the walls ({misfit:.1f} sigma); are they square?"
-        return alone._replace(settled=tied), ""
+        return alone._replace(adjustment=tied), ""
 
-    def before(self, fit: Fitted) -> Float[np.ndarray, "scans echoes"]:
+    def nominal_residuals(self, fit: CalibrationFit) -> Float[np.ndarray, "scans echoes"]:
         """Residuals of the same echoes with the ring as it was, reflectors and free poses fitted to it, metres."""
-        found = fit.settled
-        nothing = np.zeros(found.problem.modes.shape)
+        found = fit.adjustment
+        nothing = np.zeros(found.problem.basis.shape)
         with jax.enable_x64(True):
             problem = eqx.tree_at(lambda p: p.modes, found.problem, jnp.asarray(nothing))
             start = kernels.Unknowns(
                 jnp.asarray(nothing[0]),
                 jnp.asarray(found.state.poses),
-                jnp.asarray(found.state.around.scene.parameters),
+                jnp.asarray(found.state.landmark_map.landmarks.parameters),
             )
-            fitted = kernels.adjust(problem, start, poses_free=self.estimate)
+            fitted = kernels.adjust(problem, start, poses_free=self.poses_free)
             return np.asarray(kernels.residuals(problem, fitted.unknowns))
 
 
-def _better(fit: Fitted, best: Fitted) -> bool:
+def _better(fit: CalibrationFit, best: CalibrationFit) -> bool:
     """Whether more echoes are explained, and not by taking more for noise."""
-    return fit.used > best.used and fit.settled.sigma < _NOISIER * best.settled.sigma
+    return fit.explained_count > best.explained_count and fit.adjustment.sigma < _NOISIER * best.adjustment.sigma
 
 
-def covariance(found: Settled) -> Float[np.ndarray, "ring ring"]:
+def parameter_covariance(found: AdjustmentResult) -> Float[np.ndarray, "ring ring"]:
     """Of offsets, log speed and positions; 0 for what was held."""
-    columns = np.asarray(found.problem.modes)
+    columns = np.asarray(found.problem.basis)
     size = columns.shape[1]
-    return columns @ np.asarray(found.adjusted.covariance)[:size, :size] @ columns.T
+    return columns @ np.asarray(found.solution.covariance)[:size, :size] @ columns.T
 
 
-def moved_ring(ring: Ring, modes: RingModes, state: State) -> Ring:
+def ring_of(ring: Ring, modes: ParameterBasis, state: AdjustmentState) -> Ring:
     """The ring after its change along the modes."""
     change, count = modes.columns @ state.coordinates, ring.count
     return replace(
@@ -210,7 +211,7 @@ def _change(ring: Ring, other: Ring) -> Float[np.ndarray, " ring"]:
     )
 
 
-def _coordinates(modes: RingModes, change: Float[np.ndarray, " ring"]) -> Float[np.ndarray, " modes"]:
+def _coordinates(modes: ParameterBasis, change: Float[np.ndarray, " ring"]) -> Float[np.ndarray, " modes"]:
     return np.linalg.lstsq(modes.columns, change, rcond=1e-9)[0]
 
 

@@ -21,7 +21,7 @@ from jaxsonar.kernels.shape_buckets import bucket_size
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.sensors.ring_parameters import SPEED_SD
+from jaxsonar.sensors.ring_parameters import PRIOR
 
 OFFSET_SD = 0.015
 """Metres; prior of a sensor's relative range offset around the given one."""
@@ -70,7 +70,7 @@ def autofocus_ring(ring: Ring, log: Log, *, poses: bool, speed: bool, scans: int
         return ring
     move = np.asarray(moved, dtype=np.float64)
     offset = OFFSET_SD * (move[:-1] - move[:-1].mean())
-    factor = np.exp(SPEED_SD * move[-1]) if speed else 1.0
+    factor = np.exp(PRIOR.speed_sd * move[-1]) if speed else 1.0
     return dataclasses.replace(
         ring, range_offset=ring.range_offset + offset, speed_of_sound=ring.speed_of_sound * factor
     )
@@ -130,12 +130,12 @@ def _momentum_ascent(
     def allowed(move: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         offset = move[:count] - move[:count].mean()
         offset = offset * jnp.minimum(1, MOST_OFFSET / OFFSET_SD / jnp.maximum(jnp.abs(offset).max(), 1e-6))
-        most = jnp.log1p(jnp.asarray([-MOST_SPEED, MOST_SPEED], move.dtype)) / SPEED_SD * float(speed)
+        most = jnp.log1p(jnp.asarray([-MOST_SPEED, MOST_SPEED], move.dtype)) / PRIOR.speed_sd * float(speed)
         return jnp.append(offset, jnp.clip(move[count], most[0], most[1]))
 
     def sharp(move: Float[Array, " parameters"], width: Float[Array, ""]) -> Float[Array, ""]:
         offset = sensors.range_offset + OFFSET_SD * move[:count]
-        scale = sensors.range_scale * jnp.exp(SPEED_SD * move[count])
+        scale = sensors.range_scale * jnp.exp(PRIOR.speed_sd * move[count])
         changed = dataclasses.replace(sensors, range_offset=offset, range_scale=scale)
         return ring_focus_measure(changed, echoes, width, settings=settings, points=points)
 

@@ -8,11 +8,17 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar import kernels
-from jaxsonar.calibration.alternating_fit import Fitted, Plan, check_poses, covariance, moved_ring
-from jaxsonar.calibration.autofocus import focus
-from jaxsonar.calibration.beam_headings import beam_centres
-from jaxsonar.detection.extract import check_sigma
-from jaxsonar.estimation.robust_adjustment import Settled
+from jaxsonar.calibration.alternating_fit import (
+    CalibrationFit,
+    CalibrationProblem,
+    check_poses,
+    parameter_covariance,
+    ring_of,
+)
+from jaxsonar.calibration.autofocus import autofocus_ring
+from jaxsonar.calibration.beam_headings import estimate_headings
+from jaxsonar.detection.settings import check_sigma
+from jaxsonar.estimation.robust_adjustment import AdjustmentResult
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import build_map
@@ -22,14 +28,13 @@ from jaxsonar.scans.sliding_windows import check_window
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring import speed_of_sound as speed_of_sound
 from jaxsonar.sensors.ring_parameters import (
-    DEFAULT_FREE,
-    FREE,
-    SPEED_SD,
-    THERMOMETER_SD,
-    RingModes,
-    check_air,
-    check_free,
-    ring_modes,
+    DEFAULT_PARAMETERS,
+    PARAMETERS,
+    PRIOR,
+    ParameterBasis,
+    check_parameters,
+    check_speed_of_sound,
+    parameter_basis,
 )
 
 POSES = ("trust", "estimate")
@@ -76,7 +81,7 @@ class Calibration:
     """The map of every world with the calibrated ring."""
     maps_before: tuple[GlobalMap, ...]
     """The same with the nominal ring."""
-    problem: kernels.Problem
+    problem: kernels.LeastSquaresProblem
     """The least squares that the result solves, in double precision: echoes, reflectors, priors. With ``unknowns`` it
     is what ``kernels.residuals`` and ``kernels.cost`` take, for a loss of one's own on top."""
     unknowns: kernels.Unknowns
@@ -189,7 +194,7 @@ def calibrate(
     ring: Ring,
     log: Log | Sequence[Log],
     *,
-    free: Sequence[str] = DEFAULT_FREE,
+    free: Sequence[str] = DEFAULT_PARAMETERS,
     poses: str = "trust",
     odometry: float = ODOMETRY,
     temperature: float | None = None,
@@ -219,63 +224,65 @@ def calibrate(
     logs = [log] if isinstance(log, Log) else list(log)
     say = on_step or (lambda text: None)
     _check(ring, logs, free, poses, odometry, temperature, sigma, window)
-    began, speed_sd = ring, SPEED_SD
+    began, speed_sd = ring, PRIOR.speed_sd
     if temperature is not None:
-        began, speed_sd = replace(ring, speed_of_sound=speed_of_sound(temperature)), THERMOMETER_SD
+        began, speed_sd = replace(ring, speed_of_sound=speed_of_sound(temperature)), PRIOR.measured_speed_sd
     estimate = poses == "estimate"
-    modes = ring_modes(began, free, poses_free=estimate, speed_sd=speed_sd)
+    modes = parameter_basis(began, free, poses_free=estimate, speed_sd=speed_sd)
     if not estimate:
         check_poses(logs)
-    plan = Plan(began, modes, estimate, odometry, sigma, window, say)
+    plan = CalibrationProblem(began, modes, estimate, odometry, sigma, window, say)
 
     # 1. Sharpen: the smooth accumulator brings a ring that is far off near enough for echoes to find their walls.
     near = began
     if "offset" in free and window is None:
         say("sharpening the accumulator")
-        near = focus(began, max(logs, key=len), poses=not estimate, speed="speed" in free and not estimate)
+        near = autofocus_ring(began, max(logs, key=len), poses=not estimate, speed="speed" in free and not estimate)
     # 2. Least squares on the ranges: ring, walls, corners and free poses together, association renewed in between.
-    fit = plan.fitted(near, logs)
+    fit = plan.fit(near, logs)
     # 3. Wall to wall echoes tell how far off the walls really are, and so the mean offset, where there are any.
-    fit, mean = plan.pinned(fit) if "offset" in free else (fit, "")
-    found = fit.settled
+    fit, mean = plan.fit_mean_offset(fit) if "offset" in free else (fit, "")
+    found = fit.adjustment
     _check_result(fit, modes)
-    now, heading_sd = moved_ring(began, modes, found.state), np.zeros(ring.count)
+    now, heading_sd = ring_of(began, modes, found.state), np.zeros(ring.count)
     # 4. What was heard at all shows where the sensors look; ranges do not.
     if "heading" in free:
         say("beam centres")
         with jax.enable_x64(True):
-            now, heading_sd = beam_centres(now, fit.data, found)
+            now, heading_sd = estimate_headings(now, fit.data, found)
     say("maps before and after")
-    final = fit.data.placed(fit.logs, found.state.poses)
+    final = fit.data.logs_with_poses(fit.logs, found.state.poses)
     return Calibration(
         ring=now,
         nominal=ring,
         free=tuple(free),
         held=_held(free, mean, speed_sd, temperature, found),
-        covariance=covariance(found),
+        covariance=parameter_covariance(found),
         heading_sd=heading_sd,
         sigma=found.sigma,
         residuals=found.residual[found.used],
-        residuals_before=plan.before(fit)[found.used],
-        echoes=fit.data.echoes,
-        scans=fit.data.scans,
+        residuals_before=plan.nominal_residuals(fit)[found.used],
+        echoes=fit.data.echo_count,
+        scans=fit.data.scan_count,
         poses=tuple(one.pose for one in final),
         maps=tuple(build_map(now, one, window=window) for one in final),
         maps_before=tuple(build_map(ring, one, window=window) for one in fit.logs),
         problem=found.problem,
-        unknowns=found.adjusted.unknowns,
+        unknowns=found.solution.unknowns,
     )
 
 
-def _held(free: Sequence[str], mean: str, speed_sd: float, temperature: float | None, found: Settled) -> dict[str, str]:
+def _held(
+    free: Sequence[str], mean: str, speed_sd: float, temperature: float | None, found: AdjustmentResult
+) -> dict[str, str]:
     """What was not estimated, and why."""
-    held = {name: "not asked for" for name in FREE if name not in free}
+    held = {name: "not asked for" for name in PARAMETERS if name not in free}
     if "heading" in held:
         held["heading"] = "not asked for; ranges do not depend on it"
     if mean:
         held["mean_offset"] = mean
     if "speed" in free:
-        known = covariance(found)
+        known = parameter_covariance(found)
         sensors = (len(known) - 1) // 3
         sd = float(np.sqrt(known[sensors, sensors]))
         source = "the temperature" if temperature is not None else "what is expected of air"
@@ -294,7 +301,7 @@ def _check(
     sigma: float | None,
     window: float | None,
 ) -> None:
-    check_free(free)
+    check_parameters(free)
     check_sigma(sigma)
     check_window(window)
     if poses not in POSES:
@@ -305,20 +312,20 @@ def _check(
         raise SonarError(f"odometry {odometry:g}; allowed is 0.0001 to 1, the share of the way that it is wrong by")
     if temperature is not None and not -60 <= temperature <= 85:
         raise SonarError(f"temperature {temperature:g} deg C; allowed is -60 to 85")
-    check_air(ring)
+    check_speed_of_sound(ring)
 
 
-def _check_result(fit: Fitted, modes: RingModes) -> None:
+def _check_result(fit: CalibrationFit, modes: ParameterBasis) -> None:
     """Raise a SonarError for a result that is none."""
-    share = fit.used / max(fit.data.echoes, 1)
+    share = fit.explained_count / max(fit.data.echo_count, 1)
     if share < _LEAST_EXPLAINED:
         raise SonarError(
-            f"calibration: walls and corners explain {100 * share:.0f} % of the {fit.data.echoes} echoes; needed are "
+            f"calibration: walls and corners explain {100 * share:.0f} % of the {fit.data.echo_count} echoes; needed are "
             f"{100 * _LEAST_EXPLAINED:g} %: is it the right ring, are poses and units right?"
         )
     sensors = (len(modes.columns) - 1) // 3
-    shift = float((modes.columns @ fit.settled.state.coordinates)[sensors])
-    offset = (modes.columns @ fit.settled.state.coordinates)[:sensors]
+    shift = float((modes.columns @ fit.adjustment.state.coordinates)[sensors])
+    offset = (modes.columns @ fit.adjustment.state.coordinates)[:sensors]
     worst = int(np.argmax(np.abs(offset)))
     if abs(offset[worst]) > _MOST_OFFSET:
         raise SonarError(

@@ -22,7 +22,7 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.sensors.ring_parameters import check_air
+from jaxsonar.sensors.ring_parameters import check_speed_of_sound
 
 MOST_SCANS = 1000
 """Of longer logs so many scans are explained, evenly spread over it."""
@@ -53,7 +53,7 @@ def check(
             or a sigma out of range.
     """
     check_sigma(sigma)
-    check_air(ring)
+    check_speed_of_sound(ring)
     if not len(log):
         raise SonarError("check: the log holds no scan; allowed are one or more")
     _, left_out = FlatEchoes.from_log(ring, log)

@@ -1,4 +1,4 @@
-"""The ring: where the sensors sit, which of them hear each other, and in which directions (paper, section 3)."""
+"""The sensor array: sensor poses, echo paths and detection ranges (paper, section 3)."""
 
 from collections.abc import Hashable, Sequence
 from functools import cached_property, lru_cache
@@ -15,39 +15,38 @@ from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
 
 REFERENCE_SPEED_OF_SOUND = 343.2
-"""m/s; a log's range is time of flight times this, halved, whatever the air was (20 deg C)."""
+"""Metres per second, air at 20 deg C. A log's range is half the time of flight times this, at any temperature."""
 
 AnyArray = np.ndarray | jax.Array
-"""NumPy outside, JAX (a tracer too) where a loss is differentiated with respect to the ring."""
+"""NumPy arrays as a rule; JAX arrays or tracers where a loss is differentiated with respect to the ring."""
 
-
-LARGEST = 100.0
-"""Metres; no ultrasonic ring is wider, and none hears farther."""
+MAX_SIZE = 100.0
+"""Largest position, radius, range offset and maximum range of an ultrasonic ring, metres."""
 
 
 class Ring(eqx.Module):
-    """Ultrasonic sensors on a robot, in the robot frame (x forward, y left, metres, radians).
+    """Ultrasonic sensors on a robot, in the robot frame (x forward, y left; metres, radians).
 
-    A pytree: sensor poses, range offsets and the speed of sound are leaves, so a loss can be differentiated with
-    respect to them; what decides array shapes is static.
+    The ring is a pytree. Sensor poses, beams, range offsets and the speed of sound are leaves, so that a loss can be
+    differentiated with respect to them. The fields that determine array shapes are static.
     """
 
     position: Float[AnyArray, "sensors 2"]
     """Mounting position (x, y) of each sensor, metres."""
     heading: Float[AnyArray, " sensors"]
-    """Direction each sensor looks to, radians counter-clockwise from x."""
+    """Direction of each sensor's axis, radians counter-clockwise from x."""
     beam: Float[AnyArray, " sensors"]
     """Full horizontal width of each detection cone, radians, in (0, pi]."""
     range_offset: Float[AnyArray, " sensors"]
-    """What each sensor reports too much, metres; a path gets the mean of its two sensors."""
+    """Constant error of the reported range of each sensor, metres; that of a path is the mean of its two sensors."""
     speed_of_sound: Float[AnyArray, ""]
     """Metres per second."""
     neighbors: int = eqx.field(static=True)
-    """Cross echoes are heard up to this neighbor on each side."""
+    """Cross echoes are received up to this neighbor on each side."""
     max_range: float = eqx.field(static=True)
-    """Half path length up to which an echo counts, metres."""
+    """Largest half path length of an echo, metres."""
     name: str = eqx.field(static=True)
-    """What a person calls this ring."""
+    """Name in messages and figures."""
 
     def __init__(
         self,
@@ -61,22 +60,22 @@ class Ring(eqx.Module):
         speed_of_sound: Float[AnyArray, ""] | float = REFERENCE_SPEED_OF_SOUND,
         name: str = "ring",
     ):
-        """Any arrangement of sensors: a ring, a car bumper, two rings one above the other.
+        """Build an array of any arrangement: a ring, a car bumper, two rings one above the other.
 
-        The arguments are the fields, so ``dataclasses.replace(ring, neighbors=0)`` gives the same ring but for those.
+        The arguments are the fields; ``dataclasses.replace(ring, neighbors=0)`` gives a changed copy.
 
         Args:
-            position: (sensors, 2) mounting positions in the robot frame, metres.
-            heading: (sensors,) directions, radians counter-clockwise from x.
-            beam: full detection cone, radians, one for all or one each.
-            neighbors: cross echoes are heard up to this many sensors further, counted through the list and around.
-            max_range: largest half path length that counts as an echo, metres.
-            range_offset: metres, subtracted from what the sensor reports; one for all or one each.
+            position: (sensors, 2) mounting positions, robot frame, metres.
+            heading: (sensors,) directions of the axes, radians counter-clockwise from x.
+            beam: full width of the detection cone, radians, one for all sensors or one each.
+            neighbors: cross echoes are received up to this many sensors away, counted cyclically through the list.
+            max_range: largest half path length of an echo, metres.
+            range_offset: subtracted from the reported range, metres, one for all sensors or one each.
             speed_of_sound: metres per second.
-            name: what a person calls this ring.
+            name: name in messages and figures.
 
         Raises:
-            SonarError: a value that no ring can have, named with what is allowed.
+            SonarError: a value out of range; the message names it and the allowed range.
         """
         self.position = np.array(position, dtype=np.float64).reshape(-1, 2)
         self.heading = np.array(heading, dtype=np.float64).reshape(-1)
@@ -105,11 +104,11 @@ class Ring(eqx.Module):
             raise SonarError(f"ring: beam {np.degrees(worst):g} deg; allowed is more than 0 and at most 180 deg")
         if not 0 <= self.neighbors < count:
             raise SonarError(f"ring: neighbors {self.neighbors}; allowed is 0 to {count - 1} with {count} sensors")
-        if not 0 < self.max_range <= LARGEST:
-            raise SonarError(f"ring: max_range {self.max_range:g} m; allowed is more than 0 and at most {LARGEST:g} m")
+        if not 0 < self.max_range <= MAX_SIZE:
+            raise SonarError(f"ring: max_range {self.max_range:g} m; allowed is more than 0 and at most {MAX_SIZE:g} m")
         for field in ("position", "range_offset"):
-            if (worst := np.abs(getattr(self, field)).max()) > LARGEST:
-                raise SonarError(f"ring: {field} {worst:g} m; allowed is at most {LARGEST:g} m either way")
+            if (worst := np.abs(getattr(self, field)).max()) > MAX_SIZE:
+                raise SonarError(f"ring: {field} {worst:g} m; allowed is at most {MAX_SIZE:g} m either way")
         if (worst := np.degrees(np.abs(self.heading).max())) > 720:
             raise SonarError(f"ring: heading {worst:g} deg; allowed is at most 720 deg either way")
         if not 0 < self.speed_of_sound <= 10_000:
@@ -128,25 +127,25 @@ class Ring(eqx.Module):
         speed_of_sound: float = REFERENCE_SPEED_OF_SOUND,
         name: str = "ring",
     ) -> "Ring":
-        """Sensors evenly around a circle, looking outward, counter-clockwise; the defaults are the paper's ring.
+        """Build a ring of evenly spaced sensors that face outward, counter-clockwise; by default the paper's ring.
 
         Args:
             count: number of sensors.
             radius: radius of the circle, metres.
-            beam: full horizontal detection cone of every sensor, radians.
-            neighbors: cross echoes are heard up to this neighbor on each side.
-            max_range: largest half path length that counts as an echo, metres.
-            first_heading: direction of sensor 0, radians.
+            beam: full horizontal width of every detection cone, radians.
+            neighbors: cross echoes are received up to this neighbor on each side.
+            max_range: largest half path length of an echo, metres.
+            first_heading: direction of the axis of sensor 0, radians.
             speed_of_sound: metres per second.
-            name: what a person calls this ring.
+            name: name in messages and figures.
 
         Raises:
-            SonarError: a value that no ring can have, named with what is allowed.
+            SonarError: a value out of range; the message names it and the allowed range.
         """
         if _whole(count, "count") < 1:
             raise SonarError(f"ring: count {count}; allowed is 1 or more")
-        if not 0 <= radius <= LARGEST:
-            raise SonarError(f"ring: radius {radius:g} m; allowed is 0 or more, at most {LARGEST:g} m")
+        if not 0 <= radius <= MAX_SIZE:
+            raise SonarError(f"ring: radius {radius:g} m; allowed is 0 or more, at most {MAX_SIZE:g} m")
         heading = first_heading + 2 * np.pi * np.arange(count) / count
         position = radius * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         return cls(
@@ -166,20 +165,21 @@ class Ring(eqx.Module):
 
     @property
     def paths(self) -> Int[np.ndarray, "paths 2"]:
-        """Echo paths (tx, rx), by neighbor offset 0, +1, -1, +2, -2, ... and then by tx; rx = (tx + offset) mod count.
+        """Echo paths (tx, rx), ordered by neighbor offset 0, +1, -1, +2, -2, ..., then by tx.
 
-        An offset that leads to the receivers of an earlier one (as +2 and -2 in a ring of four) is listed once.
+        The receiver is rx = (tx + offset) mod count. Offsets that give the same receivers, such as +2 and -2 in a ring
+        of four sensors, are listed once.
         """
         return _paths(self.count, self.neighbors)
 
     @property
     def path_index(self) -> Int[np.ndarray, "sensors sensors"]:
-        """Row of ``paths`` that holds (tx, rx), or -1 where that pair is no echo path of this ring."""
+        """Row of ``paths`` for each (tx, rx); -1 if the pair is no echo path of this ring."""
         return _path_index(self.count, self.neighbors)
 
     @property
     def sensors(self) -> kernels.Sensors:
-        """The ring as the kernels take it; differentiable in every leaf of the ring."""
+        """The ring as an argument of kernels; differentiable with respect to every leaf of the ring."""
         paths = self.paths.astype(np.int32)
         return kernels.Sensors(
             position=jnp.asarray(self.position),
@@ -223,21 +223,21 @@ class Ring(eqx.Module):
 
     @property
     def detection_ranges(self) -> Float[AnyArray, "paths 2"]:
-        """Directions (first, last) from which each path hears a plane, radians, counter-clockwise (paper, section 3).
+        """Directions (first, last) in which each path detects a plane, radians, counter-clockwise (paper, section 3).
 
-        The intersection of the two cones: 60, 45, 30 and 15 deg wide in the paper's ring. Empty where the cones do not
-        overlap: first and last are then equal.
+        It is the intersection of the two cones: 60, 45, 30 and 15 deg wide in the paper's ring. If the cones do not
+        overlap it is empty, with equal first and last directions.
         """
         paths = self.echo_paths
         return jnp.stack([paths.start, paths.start + paths.width], axis=-1)
 
     @property
     def firing_groups(self) -> tuple[Int[np.ndarray, " group"], ...]:
-        """Sensors that fire at once without mutual interference, group after group (paper, section 3).
+        """Groups of sensors that fire simultaneously without mutual interference, in firing order (paper, section 3).
 
-        Within a group any two sensors are at least 2 * neighbors + 2 apart, so that no receiver listens to both and the
-        one in the middle hears nothing: every eighth sensor in the paper's ring, eight groups. Where the spacing does
-        not divide the ring, it is wider here and there, never narrower.
+        Any two sensors of a group are at least 2 * neighbors + 2 apart, so that no receiver listens to both: every
+        eighth sensor of the paper's ring, in eight groups. If this spacing does not divide the number of sensors, some
+        gaps are wider.
         """
         together = max(1, self.count // (2 * self.neighbors + 2))
         blocks = np.array_split(np.arange(self.count), together)
@@ -247,13 +247,13 @@ class Ring(eqx.Module):
     def corrected(
         self, reported: Float[AnyArray, "*echoes"], tx: Int[AnyArray, "*echoes"], rx: Int[AnyArray, "*echoes"]
     ) -> Float[AnyArray, "*echoes"]:
-        """Half path lengths in metres from a log's ranges: offsets taken off, then scaled to this speed of sound."""
+        """Half path lengths (metres) from a log's ranges: subtract the path's offset, scale to this speed of sound."""
         offset = 0.5 * (self.range_offset[tx] + self.range_offset[rx])
         return (reported - offset) * (self.speed_of_sound / REFERENCE_SPEED_OF_SOUND)
 
 
 def speed_of_sound(temperature: float) -> float:
-    """Metres per second in dry air of this temperature, deg C."""
+    """Speed of sound in dry air, metres per second, at a temperature in deg C."""
     return 331.3 * float(np.sqrt(1 + temperature / 273.15))
 
 
@@ -275,7 +275,7 @@ def _whole(value: int, field: str) -> int:
 
 @lru_cache(maxsize=8)
 def _paths(count: int, neighbors: int) -> Int[np.ndarray, "paths 2"]:
-    """``Ring.paths``, read-only; asked for with every scan."""
+    """``Ring.paths`` as a read-only array; cached because every scan needs it."""
     offsets = [0] + [sign * k for k in range(1, neighbors + 1) for sign in (1, -1)]
     distinct = list(dict.fromkeys(offset % count for offset in offsets))
     tx = np.tile(np.arange(count), len(distinct))
@@ -286,7 +286,7 @@ def _paths(count: int, neighbors: int) -> Int[np.ndarray, "paths 2"]:
 
 @lru_cache(maxsize=8)
 def _path_index(count: int, neighbors: int) -> Int[np.ndarray, "sensors sensors"]:
-    """``Ring.path_index``, read-only."""
+    """``Ring.path_index`` as a read-only array."""
     paths, index = _paths(count, neighbors), np.full((count, count), -1)
     index[paths[:, 0], paths[:, 1]] = np.arange(len(paths))
     index.setflags(write=False)

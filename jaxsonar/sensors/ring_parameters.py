@@ -1,4 +1,4 @@
-"""What may change about a ring, and what is expected of it: the modes along which calibration moves it."""
+"""Reduced parameter basis of a ring for calibration, with a Gaussian prior on every parameter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,103 +9,123 @@ from jaxtyping import Float
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.sensors.ring import Ring
 
-FREE = ("offset", "speed", "position", "radius", "heading")
-"""What can be estimated of a ring."""
-DEFAULT_FREE = ("offset", "speed")
-AIR = (290.0, 380.0)
-"""Metres per second; sound in air from -60 to 85 deg C."""
-OFFSET_SD = 0.03
-"""Metres; range offsets before calibration: delays of detectors, a few wavelengths."""
-SPEED_SD = 0.015
-"""Relative; an unknown temperature between about 11 and 29 deg C, or a scale that a driver got wrong by so much."""
-THERMOMETER_SD = 0.001
-"""Relative; a measured temperature, to about half a kelvin."""
-POSITION_SD = 0.005
-"""Metres; how far from its place a sensor may be mounted."""
-RADIUS_SD = 0.05
-"""Metres; a radius that was guessed."""
+PARAMETERS = ("offset", "speed", "position", "radius", "heading")
+"""Groups of ring parameters that can be estimated."""
+DEFAULT_PARAMETERS = ("offset", "speed")
+"""Groups that are estimated unless others are chosen."""
 
 
 @dataclass(frozen=True)
-class RingModes:
-    """Columns that say how (offsets, log speed of sound, positions) may change, each with the prior N(0, 1)."""
+class RingPrior:
+    """Prior standard deviations of ring parameters before calibration, and the range of valid speeds of sound."""
 
-    columns: Float[np.ndarray, "ring modes"]
-    """Metres, relative, metres; rows: offsets (sensors), log speed, x and y of every sensor."""
+    offset_sd: float = 0.03
+    """Range offsets, metres: delays of detectors, a few wavelengths."""
+    speed_sd: float = 0.015
+    """Speed of sound, relative: an unknown temperature between about 11 and 29 deg C, or an equal scale error."""
+    measured_speed_sd: float = 0.001
+    """Speed of sound after a temperature measurement, relative: about half a kelvin."""
+    position_sd: float = 0.005
+    """Mounting positions, metres."""
+    radius_sd: float = 0.05
+    """Radius of a ring that was guessed, metres."""
+    min_speed: float = 290.0
+    """Smallest speed of sound in air, metres per second: -60 deg C."""
+    max_speed: float = 380.0
+    """Largest speed of sound in air, metres per second: 85 deg C."""
+
+
+PRIOR = RingPrior()
+
+
+@dataclass(frozen=True)
+class ParameterBasis:
+    """Linear basis of changes of a ring: each coefficient has the prior N(0, 1). A fixed parameter has no column."""
+
+    columns: Float[np.ndarray, "parameters basis"]
+    """Change of the ring per unit of each coefficient. Rows: range offsets of all sensors (metres), log speed of sound,
+    x and y of every sensor (metres)."""
     names: tuple[str, ...]
-    """What each column belongs to: a name of ``FREE``, or "mean"."""
+    """Parameter group of each column: a name from ``PARAMETERS``, or "mean" for the mean range offset."""
 
-    def only(self, *names: str) -> "RingModes":
-        """The same shape, the columns of other names held at 0: so that nothing is compiled anew."""
+    def only(self, *names: str) -> "ParameterBasis":
+        """The basis with all other columns set to 0. The shape stays, so that no kernel is compiled again."""
         kept = np.array([name in names for name in self.names])
-        return RingModes(self.columns * kept, self.names)
+        return ParameterBasis(self.columns * kept, self.names)
 
 
-def ring_modes(ring: Ring, free: Sequence[str], *, poses_free: bool, speed_sd: float) -> RingModes:
-    """The modes of a ring.
+def parameter_basis(ring: Ring, free: Sequence[str], *, poses_free: bool, speed_sd: float) -> ParameterBasis:
+    """Basis of the chosen parameter groups.
+
+    Range offsets are split into deviations that sum to zero and their mean, because the mean can be held separately.
 
     Args:
-        ring: the sensors where they are thought to be.
-        free: names of ``FREE``.
-        poses_free: whether the poses are estimated: then moving or turning all sensors together moves the robot's frame
-            and is no change of the ring.
-        speed_sd: relative standard deviation that is expected of the speed of sound.
+        ring: nominal sensors.
+        free: names from ``PARAMETERS``.
+        poses_free: whether poses are estimated as well. A common motion of all sensors is then equivalent to a change
+            of the robot frame (gauge freedom), and the positions' basis does not contain it.
+        speed_sd: prior standard deviation of the speed of sound, relative.
+
+    Raises:
+        SonarError: the radius is free, but all sensors have one position.
     """
     count = ring.count
     position = np.asarray(ring.position, np.float64)
     blocks: list[tuple[str, np.ndarray]] = []
 
-    def add(name: str, columns: np.ndarray, begin: int) -> None:
-        whole = np.zeros((3 * count + 1, columns.shape[1]))
-        whole[begin : begin + len(columns)] = columns
-        blocks.append((name, whole))
+    def add(name: str, columns: np.ndarray, first_row: int) -> None:
+        block = np.zeros((3 * count + 1, columns.shape[1]))
+        block[first_row : first_row + len(columns)] = columns
+        blocks.append((name, block))
 
     if "offset" in free:
-        level = np.full((count, count), 1 / count)
-        add("offset", OFFSET_SD * (np.eye(count) - level), 0)
-        add("mean", np.full((count, 1), OFFSET_SD), 0)
+        mean = np.full((count, count), 1 / count)
+        add("offset", PRIOR.offset_sd * (np.eye(count) - mean), 0)
+        add("mean", np.full((count, 1), PRIOR.offset_sd), 0)
     if "speed" in free:
         add("speed", np.full((1, 1), speed_sd), count)
     if "position" in free:
-        add("position", POSITION_SD * _without_motion(position, poses_free), count + 1)
+        add("position", PRIOR.position_sd * _position_projector(position, poses_free), count + 1)
     if "radius" in free:
         outward = position - position.mean(axis=0)
-        far = np.linalg.norm(outward, axis=1).mean()
-        if far == 0:
+        radius = np.linalg.norm(outward, axis=1).mean()
+        if radius == 0:
             raise SonarError(f"ring {ring.name!r}: all sensors are in one place; allowed for a free radius is a ring")
-        add("radius", RADIUS_SD * (outward / far).reshape(-1, 1), count + 1)
+        add("radius", PRIOR.radius_sd * (outward / radius).reshape(-1, 1), count + 1)
     if not blocks:
         add("none", np.zeros((1, 1)), 0)
     columns = np.concatenate([columns for _, columns in blocks], axis=1)
-    return RingModes(columns, tuple(name for name, block in blocks for _ in range(block.shape[1])))
+    return ParameterBasis(columns, tuple(name for name, block in blocks for _ in range(block.shape[1])))
 
 
-def _without_motion(position: Float[np.ndarray, "sensors 2"], poses_free: bool) -> Float[np.ndarray, "places places"]:
-    """Projector on changes of the positions that are no motion of the whole array; the identity for known poses."""
+def _position_projector(
+    position: Float[np.ndarray, "sensors 2"], poses_free: bool
+) -> Float[np.ndarray, "coordinates coordinates"]:
+    """Projector onto position changes without common translation and rotation; the identity for known poses."""
     size = position.size
     if not poses_free:
         return np.eye(size)
-    turned = np.stack([-position[:, 1], position[:, 0]], axis=1).ravel()
-    along_x, along_y = np.tile([1.0, 0.0], len(position)), np.tile([0.0, 1.0], len(position))
-    basis, strength, _ = np.linalg.svd(np.stack([along_x, along_y, turned], axis=1), full_matrices=False)
-    basis = basis[:, strength > 1e-9]
+    rotation = np.stack([-position[:, 1], position[:, 0]], axis=1).ravel()
+    shift_x, shift_y = np.tile([1.0, 0.0], len(position)), np.tile([0.0, 1.0], len(position))
+    basis, singular, _ = np.linalg.svd(np.stack([shift_x, shift_y, rotation], axis=1), full_matrices=False)
+    basis = basis[:, singular > 1e-9]
     return np.eye(size) - basis @ basis.T
 
 
-def check_free(free: Sequence[str]) -> None:
-    """Raise a SonarError for something that cannot be estimated."""
+def check_parameters(free: Sequence[str]) -> None:
+    """Raise a SonarError for a name that is not in ``PARAMETERS``, a repeated name, or no name."""
     for name in free:
-        if name not in FREE:
-            raise SonarError(f"free {name!r}; allowed are {', '.join(FREE)}")
+        if name not in PARAMETERS:
+            raise SonarError(f"free {name!r}; allowed are {', '.join(PARAMETERS)}")
     if len(set(free)) < len(free):
-        raise SonarError(f"free {', '.join(free)}: one came twice; allowed is each of {', '.join(FREE)} once")
+        raise SonarError(f"free {', '.join(free)}: one came twice; allowed is each of {', '.join(PARAMETERS)} once")
     if not free:
-        raise SonarError(f"free: nothing came; allowed are one or more of {', '.join(FREE)}")
+        raise SonarError(f"free: nothing came; allowed are one or more of {', '.join(PARAMETERS)}")
 
 
-def check_air(ring: Ring) -> None:
-    """Raise a SonarError for a speed of sound that no air has."""
-    speed, (low, high) = float(ring.speed_of_sound), AIR
+def check_speed_of_sound(ring: Ring) -> None:
+    """Raise a SonarError for a speed of sound that air does not have."""
+    speed, low, high = float(ring.speed_of_sound), PRIOR.min_speed, PRIOR.max_speed
     if not low <= speed <= high:
         raise SonarError(
             f"ring {ring.name!r}: speed_of_sound {speed:g} m/s; allowed is that of air, {low:g} to {high:g}"

@@ -1,4 +1,4 @@
-"""Rings as TOML files: degrees where a person types them, every key checked; rings of known devices are shipped."""
+"""Rings as TOML files, with angles in degrees and every key checked; the package contains rings of known devices."""
 
 import math
 import os
@@ -52,7 +52,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     ring: Annotated[_RingTable | None, Meta(description="one table [ring]")] = None
     array: Annotated[_ArrayTable | None, Meta(description="one table [array]")] = None
     sensor: Annotated[list[_SensorTable] | None, Meta(description="tables [[sensor]], one a sensor")] = None
-    # What a calibration says about itself; a ring needs none of it.
+    # Results of a calibration; ignored here.
     calibration: Annotated[dict[str, Any] | None, Meta(description="one table [calibration]")] = None
 
 
@@ -60,23 +60,23 @@ _TABLES = {"": _File, "ring": _RingTable, "array": _ArrayTable, "sensor": _Senso
 
 
 def shipped_rings() -> tuple[str, ...]:
-    """Names of the rings that come with the package, as ``load_ring`` takes them."""
+    """Names of the rings in the package, as accepted by ``load_ring``."""
     return tuple(sorted(file.stem.removeprefix("ring-") for file in DATA.glob("ring-*.toml")))
 
 
 def load_ring(path: str | os.PathLike[str]) -> Ring:
-    """A ring from a TOML file, or one of the shipped rings by its name.
+    """Load a ring from a TOML file, or one of the shipped rings by name.
 
-    The file has a ``name``, optionally ``speed_of_sound`` (m/s), and either ``[ring]`` (count, radius,
-    first_heading_deg, beam_deg, neighbors, max_range: sensors evenly around a circle) or ``[array]`` (neighbors,
-    max_range) with one ``[[sensor]]`` each (x, y, heading_deg, beam_deg and optionally range_offset). A table
-    ``[calibration]``, which calibrated rings carry, is left unread. Lengths in metres.
+    The file contains ``name``, optionally ``speed_of_sound`` (m/s), and either a circular ring or a general array. A
+    ring is a table ``[ring]`` with count, radius, first_heading_deg, beam_deg, neighbors and max_range. An array is a
+    table ``[array]`` with neighbors and max_range, and one table ``[[sensor]]`` per sensor with x, y, heading_deg,
+    beam_deg and optionally range_offset. Lengths are in metres. A table ``[calibration]`` is ignored.
 
     Args:
-        path: the file; or, where no such file exists, a name from ``shipped_rings()``: ``load_ring("faw")``.
+        path: the file; if there is no such file, a name from ``shipped_rings()``, as in ``load_ring("faw")``.
 
     Raises:
-        SonarError: no such ring, or a file that holds none; one line with file, key and what is allowed.
+        SonarError: no such ring, or an invalid file; the message names file, key and allowed values.
     """
     file = Path(path)
     if not os.path.isfile(path) and os.fspath(path) in shipped_rings():
@@ -133,40 +133,39 @@ def _ring(given: _File) -> Ring:
 
 
 def save_ring(ring: Ring, path: str | os.PathLike[str]) -> None:
-    """Write a ring as TOML, so that ``load_ring`` gives the same one to 1e-12 (m, rad, m/s).
+    """Write a ring as TOML, so that ``load_ring`` restores it to within 1e-12 (m, rad, m/s).
 
-    As ``[ring]`` where the sensors are evenly around a circle, alike and without offsets; as ``[array]`` with a
-    ``[[sensor]]`` each otherwise.
+    A circular ring of equal sensors without range offsets is written as ``[ring]``, any other as ``[array]``.
 
     Args:
         ring: the ring.
-        path: the file, replaced only once all is written.
+        path: the file; an existing one is replaced only after the new one is complete.
 
     Raises:
-        SonarError: the place cannot be written.
+        SonarError: the file cannot be written.
     """
     with atomic_write(path) as file:
         file.write(ring_toml(ring))
 
 
 def ring_toml(ring: Ring, *, each: bool = False) -> str:
-    """A ring as the text of its file.
+    """A ring as the text of a TOML file.
 
     Args:
         ring: the ring.
-        each: as ``[array]`` with a ``[[sensor]]`` each, even where ``[ring]`` would do.
+        each: write every sensor as ``[[sensor]]``, even if ``[ring]`` would suffice.
     """
     speed = float(np.asarray(ring.speed_of_sound, dtype=np.float64))
     head: dict[str, Any] = {"name": ring.name, "speed_of_sound": speed}
     if (circle := _circle(ring)) and not each:
         return tomli_w.dumps({**head, "ring": circle})
     text = tomli_w.dumps({**head, "array": {"neighbors": ring.neighbors, "max_range": ring.max_range}})
-    # One by one, since the library would put short tables into an inline array.
+    # One table at a time, because the library writes lists of short tables as inline arrays.
     return text + "".join(f"\n[[sensor]]\n{tomli_w.dumps(sensor)}" for sensor in _sensors(ring))
 
 
 def _circle(ring: Ring) -> dict[str, Any] | None:
-    """The table [ring], or None where it would not give this ring back."""
+    """The table [ring], or None if it cannot represent this ring."""
     position, heading = np.asarray(ring.position, np.float64), np.asarray(ring.heading, np.float64)
     beam, offset = np.asarray(ring.beam, np.float64), np.asarray(ring.range_offset, np.float64)
     radius, first_heading = _short(np.hypot(*position[0])), float(heading[0])
@@ -186,7 +185,7 @@ def _circle(ring: Ring) -> dict[str, Any] | None:
 
 
 def _sensors(ring: Ring) -> list[dict[str, Any]]:
-    """The tables [[sensor]]."""
+    """The tables [[sensor]], one per sensor."""
     columns = (ring.position, ring.heading, ring.beam, ring.range_offset)
     sensors = []
     for (x, y), heading, beam, offset in zip(*(np.asarray(column, np.float64) for column in columns), strict=True):
@@ -201,7 +200,7 @@ def _sensors(ring: Ring) -> list[dict[str, Any]]:
 
 
 def _short(value: float) -> float:
-    """0.14 for 0.14000000000000004: what is dropped is far below the 1e-12 that a file promises."""
+    """A length without rounding noise: 0.14 for 0.14000000000000004. The file format guarantees 1e-12 only."""
     return round(float(value), 14) + 0.0
 
 
@@ -219,7 +218,7 @@ def _read(file: Path) -> _File:
 
 
 def _refuse_not_finite(file: Path, value: Any, key: str) -> None:
-    """TOML knows nan and inf, and no bound stops both."""
+    """Raise a SonarError for nan and inf, which TOML allows and which the bounds above do not exclude."""
     if isinstance(value, float) and not math.isfinite(value):
         raise SonarError(f"{shown(file)}: {shown(key)}: {value} came; allowed is {_allowed(key) or 'a finite number'}")
     if isinstance(value, dict):
@@ -231,7 +230,7 @@ def _refuse_not_finite(file: Path, value: Any, key: str) -> None:
 
 
 def _refuse(file: Path, data: dict[str, Any], message: str) -> NoReturn:
-    """One line in our words for what msgspec found; it names a key or the table that a key is in."""
+    """Raise a one-line SonarError for a message of msgspec, which names a key or its table."""
     what, _, place = message.partition(" - at `$")
     place = place.rstrip("`").removeprefix(".")
     if field := re.fullmatch(r"Object (missing required|contains unknown) field `(.*)`", what, re.DOTALL):
@@ -250,7 +249,7 @@ def _refuse(file: Path, data: dict[str, Any], message: str) -> NoReturn:
 
 
 def _allowed(key: str) -> str:
-    """What may stand under a key such as ``sensor[3].beam_deg``; empty where the key is none of ours."""
+    """Description of the allowed values of a key such as ``sensor[3].beam_deg``; empty for an unknown key."""
     table, _, name = re.sub(r"\[\d+\]", "", key).rpartition(".")
     hint = get_type_hints(_TABLES[table], include_extras=True).get(name) if table in _TABLES else None
     return next((meta.description or "" for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, Meta)), "")

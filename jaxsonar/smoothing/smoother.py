@@ -18,7 +18,7 @@ from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.detection.settings import check_sigma
 from jaxsonar.estimation.alternation import AGAIN, MAPS, AlternationResult, alternate
 from jaxsonar.estimation.batch_data import BatchData
-from jaxsonar.estimation.landmark_map import LandmarkMap, map_with_tentative_points, landmark_map_of
+from jaxsonar.estimation.landmark_map import LandmarkMap, landmark_map_of, map_with_tentative_points
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.robust_adjustment import AdjustmentResult, AdjustmentState, anneal, gnc_adjust
 from jaxsonar.estimation.sparse_lm import known
@@ -29,11 +29,11 @@ from jaxsonar.registration.sequential import register_remaining
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import check_window
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.sensors.ring_parameters import SPEED_SD, RingModes, ring_modes
-from jaxsonar.smoothing.covisibility import Passages
-from jaxsonar.smoothing.odometry_outliers import Breaks, broken_steps
-from jaxsonar.smoothing.smoothed_map import settled_map
-from jaxsonar.smoothing.wall_echo_mask import of_own_walls
+from jaxsonar.sensors.ring_parameters import PRIOR, ParameterBasis, parameter_basis
+from jaxsonar.smoothing.covisibility import Traversals
+from jaxsonar.smoothing.odometry_outliers import OdometryOutliers, find_odometry_outliers
+from jaxsonar.smoothing.smoothed_map import adjusted_map
+from jaxsonar.smoothing.wall_echo_mask import wall_explained_mask
 
 BLUR = 0.2
 """Of local models where scans are placed: of a ring that is calibrated (``placing``)."""
@@ -96,9 +96,9 @@ def smooth(
     window: float | None = None,
     speed: bool = False,
     scale: bool = False,
-    slip: OdometryNoise | None = None,
+    odometry_noise: OdometryNoise | None = None,
     models: Sequence[LocalModel] | None = None,
-    passages: Passages | None = None,
+    traversals: Traversals | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Smoothed:
     """Adjust all poses, walls and corners to the ranges.
@@ -115,7 +115,7 @@ def smooth(
         window: metres of path gathered into one local model for the map, for sparse rings.
         speed: whether the speed of sound is estimated.
         scale: whether the scales of the odometry's ways and turns are.
-        slip: noise of the odometry; as ``Slip()`` if left out.
+        odometry_noise: noise model of the odometry; default ``OdometryNoise()``.
         models: the local models of the scans, if they are known already; not with a window.
         passages: which scans are known to each other so well that they hear the same walls; all of them if left out.
         progress: told what is being done.
@@ -131,7 +131,17 @@ def smooth(
         say("local models")
         models = list(local_models(ring, log, sigma=sigma))
     job = _Job(
-        ring, log, measured, modes, slip or OdometryNoise(), sigma, window, models, passages, int(_placed(given).argmax()), say
+        ring,
+        log,
+        measured,
+        modes,
+        odometry_noise or OdometryNoise(),
+        sigma,
+        window,
+        models,
+        traversals,
+        int(_placed(given).argmax()),
+        say,
     )
     # 1. Maps and least squares in turn, from the poses as they came.
     best = job.settled(_led(given, measured))
@@ -144,7 +154,11 @@ def smooth(
         more = register_remaining(models or [], best.poses, measured, margin=margin, noise_scale=BLUR)
         if _placed(more).sum() > _placed(best.poses).sum():
             fit = job.settled(more)
-            best = fit if fit.round.explained_count > best.round.explained_count and fit.sigma < _NOISIER * best.sigma else best
+            best = (
+                fit
+                if fit.round.explained_count > best.round.explained_count and fit.sigma < _NOISIER * best.sigma
+                else best
+            )
     # 3. How well all of it is known.
     say("covariances")
     return job.result(best)
@@ -171,12 +185,12 @@ class _Job:
     ring: Ring
     log: Log
     odometry: Float[np.ndarray, "scans 3"]
-    modes: RingModes
+    modes: ParameterBasis
     odometry_noise: OdometryNoise
     sigma: float | None
     window: float | None
     models: Sequence[LocalModel] | None
-    passages: Passages | None
+    passages: Traversals | None
     first: int
     """Row of the scan that stays where it is."""
     say: Callable[[str], None]
@@ -208,17 +222,20 @@ class _Job:
         if len(change) > 3 * self.ring.count + 1:
             told *= np.exp(-change[[-2, -2, -1]])
         last = len(rows) - 1
-        return rows[broken_steps(state.poses[: last + 1], told[:last], data.odometry_information[:last])]
+        return rows[find_odometry_outliers(state.poses[: last + 1], told[:last], data.odometry_information[:last])]
 
     def _settled(self, poses: Float[np.ndarray, "scans 3"], broken: Int[np.ndarray, " some"] = _NONE) -> _Fit:
         log = replace(self.log, pose=poses)
-        data = _free(BatchData.from_logs(self.ring, [log], [self.odometry], self.odometry_noise, keep_empty_scans=True), self.first)
+        data = _free(
+            BatchData.from_logs(self.ring, [log], [self.odometry], self.odometry_noise, keep_empty_scans=True),
+            self.first,
+        )
         data = replace(data, min_echoes_per_landmark=_TOGETHER if self.window is None else 1, sparse=True)
         if self.models is not None:
-            data = replace(data, wall_explained=of_own_walls(self.ring, data, self.models))
+            data = replace(data, wall_explained=wall_explained_mask(self.ring, data, self.models))
         if data.scan_count > _MANY:
             data = replace(data, max_iterations=_FEW_STEPS)
-        found = self._alternated(data, log, Breaks(broken, self._rows))
+        found = self._alternated(data, log, OdometryOutliers(broken, self._rows))
         if found is None:
             raise SonarError("smooth: no echo fits the walls; is it the right ring, are poses and units right?")
         rows = data.scan_rows[0]
@@ -244,36 +261,40 @@ class _Job:
         odd[self.first] = False
         return odd
 
-    def _mapped(self, data: BatchData, log: Log, state: AdjustmentState, breaks: Breaks) -> GlobalMap:
+    def _mapped(self, data: BatchData, log: Log, state: AdjustmentState, breaks: OdometryOutliers) -> GlobalMap:
         ring = self._heard_with(state)
-        world = map_with_tentative_points(ring, data.logs_with_poses([log], state.poses)[0], window=self.window, models=self.models)
+        world = map_with_tentative_points(
+            ring, data.logs_with_poses([log], state.poses)[0], window=self.window, models=self.models
+        )
         if not len(world):
             raise SonarError("smooth: no wall found; allowed are scans of a place with straight walls in reach")
-        world = world if self.passages is None else self.passages.parted(world, self._rows)
-        return breaks.parted(world) if len(breaks.steps) else world
+        world = world if self.passages is None else self.passages.split_landmarks(world, self._rows)
+        return breaks.split_landmarks(world) if len(breaks.steps) else world
 
     @cached_property
     def _rows(self) -> dict[int, int]:
         """Of the scans by their numbers."""
         return {int(number): row for row, number in enumerate(self.log.scan)}
 
-    def _around(self, data: BatchData, worlds: list[GlobalMap], breaks: Breaks) -> LandmarkMap:
+    def _around(self, data: BatchData, worlds: list[GlobalMap], breaks: OdometryOutliers) -> LandmarkMap:
         """The reflectors of the only map, and who may hear them."""
         around = landmark_map_of(worlds, tie_corners=False)
         if self.passages is None and not len(breaks.steps):
             return around
         world, rows = worlds[0], data.scan_rows[0]
-        heard = breaks.heard_by(world, len(self.log))
+        heard = breaks.visibility_mask(world, len(self.log))
         if self.passages is not None:
-            heard &= self.passages.heard_by(world, self._rows)[self.passages.part]
+            heard &= self.passages.visibility_mask(world, self._rows)[self.passages.segment_id]
         heard_by = np.zeros((len(data.poses), len(around.world)), dtype=bool)
         heard_by[: len(rows), : heard.shape[1]] = heard[rows]
         return around._replace(visible=heard_by)
 
-    def _alternated(self, data: BatchData, log: Log, breaks: Breaks) -> AlternationResult | None:
+    def _alternated(self, data: BatchData, log: Log, breaks: OdometryOutliers) -> AlternationResult | None:
         """Map and least squares in turn; at first the poses stay near where they began, until the map has shape."""
         near = replace(data, prior_information=np.maximum(data.prior_information, 1 / np.square(_NEAR)))
-        state = AdjustmentState(np.zeros(self.modes.columns.shape[1]), data.poses, landmark_map_of([], tie_corners=False))
+        state = AdjustmentState(
+            np.zeros(self.modes.columns.shape[1]), data.poses, landmark_map_of([], tie_corners=False)
+        )
         self.say("first map")
         start = state._replace(landmark_map=self._around(data, [self._mapped(data, log, state, breaks)], breaks))
         with jax.enable_x64(True):
@@ -291,7 +312,9 @@ class _Job:
     def _settle(self, data: BatchData, state: AdjustmentState, widest: float) -> AdjustmentResult:
         """In double precision."""
         with jax.enable_x64(True):
-            return gnc_adjust(self.ring, data, self.modes, state, initial_scale=widest, poses_free=True, sigma=self.sigma)
+            return gnc_adjust(
+                self.ring, data, self.modes, state, initial_scale=widest, poses_free=True, sigma=self.sigma
+            )
 
     def _heard_with(self, state: AdjustmentState) -> Ring:
         """The ring with the speed of sound so far."""
@@ -315,7 +338,7 @@ class _Job:
             poses=fit.poses,
             pose_cov=pose_cov,
             heard=fit.heard,
-            world=settled_map(fit.round.maps[0], found, cov.reflectors),
+            world=adjusted_map(fit.round.maps[0], found, cov.reflectors),
             used=float(found.used.sum() / max(fit.data.echo_count, 1)),
             sigma=found.sigma,
             ring=ring,
@@ -325,15 +348,15 @@ class _Job:
         )
 
 
-def _modes(ring: Ring, *, speed: bool, scale: bool) -> RingModes:
+def _modes(ring: Ring, *, speed: bool, scale: bool) -> ParameterBasis:
     """The speed of sound, if it is free, and the scales of the odometry."""
-    modes = ring_modes(ring, ("speed",) if speed else (), poses_free=True, speed_sd=SPEED_SD)
+    modes = parameter_basis(ring, ("speed",) if speed else (), poses_free=True, speed_sd=PRIOR.speed_sd)
     if not scale:
         return modes
     columns = np.zeros((len(modes.columns) + 2, modes.columns.shape[1] + 2))
     columns[:-2, :-2] = modes.columns
     columns[-2:, -2:] = SCALE_SD * np.eye(2)
-    return RingModes(columns, (*modes.names, "way", "turn"))
+    return ParameterBasis(columns, (*modes.names, "way", "turn"))
 
 
 def _free(data: BatchData, first: int) -> BatchData:

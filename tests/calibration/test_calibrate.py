@@ -10,16 +10,7 @@ from jaxsonar import Log, Ring, SonarError, calibrate, load_ring, save_calibrati
 from jaxsonar.calibration.calibrate import Calibration, speed_of_sound
 from jaxsonar.geometry.se2 import compose, inverse, relative, wrap_angle
 from jaxsonar.reports.plot_calibration import calibration_figure
-from jaxsonar.sensors.ring_parameters import (
-    FREE,
-    OFFSET_SD,
-    POSITION_SD,
-    RADIUS_SD,
-    SPEED_SD,
-    THERMOMETER_SD,
-    check_free,
-    ring_modes,
-)
+from jaxsonar.sensors.ring_parameters import PARAMETERS, PRIOR, check_parameters, parameter_basis
 from jaxsonar.simulation.office import load_office
 
 SIGMA = 0.001
@@ -135,21 +126,21 @@ def known_to(found: Calibration, count=COUNT):
 @pytest.mark.slow
 @pytest.mark.parametrize("poses_free", [False, True])
 def test_offset_modes_move_no_mean_and_have_the_spread_that_is_expected(nominal, poses_free):
-    modes = ring_modes(nominal, FREE, poses_free=poses_free, speed_sd=0.02)
+    modes = parameter_basis(nominal, PARAMETERS, poses_free=poses_free, speed_sd=0.02)
     assert modes.columns.shape == (3 * COUNT + 1, len(modes.names))
     of = {name: modes.columns[:, [name == other for other in modes.names]] for name in set(modes.names)}
     np.testing.assert_allclose(of["offset"][:COUNT].sum(axis=0), 0, atol=1e-15)
     spread = {name: np.sqrt((columns**2).sum(axis=1)) for name, columns in of.items()}
     np.testing.assert_allclose(
         np.hypot(spread["offset"], spread["mean"])[:COUNT] ** 2,
-        OFFSET_SD**2 * (1 - 1 / COUNT) + OFFSET_SD**2,
+        PRIOR.offset_sd**2 * (1 - 1 / COUNT) + PRIOR.offset_sd**2,
         rtol=1e-12,
     )
     np.testing.assert_allclose(spread["speed"][COUNT], 0.02)
     outward = modes.columns[COUNT + 1 :, modes.names.index("radius")].reshape(-1, 2)
-    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), RADIUS_SD)
+    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), PRIOR.radius_sd)
     freedoms = 2 * COUNT - 3 * poses_free
-    np.testing.assert_allclose((of["position"] ** 2).sum(), freedoms * POSITION_SD**2)
+    np.testing.assert_allclose((of["position"] ** 2).sum(), freedoms * PRIOR.position_sd**2)
     assert np.linalg.matrix_rank(of["position"]) == freedoms
 
 
@@ -157,17 +148,17 @@ def test_with_free_poses_no_mode_is_a_motion_of_the_robot():
     """Sensors anywhere: what all do together is no change of the ring."""
     place = np.random.default_rng(2).uniform(-0.5, 0.5, (7, 2))
     ring = Ring(place, np.zeros(7), beam=1.0, neighbors=1, max_range=2.0)
-    columns = ring_modes(ring, ("position",), poses_free=True, speed_sd=0.01).columns[8:]
+    columns = parameter_basis(ring, ("position",), poses_free=True, speed_sd=0.01).columns[8:]
     around = np.stack([-place[:, 1], place[:, 0]], axis=1)
     for motion in (np.tile([1.0, 0.0], (7, 1)), np.tile([0.0, 1.0], (7, 1)), around):
         np.testing.assert_allclose(motion.ravel() @ columns, 0, atol=1e-15)
     # What is no motion stays: the projector is one.
-    np.testing.assert_allclose(columns @ columns, POSITION_SD * columns, atol=1e-17)
+    np.testing.assert_allclose(columns @ columns, PRIOR.position_sd * columns, atol=1e-17)
 
 
 @pytest.mark.slow
 def test_modes_that_are_held_leave_the_shape(nominal):
-    modes = ring_modes(nominal, ("offset", "speed"), poses_free=False, speed_sd=0.01)
+    modes = parameter_basis(nominal, ("offset", "speed"), poses_free=False, speed_sd=0.01)
     held = modes.only("offset")
     assert held.columns.shape == modes.columns.shape
     np.testing.assert_array_equal(held.columns[:, :COUNT], modes.columns[:, :COUNT])
@@ -177,12 +168,12 @@ def test_modes_that_are_held_leave_the_shape(nominal):
 @pytest.mark.slow
 def test_what_cannot_be_free_is_refused(nominal):
     with pytest.raises(SonarError, match="free 'temper'; allowed are offset, speed, position, radius, heading"):
-        check_free(("offset", "temper"))
+        check_parameters(("offset", "temper"))
     with pytest.raises(SonarError, match="nothing came"):
-        check_free(())
+        check_parameters(())
     lone = Ring(np.zeros((2, 2)), [0.0, 1.0], beam=1.0, neighbors=1, max_range=2.0)
     with pytest.raises(SonarError, match="all sensors are in one place"):
-        ring_modes(lone, ("radius",), poses_free=False, speed_sd=0.01)
+        parameter_basis(lone, ("radius",), poses_free=False, speed_sd=0.01)
 
 
 # Offsets and speed
@@ -270,10 +261,10 @@ def test_a_thermometer_is_one_more_measurement(nominal, speed):
     told = calibrate(nominal, log, free=("speed",), temperature=temperature)
     logs = [np.log(float(speed)) for speed in (free.ring.speed_of_sound, nominal.speed_of_sound)]
     weight = (free.ring.speed_of_sound / free.speed_of_sound_sd) ** 2
-    by_data = weight - SPEED_SD**-2
-    value = (weight * logs[0] - SPEED_SD**-2 * logs[1]) / by_data
-    both = by_data + THERMOMETER_SD**-2
-    expected = (by_data * value + THERMOMETER_SD**-2 * np.log(speed_of_sound(temperature))) / both
+    by_data = weight - PRIOR.speed_sd**-2
+    value = (weight * logs[0] - PRIOR.speed_sd**-2 * logs[1]) / by_data
+    both = by_data + PRIOR.measured_speed_sd**-2
+    expected = (by_data * value + PRIOR.measured_speed_sd**-2 * np.log(speed_of_sound(temperature))) / both
     sd = told.speed_of_sound_sd / float(told.ring.speed_of_sound)
     assert sd == pytest.approx(both**-0.5, rel=0.05)
     assert abs(np.log(float(told.ring.speed_of_sound)) - expected) < 0.3 * sd

@@ -27,7 +27,6 @@ from jaxsonar import (
     simulate,
 )
 from jaxsonar.cli import app as cli
-from jaxsonar.detection import ml_detector as method_ml
 from jaxsonar.detection.local_map import KIND_NAMES
 from jaxsonar.detection.settings import SETTINGS
 from jaxsonar.sensors.ring_toml import load_ring
@@ -345,4 +344,4 @@ def test_a_wrong_argument_is_one_line_and_exit_code_2(tmp_path, capsys, options,
 def test_kinds_have_the_names_of_the_kernels_numbers():
     assert [KIND_NAMES[kind] for kind in (kernels.PLANE, kernels.CORNER, kernels.EDGE)] == ["plane", "corner", "edge"]
     assert HoughSettings().rho_cells == 100
-    assert method_ml.DECIDED > 0.5
+    assert SETTINGS.min_probability > 0.5
