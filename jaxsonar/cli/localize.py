@@ -57,8 +57,8 @@ def run(options: argparse.Namespace) -> int:
             )
     except SonarError as error:
         raise SonarError(f"{shown(options.log)}: {error}") from None
-    if not found.certain:
-        print_status(found.why)
+    if not found.is_certain:
+        print_status(found.reason)
         return 1
     trajectory = found.trajectory
     figure = None
@@ -75,10 +75,10 @@ def run(options: argparse.Namespace) -> int:
         from jaxsonar.reports import plot_style as figures
 
         figures.save(figure, options.figure)
-    print_status(found.why)
+    print_status(found.reason)
     if len(trajectory) < len(log):
         print_status(
-            f"{len(log) - len(trajectory)} of {count(len(log), 'scan')} could not be laid on the others: no pose"
+            f"{len(log) - len(trajectory)} of {count(len(log), 'scan')} could not be registered to the others: no pose"
         )
     return 0
 

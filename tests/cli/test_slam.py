@@ -121,7 +121,7 @@ def test_localize_in_a_map(here, capsys):
         assert call("localize", "log.csv", "--ring", "faw", *files, *more) == 0
         found = load_trajectory(here / "where.tum")
         np.testing.assert_allclose(found.poses, truth()[:COUNT], atol=0.06)  # some scans see no wall across the way
-        assert "the first one at" in capsys.readouterr().err
+        assert "the first is at" in capsys.readouterr().err
     assert (here / "where.svg").exists()
 
 

@@ -45,7 +45,7 @@ def off(found: Localized, truth):
 
 def assert_there(found, truth):
     """As near as the covariance says, and near."""
-    assert found.certain, found.why
+    assert found.is_certain, found.reason
     apart = off(found, truth)
     assert np.hypot(apart[:, 0], apart[:, 1]).max() < 0.02
     assert np.abs(apart[:, 2]).max() < np.radians(1.5)
@@ -86,15 +86,15 @@ def test_rooms_that_look_alike_from_both_ends():
     poses = np.array([[0.8 + 0.12 * k, 0.7 + 0.03 * k, 0.2 + 0.05 * k] for k in range(5)])
     given = simulate(RING, Room(walls), poses, sigma=SIGMA, seed=2).as_log(RING, poses)
     found = localize(RING, world_of(walls), given, sigma=SIGMA)
-    assert not found.certain
-    assert "ambiguous" in found.why
+    assert not found.is_certain
+    assert "ambiguous" in found.reason
     assert np.isnan(found.poses).all()
     assert not len(found.trajectory)
     other = np.array([3.0, 2.0, 0.0]) - poses[0] * [1, 1, -1] + [0, 0, np.pi]
-    for place, truth in zip(sorted(found.places[:2], key=lambda one: one.pose[0]), (poses[0], other), strict=True):
+    for place, truth in zip(sorted(found.hypotheses[:2], key=lambda one: one.pose[0]), (poses[0], other), strict=True):
         np.testing.assert_allclose(place.pose[:2], truth[:2], atol=0.01)
         assert abs(wrap_angle(float(place.pose[2] - truth[2]))) < np.radians(1)
-    assert all(f"{place.pose[0]:.2f}, {place.pose[1]:.2f} m" in found.why for place in found.places[:2])
+    assert all(f"{place.pose[0]:.2f}, {place.pose[1]:.2f} m" in found.reason for place in found.hypotheses[:2])
     # A rough pose says which.
     assert_there(localize(RING, world_of(walls), given, start=[0.9, 0.6, 0.1], sigma=SIGMA), poses)
 
@@ -104,7 +104,7 @@ def test_corners_of_a_floor_plan_are_heard_too(world):
     truth = office().poses[8:9]
     found = localize(RING, world, log()[8:9], start=(truth[0] + [0.2, -0.1, 0.1]).tolist(), sigma=SIGMA)
     assert_there(found, truth)
-    assert found.places[0].explained > 0.6
+    assert found.hypotheses[0].explained > 0.6
 
 
 @pytest.mark.slow
@@ -113,8 +113,8 @@ def test_another_place_is_not_in_the_map(world):
     poses = np.array([[0.8, 0.8, 0.1 * k] for k in range(4)])
     given = simulate(RING, Room(walls), poses, sigma=SIGMA, seed=2).as_log(RING, poses)
     found = localize(RING, world, given, sigma=SIGMA)
-    assert not found.certain
-    assert "no place" in found.why or "ambiguous" in found.why
+    assert not found.is_certain
+    assert "no place" in found.reason or "ambiguous" in found.reason
 
 
 def test_bad_calls(world):

@@ -1,0 +1,129 @@
+"""A known map as landmarks with covariances: for the EKF update around a pose, and as features for pose hypotheses."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxsonar import kernels
+from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
+from jaxsonar.localization.settings import SETTINGS
+from jaxsonar.mapping.global_map import GlobalMap
+from jaxsonar.registration.features import Features
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMap:
+    """Landmarks of a known map. A wall may be seen from both of its sides."""
+
+    landmarks: kernels.Landmarks
+    """Walls are anchored in their middle."""
+    covariance: Float[np.ndarray, "landmarks 2 2"]
+    """Of the parameters of each landmark."""
+
+    @classmethod
+    def of(cls, world: GlobalMap) -> "KnownMap":
+        """Landmarks of a map; a map without points, such as a floor plan, gets corners where its walls meet."""
+        middle, half = world.segments.mean(axis=1), world.length / 2
+        wall_covariance = _wall_covariances(world, middle)
+        points = world.points
+        point_covariance = np.where(
+            np.isfinite(world.point_cov), world.point_cov, np.eye(2) * SETTINGS.default_map_sd[0] ** 2
+        )
+        kinds = [kernels.CORNER if kind == "corner" else kernels.EDGE for kind in world.point_kinds]
+        if not kinds:
+            points, point_covariance = _wall_corners(world, middle, wall_covariance)
+            kinds = [kernels.CORNER] * len(points)
+        zeros = np.zeros((len(kinds), 2))
+        landmarks = kernels.Landmarks(
+            kind=np.array([kernels.PLANE] * len(world) + kinds, dtype=np.int32),
+            parameters=np.concatenate([np.stack([np.zeros(len(world)), world.theta], axis=-1), zeros]),
+            anchor=np.concatenate([middle, points]),
+            extent=np.concatenate([half[:, None] * [-1.0, 1.0], zeros]),
+        )
+        return cls(landmarks, np.concatenate([wall_covariance, point_covariance]))
+
+    @property
+    def is_wall(self) -> Bool[np.ndarray, " landmarks"]:
+        """Which landmarks are walls."""
+        return np.asarray(self.landmarks.kind) == kernels.PLANE
+
+    def belief_at(
+        self, pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"], max_range: float
+    ) -> kernels.Belief:
+        """Joint belief of a pose and the landmarks that may be detected from it; normals point away from the robot.
+
+        Args:
+            pose: world_from_robot, metres and radians.
+            covariance: its covariance.
+            max_range: range of the sensors, metres.
+        """
+        anchor, theta = np.asarray(self.landmarks.anchor), np.asarray(self.landmarks.parameters)[:, 1]
+        half, wall = np.asarray(self.landmarks.extent)[:, 1], self.is_wall
+        offset = anchor - pose[:2]
+        along, across = (offset * tangent_of(theta)).sum(axis=-1), (offset * unit(theta)).sum(axis=-1)
+        beyond = np.maximum(np.abs(along) - half, 0.0)
+        distance = np.where(wall, np.hypot(across, beyond), np.linalg.norm(offset, axis=-1))
+        uncertainty = 3 * np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+        in_reach = distance < max_range + uncertainty
+        rows = np.flatnonzero(in_reach & (~wall | (beyond < SETTINGS.wall_extension + uncertainty)))
+        rows = rows[np.argsort(distance[rows], kind="stable")][: SETTINGS.max_landmarks]
+        facing = np.where(wall, wrap_angle(theta + np.pi * ((across < 0) & wall)), 0.0)[rows]
+        joint = np.zeros((3 + 2 * len(rows), 3 + 2 * len(rows)))
+        joint[:3, :3] = covariance
+        for k, row in enumerate(rows):
+            joint[3 + 2 * k : 5 + 2 * k, 3 + 2 * k : 5 + 2 * k] = self.covariance[row]
+        parameters = np.stack([np.zeros(len(rows)), facing], axis=-1)
+        return kernels.Belief(pose, self.landmarks.take(rows).with_parameters(parameters), joint)
+
+    @cached_property
+    def features(self) -> Features:
+        """Walls, each from both of its sides, and points."""
+        wall, kind = self.is_wall, np.asarray(self.landmarks.kind)
+        anchor, theta = np.asarray(self.landmarks.anchor), np.asarray(self.landmarks.parameters)[wall, 1]
+        count = 2 * int(wall.sum())
+        return Features(
+            reference=np.tile(anchor[wall], (2, 1)),
+            theta=np.concatenate([theta, wrap_angle(theta + np.pi)]),
+            offset=np.zeros(count),
+            covariance=np.tile(self.covariance[wall], (2, 1, 1)),
+            extent=np.tile(np.asarray(self.landmarks.extent)[wall], (2, 1)),
+            weight=np.ones(count),
+            scans=np.full(count, SETTINGS.wall_scans),
+            point=anchor[~wall],
+            is_corner=kind[~wall] == kernels.CORNER,
+            point_sd=np.sqrt(np.trace(self.covariance[~wall], axis1=1, axis2=2) / 2),
+        )
+
+
+def _wall_covariances(world: GlobalMap, middle: Float[np.ndarray, "walls 2"]) -> Float[np.ndarray, "walls 2 2"]:
+    """Covariances of (distance at the middle, theta): that distance is better known than that from the origin."""
+    arm = (middle * tangent_of(world.theta)).sum(axis=-1)
+    (default_across, default_turn), (min_across, min_turn) = SETTINGS.default_map_sd, SETTINGS.min_map_sd
+    turn = np.where(np.isfinite(world.sigma_theta), world.sigma_theta, default_turn)
+    across = np.where(np.isfinite(world.sigma_rho), world.sigma_rho**2 - (arm * turn) ** 2, default_across**2)
+    # Echoes along the wall determine both: a smaller difference is a rounding error.
+    across = np.maximum(across, (world.length / 2 * turn) ** 2 / 12)
+    covariance = np.zeros((len(world), 2, 2))
+    covariance[:, 0, 0] = np.maximum(across, min_across**2)
+    covariance[:, 1, 1] = np.maximum(turn, min_turn) ** 2
+    return covariance
+
+
+def _wall_corners(
+    world: GlobalMap, middle: Float[np.ndarray, "walls 2"], wall_covariance: Float[np.ndarray, "walls 2 2"]
+) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 2"]]:
+    """Points where walls meet at right angles, and their covariances."""
+    gap = np.linalg.norm(world.segments[:, None, :, None] - world.segments[None, :, None], axis=-1).min(axis=(2, 3))
+    right_angle = np.abs(np.cos(world.theta[:, None] - world.theta)) < np.sin(SETTINGS.corner_angle)
+    points, covariances = [], []
+    for pair in np.argwhere(np.triu((gap < SETTINGS.corner_gap) & right_angle, 1)):
+        normal = unit(world.theta[pair])
+        point = np.linalg.solve(normal, (normal * middle[pair]).sum(-1))
+        along = ((point - middle[pair]) * tangent_of(world.theta[pair])).sum(-1)
+        across = wall_covariance[pair, 0, 0] + along**2 * wall_covariance[pair, 1, 1]
+        inverse = np.linalg.inv(normal)
+        points.append(point)
+        covariances.append(inverse @ np.diag(across) @ inverse.T)
+    return np.array(points).reshape(-1, 2), np.array(covariances).reshape(-1, 2, 2)
