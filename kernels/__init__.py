@@ -21,7 +21,9 @@ from .bundle_adjustment import residuals as residuals
 from .data_association import Association as Association
 from .data_association import CandidateReflections as CandidateReflections
 from .data_association import associate as associate
+from .detection_settings import DetectionSettings as DetectionSettings
 from .geometry import fold_line as fold_line
+from .geometry import segment_endpoints as segment_endpoints
 from .geometry import normal as normal
 from .geometry import tangent as tangent
 from .geometry import wrap_angle as wrap_angle
@@ -32,7 +34,6 @@ from .hough_accumulator import full_wall_votes as full_wall_votes
 from .hough_accumulator import lowpass as lowpass
 from .hough_accumulator import soft_accumulate as soft_accumulate
 from .hough_accumulator import theta_row as theta_row
-from .hough_merging import vote_lines as vote_lines
 from .hough_voting import PIECE as PIECE
 from .hough_voting import Echoes as Echoes
 from .hough_voting import RingArcs as RingArcs
@@ -43,6 +44,7 @@ from .hough_voting import moved_arcs as moved_arcs
 from .hough_voting import points_of_widest_arc as points_of_widest_arc
 from .hough_voting import ring_arcs as ring_arcs
 from .hough_voting import vote as vote
+from .hough_voting import vote_lines as vote_lines
 from .isorange_arcs import Arc as Arc
 from .isorange_arcs import arc as arc
 from .isorange_arcs import arc_point as arc_point
@@ -57,7 +59,6 @@ from .landmarks import Landmarks as Landmarks
 from .landmarks import Reflection as Reflection
 from .landmarks import landmark_in_robot_frame as landmark_in_robot_frame
 from .landmarks import predict_reflection as predict_reflection
-from .line_extent import segment_endpoints as segment_endpoints
 from .measurement_model import CORNER as CORNER
 from .measurement_model import EDGE as EDGE
 from .measurement_model import PLANE as PLANE
@@ -68,8 +69,7 @@ from .measurement_model import edge_range as edge_range
 from .measurement_model import expected_range as expected_range
 from .measurement_model import plane_range as plane_range
 from .measurement_model import reported_range as reported_range
-from .ml_detection import Expectations as Expectations
-from .ml_detection import Explanation as Explanation
-from .ml_detection import explain as explain
+from .ml_detection import Detections as Detections
+from .ml_detection import detect_ml as detect_ml
 from .robust_fit import CandidateFits as CandidateFits
 from .robust_fit import fit_candidates as fit_candidates

@@ -5,10 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .geometry import normal, tangent, wrap_angle
-
-WIDER = 1.2
-"""By so much the cones are taken to be wider where echoes are laid to reflectors."""
+from .geometry import normal, rotate, wrap_angle
 
 
 class Sensors(eqx.Module):
@@ -56,26 +53,21 @@ def chord_squared(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     return 4 * jnp.sin(jnp.minimum(angle, jnp.pi) / 2) ** 2
 
 
-def widened(paths: EchoPaths, factor: float) -> EchoPaths:
+def widen_cones(paths: EchoPaths, factor: float) -> EchoPaths:
     """The same paths with wider cones, half a plane at most: for sensors that look elsewhere than they should."""
     half_beam = jnp.minimum(factor * 2 * jnp.arcsin(jnp.sqrt(paths.cone) / 2), jnp.pi / 2)
     return eqx.tree_at(lambda p: p.cone, paths, chord_squared(half_beam))
 
 
-def moved_path(path: EchoPaths, pose: Float[Array, "3"]) -> EchoPaths:
+def transform_path(path: EchoPaths, pose: Float[Array, "3"]) -> EchoPaths:
     """ONE echo path as seen from a frame in which the robot stands at the pose: x, y (metres), theta (radians)."""
-    along, across = normal(pose[2]), tangent(pose[2])
-
-    def turned(vector: Float[Array, "*any 2"]) -> Float[Array, "*any 2"]:
-        return vector[..., :1] * along + vector[..., 1:] * across
-
     return EchoPaths(
-        midpoint=pose[:2] + turned(path.midpoint),
-        half_baseline=turned(path.half_baseline),
+        midpoint=pose[:2] + rotate(path.midpoint, pose[2]),
+        half_baseline=rotate(path.half_baseline, pose[2]),
         start=path.start + pose[2],
         width=path.width,
         range_offset=path.range_offset,
-        axes=jax.vmap(turned)(path.axes),
+        axes=jax.vmap(rotate, in_axes=(0, None))(path.axes, pose[2]),
         cone=path.cone,
     )
 

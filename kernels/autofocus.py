@@ -18,6 +18,7 @@ from . import isorange_arcs as arcs
 from .array_geometry import Sensors, echo_paths
 from .hough_accumulator import HoughSettings
 from .hough_voting import Echoes
+from .measurement_model import corrected_range
 
 BLUR_REACH = 6
 """Cells on each side that the low pass along rho takes in: three standard deviations of two cells."""
@@ -25,7 +26,7 @@ _NORM = 4  # of the occupancies along an arc: near their maximum, yet smooth
 _LEAST = 1e-12  # keeps the logarithm finite where all lines of an echo lie beyond the accumulator
 
 
-def sharpness(occupancy: Float[Array, "echoes points"], counts: Bool[Array, "echoes points"]) -> Float[Array, ""]:
+def focus_measure(occupancy: Float[Array, "echoes points"], counts: Bool[Array, "echoes points"]) -> Float[Array, ""]:
     """Sum over echoes of the logarithm of the 4-norm of the occupancies that each finds along its arc.
 
     Args:
@@ -76,7 +77,7 @@ def lines_of_echoes(
     def one_echo(path: Int[Array, ""], reported: Float[Array, ""], pose: Float[Array, "3"] | None):
         arc: arcs.Arc = jax.tree.map(lambda leaf: leaf[path], arcs_of_paths)
         offset = paths.range_offset[path]
-        reach = arcs.corrected_range(reported, range_offset=offset, range_scale=sensors.range_scale)
+        reach = corrected_range(reported, range_offset=offset, range_scale=sensors.range_scale)
         rho, counts = arcs.tangent_rho(arc, reach, max_range=sensors.max_range)
         theta = arc.theta
         if pose is not None:  # rho + n . (x, y), with the place turned into the robot frame instead of every normal
@@ -91,7 +92,7 @@ def lines_of_echoes(
 
 
 @partial(jax.jit, static_argnames=("settings", "points"))
-def ring_sharpness(
+def ring_focus_measure(
     sensors: Sensors, echoes: Echoes, width: Float[Array, ""], *, settings: HoughSettings, points: int
 ) -> Float[Array, ""]:
     """How well the echoes agree on where walls are, in nats: the sum over echoes, one accumulator a row.
@@ -113,6 +114,6 @@ def ring_sharpness(
         vote = partial(hough.soft_accumulate, rho, theta, settings=settings)
         votes, read = jax.vjp(vote, counts.astype(rho.dtype))
         (occupancy,) = read(blurred(votes, width, settings))  # reading between cells is the transpose of voting
-        return sharpness(occupancy, counts)
+        return focus_measure(occupancy, counts)
 
     return jax.lax.map(one_row, echoes).sum()

@@ -6,29 +6,34 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .array_geometry import Sensors, echo_paths
-from .data_association import Candidates
-from .landmarks import Scene, audible, take
+from .data_association import CandidateReflections
+from .geometry import signed_angle
+from .landmarks import Landmarks, predict_reflection
 
 _CENTRE_SD = 0.2  # rad; what is expected of the directions of sensors
 _BORDER = (0.1, 0.3)  # rad and relative; how wide the border of a cone is, without which few sightings make it a cliff
 
 
-class Beams(eqx.Module):
+class BeamPattern(eqx.Module):
     """Detection cones as their echoes show them."""
 
     centre: Float[Array, " sensors"]
     """How far each sensor looks to the left of its heading, radians."""
-    half: Float[Array, ""]
+    half_width: Float[Array, ""]
     """Off-axis angle at which half of the echoes are heard that are heard on the axis, radians."""
-    softness: Float[Array, ""]
+    log_rolloff_width: Float[Array, ""]
     """Logarithm of the width of that border, radians."""
-    share: Float[Array, ""]
+    detection_log_odds: Float[Array, ""]
     """Log odds that an echo on the axis is heard."""
 
 
 @jax.jit
 def off_axis_angles(
-    sensors: Sensors, scene: Scene, candidates: Candidates, poses: Float[Array, "scans 3"], world: Int[Array, " scans"]
+    sensors: Sensors,
+    scene: Landmarks,
+    candidates: CandidateReflections,
+    poses: Float[Array, "scans 3"],
+    world: Int[Array, " scans"],
 ) -> Float[Array, "scans candidates sensors"]:
     """Direction from which every sensor's own echo of every candidate would arrive, from its heading, radians.
 
@@ -40,20 +45,20 @@ def off_axis_angles(
     wide = eqx.tree_at(lambda p: p.cone, paths, jnp.full_like(paths.cone, 2))  # half the plane
 
     def one(pose, here, reflection, own, first, second, path):
-        reach, share, arrival = audible(pose, reflection, first, second, path)
+        reach, share, arrival = predict_reflection(pose, reflection, first, second, path)
         axis = path.axes[0]
-        angle = jnp.arctan2(axis[0] * arrival[1] - axis[1] * arrival[0], axis @ arrival)
+        angle = signed_angle(axis, arrival)
         return jnp.where((share > 0) & (reach < sensors.max_range) & (here == own), angle, jnp.nan)
 
-    first, second = take(scene, candidates.reflection.first), take(scene, candidates.reflection.second)
+    first, second = scene.take(candidates.reflection.first), scene.take(candidates.reflection.second)
     each = jax.vmap(one, in_axes=(None, None, None, None, None, None, 0))
     each = jax.vmap(each, in_axes=(None, None, 0, 0, 0, 0, None))
     each = jax.vmap(each, in_axes=(0, 0, None, None, None, None, None))
     return each(poses, world, candidates.reflection, candidates.world, first, second, wide)
 
 
-def beam_misfit(
-    beams: Beams,
+def beam_negative_log_likelihood(
+    beams: BeamPattern,
     sensor: Int[Array, " sightings"],
     angle: Float[Array, " sightings"],
     heard: Bool[Array, " sightings"],
@@ -68,10 +73,10 @@ def beam_misfit(
         heard: whether it did.
         counts: False for padding.
     """
-    inside = (beams.half - jnp.abs(angle - beams.centre[sensor])) / jnp.exp(beams.softness)
-    log_heard = jax.nn.log_sigmoid(beams.share) + jax.nn.log_sigmoid(inside)
+    inside = (beams.half_width - jnp.abs(angle - beams.centre[sensor])) / jnp.exp(beams.log_rolloff_width)
+    log_heard = jax.nn.log_sigmoid(beams.detection_log_odds) + jax.nn.log_sigmoid(inside)
     log_not = jnp.log1p(-jnp.exp(jnp.minimum(log_heard, -1e-6)))
     log_likelihood = jnp.where(counts, jnp.where(heard, log_heard, log_not), 0).sum()
     width, spread = _BORDER
-    expected = (beams.centre**2).sum() / _CENTRE_SD**2 + ((beams.softness - jnp.log(width)) / spread) ** 2
+    expected = (beams.centre**2).sum() / _CENTRE_SD**2 + ((beams.log_rolloff_width - jnp.log(width)) / spread) ** 2
     return 0.5 * expected - log_likelihood

@@ -19,13 +19,14 @@ from jaxtyping import Array, Float, Int
 from .array_geometry import Sensors
 from .block_arrowhead import Arrow, covariances, eliminated, solved
 from .geometry import normal, tangent, wrap_angle
-from .landmarks import Reflection, Scene, expected_range, expected_report, seen_from, take
+from .landmarks import Landmarks, Reflection, landmark_in_robot_frame
+from .measurement_model import expected_range, reported_range
 
 _DAMPING = (1e-6, 1e-12, 1e8)  # relative to the diagonal: first, least, most
 _ENOUGH = 1e-9  # relative decrease of the cost at which it ends
 
 
-class Heard(eqx.Module):
+class EchoFactors(eqx.Module):
     """Echoes that come from known reflectors, scan by scan; rectangular, so what is missing has weight 0."""
 
     path: Int[Array, "*scans echoes"]
@@ -41,53 +42,53 @@ class Heard(eqx.Module):
 class Unknowns(eqx.Module):
     """What is estimated."""
 
-    modes: Float[Array, " modes"]
+    coordinates: Float[Array, " coordinates"]
     """Of the ring, in standard deviations of what is expected of them."""
     poses: Float[Array, "scans 3"]
     """world_from_robot: x, y (metres), theta (radians)."""
-    scene: Float[Array, "reflectors 2"]
+    landmarks: Float[Array, "reflectors 2"]
     """``Scene.parameters``."""
 
 
-class Problem(eqx.Module):
+class LeastSquaresProblem(eqx.Module):
     """What is given."""
 
     sensors: Sensors
     """The ring to start from."""
-    modes: Float[Array, "ring modes"]
+    basis: Float[Array, "ring modes"]
     """Columns: change of offsets (sensors), logarithm of the speed of sound, positions (sensors x 2); metres. With two
     rows more the logarithms of how much too long the odometry's ways are, and too far its turns."""
-    scene: Scene
+    landmarks: Landmarks
     """The reflectors to start from."""
-    heard: Heard
+    factors: EchoFactors
     """The echoes."""
-    poses: Float[Array, "scans 3"]
+    prior_poses: Float[Array, "scans 3"]
     """The poses to start from."""
-    anchored: Float[Array, "scans 3"]
+    prior_information: Float[Array, "scans 3"]
     """Inverse variance of each start pose, 1 / square metres and radians."""
     odometry: Float[Array, "scans 3"]
     """The next pose in the frame of each one; the last is not used."""
-    linked: Float[Array, "scans 3"]
+    odometry_information: Float[Array, "scans 3"]
     """Inverse variance of the odometry; 0 where there is none, and for the last one."""
-    reach: float = eqx.field(default=1.0, static=True)
+    landmark_prior_sd: float = eqx.field(default=1.0, static=True)
     """Metres, radians; how far a reflector may lie from its start (one standard deviation): none is undetermined."""
 
 
-class Adjusted(eqx.Module):
+class LeastSquaresSolution(eqx.Module):
     """The result, and how well it is known."""
 
     unknowns: Unknowns
     cost: Float[Array, ""]
     """Half the weighted sum of squares, priors included."""
-    before: Float[Array, ""]
+    initial_cost: Float[Array, ""]
     """The same at the start."""
     covariance: Float[Array, "shared shared"]
     """Of modes and scene parameters, poses accounted for; (0, 0) where it was not asked for."""
-    steps: Int[Array, ""]
+    iterations: Int[Array, ""]
     """Steps taken."""
 
 
-def moved_sensors(sensors: Sensors, change: Float[Array, " ring"]) -> Sensors:
+def apply_parameters(sensors: Sensors, change: Float[Array, " ring"]) -> Sensors:
     """The ring after a change of (offsets, logarithm of the speed of sound, positions), as columns of modes are.
 
     What may follow in such a column is of the odometry, not of the ring.
@@ -106,38 +107,40 @@ def moved_sensors(sensors: Sensors, change: Float[Array, " ring"]) -> Sensors:
 
 
 @jax.jit
-def residuals(problem: Problem, unknowns: Unknowns) -> Float[Array, "scans echoes"]:
+def residuals(problem: LeastSquaresProblem, unknowns: Unknowns) -> Float[Array, "scans echoes"]:
     """Reported minus expected range of every echo, metres; differentiable in the unknowns.
 
     Echoes of weight 0 have a residual, too; it means nothing.
     """
-    sensors = moved_sensors(problem.sensors, problem.modes @ unknowns.modes)
-    scene = _at(problem.scene, unknowns.scene)
+    sensors = apply_parameters(problem.sensors, problem.basis @ unknowns.coordinates)
+    scene = _at(problem.landmarks, unknowns.landmarks)
 
     def one(path, reported, reflection, pose):
-        local, reflectors = _locally(sensors, scene, path, reflection, pose)
-        return reported - _report(local, reflectors, reflection.kind)
+        local, reflectors = echo_geometry(sensors, scene, path, reflection, pose)
+        return reported - predicted_report(local, reflectors, reflection.kind)
 
     each_echo = jax.vmap(one, in_axes=(0, 0, 0, None))
-    heard = problem.heard
+    heard = problem.factors
     return jax.vmap(each_echo)(heard.path, heard.reported, heard.reflection, unknowns.poses)
 
 
 @jax.jit
-def cost(problem: Problem, unknowns: Unknowns) -> Float[Array, ""]:
+def cost(problem: LeastSquaresProblem, unknowns: Unknowns) -> Float[Array, ""]:
     """Half the weighted sum of squares of the residuals and of what was expected of modes, poses and reflectors."""
-    total = (problem.heard.weight * residuals(problem, unknowns) ** 2).sum() + (unknowns.modes**2).sum()
-    total += (((unknowns.scene - problem.scene.parameters) / problem.reach) ** 2).sum()
-    total += (problem.anchored * _pose_difference(unknowns.poses, problem.poses) ** 2).sum()
-    if len(problem.poses) > 1:
+    total = (problem.factors.weight * residuals(problem, unknowns) ** 2).sum() + (unknowns.coordinates**2).sum()
+    total += (((unknowns.landmarks - problem.landmarks.parameters) / problem.landmark_prior_sd) ** 2).sum()
+    total += (problem.prior_information * _pose_difference(unknowns.poses, problem.prior_poses) ** 2).sum()
+    if len(problem.prior_poses) > 1:
         steps = (unknowns.poses[:-1], unknowns.poses[1:], problem.odometry[:-1])
-        slips = jax.vmap(_slip, in_axes=(0, 0, 0, None))(*steps, _odometry_scale(problem, unknowns))
-        total += (problem.linked[:-1] * slips**2).sum()
+        slips = jax.vmap(odometry_residual, in_axes=(0, 0, 0, None))(*steps, _odometry_scale(problem, unknowns))
+        total += (problem.odometry_information[:-1] * slips**2).sum()
     return total / 2
 
 
 @partial(jax.jit, static_argnames=("poses_free", "most"))
-def adjust(problem: Problem, unknowns: Unknowns, *, poses_free: bool, most: int = 20) -> Adjusted:
+def adjust(
+    problem: LeastSquaresProblem, unknowns: Unknowns, *, poses_free: bool, most: int = 20
+) -> LeastSquaresSolution:
     """Least squares on the ranges, from a start within the basin.
 
     Args:
@@ -165,28 +168,30 @@ def adjust(problem: Problem, unknowns: Unknowns, *, poses_free: bool, most: int 
     start = (unknowns, before, jnp.asarray(_DAMPING[0], before.dtype), jnp.asarray(0), jnp.asarray(False))
     found, value, _, count, _ = jax.lax.while_loop(lambda state: (state[3] < most) & ~state[4], step, start)
     known = eliminated(_linearised(problem, found, poses_free), jnp.zeros_like(value)).shared
-    return Adjusted(found, value, before, jnp.linalg.inv(known), count)
+    return LeastSquaresSolution(found, value, before, jnp.linalg.inv(known), count)
 
 
-class Slopes(eqx.Module):
+class Jacobians(eqx.Module):
     """The problem taken apart at a point: what is left of every term, and how the expected report or slip grows."""
 
-    left: Float[Array, " echoes"]
+    residual: Float[Array, " echoes"]
     """Reported minus expected range, metres."""
-    by_modes: Float[Array, "echoes modes"]
-    by_pose: Float[Array, "echoes 3"]
-    by_first: Float[Array, "echoes 2"]
-    by_second: Float[Array, "echoes 2"]
+    d_range_d_coordinates: Float[Array, "echoes modes"]
+    d_range_d_pose: Float[Array, "echoes 3"]
+    d_range_d_first: Float[Array, "echoes 2"]
+    d_range_d_second: Float[Array, "echoes 2"]
     """0 but for wall to wall."""
-    slip: Float[Array, "steps 3"]
+    odometry_residual: Float[Array, "steps 3"]
     """How far every pose is from where the odometry has it, seen from the one before: metres and radians."""
-    slip_by_here: Float[Array, "steps 3 3"]
-    slip_by_there: Float[Array, "steps 3 3"]
-    slip_by_modes: Float[Array, "steps 3 modes"]
+    d_odometry_d_from: Float[Array, "steps 3 3"]
+    d_odometry_d_to: Float[Array, "steps 3 3"]
+    d_odometry_d_coordinates: Float[Array, "steps 3 modes"]
 
 
 @jax.jit
-def slopes(problem: Problem, unknowns: Unknowns, scan: Int[Array, " echoes"], echo: Int[Array, " echoes"]) -> Slopes:
+def linearize(
+    problem: LeastSquaresProblem, unknowns: Unknowns, scan: Int[Array, " echoes"], echo: Int[Array, " echoes"]
+) -> Jacobians:
     """Residuals and slopes of chosen echoes, and of all odometry.
 
     Args:
@@ -195,17 +200,17 @@ def slopes(problem: Problem, unknowns: Unknowns, scan: Int[Array, " echoes"], ec
         scan: row of each of the echoes.
         echo: its column.
     """
-    sensors = moved_sensors(problem.sensors, problem.modes @ unknowns.modes)
-    scene = _at(problem.scene, unknowns.scene)
+    sensors = apply_parameters(problem.sensors, problem.basis @ unknowns.coordinates)
+    scene = _at(problem.landmarks, unknowns.landmarks)
     count = sensors.heading.shape[0]
-    heard, modes = problem.heard, problem.modes
+    heard, modes = problem.factors, problem.basis
     place = modes[count + 1 : 3 * count + 1].reshape(count, 2, -1)
 
     def one(scan, echo):
         path, reported = heard.path[scan, echo], heard.reported[scan, echo]
         reflection = jax.tree.map(lambda leaf: leaf[scan, echo], heard.reflection)
-        local, reflectors = _locally(sensors, scene, path, reflection, unknowns.poses[scan])
-        report, slope = jax.value_and_grad(_report)(local, reflectors, reflection.kind)
+        local, reflectors = echo_geometry(sensors, scene, path, reflection, unknowns.poses[scan])
+        report, slope = jax.value_and_grad(predicted_report)(local, reflectors, reflection.kind)
         tx, rx = sensors.tx[path], sensors.rx[path]
         by_modes = slope.offset / 2 * (modes[tx] + modes[rx]) + slope.speed * modes[count]
         by_modes += slope.tx @ place[tx] + slope.rx @ place[rx]
@@ -213,14 +218,14 @@ def slopes(problem: Problem, unknowns: Unknowns, scan: Int[Array, " echoes"], ec
 
     steps = (unknowns.poses[:-1], unknowns.poses[1:], problem.odometry[:-1])
     axes, scale = (0, 0, 0, None), _odometry_scale(problem, unknowns)
-    slip = jax.vmap(_slip, in_axes=axes)(*steps, scale)
-    here, there, by_scale = jax.vmap(jax.jacfwd(_slip, argnums=(0, 1, 3)), in_axes=axes)(*steps, scale)
+    slip = jax.vmap(odometry_residual, in_axes=axes)(*steps, scale)
+    here, there, by_scale = jax.vmap(jax.jacfwd(odometry_residual, argnums=(0, 1, 3)), in_axes=axes)(*steps, scale)
     by_modes = by_scale @ modes[-2:] if _has_scale(problem) else jnp.zeros((*slip.shape, modes.shape[1]), slip.dtype)
-    return Slopes(*jax.vmap(one)(scan, echo), slip, here, there, by_modes)
+    return Jacobians(*jax.vmap(one)(scan, echo), slip, here, there, by_modes)
 
 
 @jax.jit
-def pose_covariances(problem: Problem, unknowns: Unknowns) -> Float[Array, "scans 3 3"]:
+def pose_covariances(problem: LeastSquaresProblem, unknowns: Unknowns) -> Float[Array, "scans 3 3"]:
     """Of every pose (x, y, theta) by itself, at the minimum of the cost; ring and scene unknown as the problem has it.
 
     By a backward recursion over the chain of poses, O(shared^2) a scan.
@@ -229,16 +234,16 @@ def pose_covariances(problem: Problem, unknowns: Unknowns) -> Float[Array, "scan
     return poses
 
 
-def _linearised(problem: Problem, unknowns: Unknowns, poses_free: bool) -> Arrow:
+def _linearised(problem: LeastSquaresProblem, unknowns: Unknowns, poses_free: bool) -> Arrow:
     """The normal equations; shared are modes and scene parameters. No poses where they are held."""
-    sensors = moved_sensors(problem.sensors, problem.modes @ unknowns.modes)
-    scene = _at(problem.scene, unknowns.scene)
-    count, ring = sensors.heading.shape[0], problem.modes.shape[0]
+    sensors = apply_parameters(problem.sensors, problem.basis @ unknowns.coordinates)
+    scene = _at(problem.landmarks, unknowns.landmarks)
+    count, ring = sensors.heading.shape[0], problem.basis.shape[0]
     size = ring + 2 * scene.kind.shape[0]
 
     def one_echo(path, reported, reflection, weight, pose):
-        local, reflectors = _locally(sensors, scene, path, reflection, pose)
-        report, slope = jax.value_and_grad(_report)(local, reflectors, reflection.kind)
+        local, reflectors = echo_geometry(sensors, scene, path, reflection, pose)
+        report, slope = jax.value_and_grad(predicted_report)(local, reflectors, reflection.kind)
         tx, rx = sensors.tx[path], sensors.rx[path]
         pair = jnp.arange(2, dtype=tx.dtype)
         column = jnp.concatenate(
@@ -272,8 +277,8 @@ def _linearised(problem: Problem, unknowns: Unknowns, poses_free: bool) -> Arrow
         cross = jnp.zeros((size, 3), h.dtype).at[column].add(weighted[:, :, None] * turn[:, None, :])
         return total, (cross.T, pull.T @ turn, pull.T @ left)
 
-    zero = (jnp.zeros((size, size), unknowns.scene.dtype), jnp.zeros(size, unknowns.scene.dtype))
-    (h, g), own = jax.lax.scan(one_scan, zero, (problem.heard, unknowns.poses))
+    zero = (jnp.zeros((size, size), unknowns.landmarks.dtype), jnp.zeros(size, unknowns.landmarks.dtype))
+    (h, g), own = jax.lax.scan(one_scan, zero, (problem.factors, unknowns.poses))
     if own is None:
         none = jnp.zeros((0, 3, 3), h.dtype)
         arrow = Arrow(h, g, jnp.zeros((0, 3, size), h.dtype), none, none[:, 0], none)
@@ -282,35 +287,35 @@ def _linearised(problem: Problem, unknowns: Unknowns, poses_free: bool) -> Arrow
     return _along_modes(problem, unknowns, arrow)
 
 
-def _along_modes(problem: Problem, unknowns: Unknowns, arrow: Arrow) -> Arrow:
+def _along_modes(problem: LeastSquaresProblem, unknowns: Unknowns, arrow: Arrow) -> Arrow:
     """From changes of the ring to its modes, with what is expected of these and of the reflectors."""
-    modes, ring, h, g = problem.modes, problem.modes.shape[0], arrow.shared, arrow.shared_g
+    modes, ring, h, g = problem.basis, problem.basis.shape[0], arrow.shared, arrow.shared_g
     reflectors = jnp.eye(len(g) - ring, dtype=h.dtype)
     shared = jnp.block(
         [
             [modes.T @ h[:ring, :ring] @ modes + jnp.eye(modes.shape[1], dtype=h.dtype), modes.T @ h[:ring, ring:]],
-            [h[ring:, :ring] @ modes, h[ring:, ring:] + reflectors / problem.reach**2],
+            [h[ring:, :ring] @ modes, h[ring:, ring:] + reflectors / problem.landmark_prior_sd**2],
         ]
     )
-    strayed = (problem.scene.parameters - unknowns.scene).ravel() / problem.reach**2
-    shared_g = jnp.concatenate([modes.T @ g[:ring] - unknowns.modes, g[ring:] + strayed])
+    strayed = (problem.landmarks.parameters - unknowns.landmarks).ravel() / problem.landmark_prior_sd**2
+    shared_g = jnp.concatenate([modes.T @ g[:ring] - unknowns.coordinates, g[ring:] + strayed])
     cross = jnp.concatenate([arrow.cross[..., :ring] @ modes, arrow.cross[..., ring:]], axis=-1)
     return arrow._replace(shared=shared, shared_g=shared_g, cross=cross)
 
 
-def _with_links(problem: Problem, unknowns: Unknowns, arrow: Arrow) -> Arrow:
+def _with_links(problem: LeastSquaresProblem, unknowns: Unknowns, arrow: Arrow) -> Arrow:
     """The normal equations with the anchors of the poses and the odometry between them."""
-    start = problem.anchored * _pose_difference(problem.poses, unknowns.poses)
-    pose = arrow.pose + jax.vmap(jnp.diag)(problem.anchored)
+    start = problem.prior_information * _pose_difference(problem.prior_poses, unknowns.poses)
+    pose = arrow.pose + jax.vmap(jnp.diag)(problem.prior_information)
     pose_g = arrow.pose_g + start
-    if len(problem.poses) < 2:
+    if len(problem.prior_poses) < 2:
         return arrow._replace(pose=pose, pose_g=pose_g)
     scale = _odometry_scale(problem, unknowns)
     steps = (unknowns.poses[:-1], unknowns.poses[1:], problem.odometry[:-1])
-    weight = problem.linked[:-1]
-    slip = jax.vmap(_slip, in_axes=(0, 0, 0, None))(*steps, scale)
+    weight = problem.odometry_information[:-1]
+    slip = jax.vmap(odometry_residual, in_axes=(0, 0, 0, None))(*steps, scale)
     by_here, by_there, by_scale = jax.vmap(
-        jax.jacfwd(_slip, argnums=(0, 1, 3)), in_axes=(0, 0, 0, None)
+        jax.jacfwd(odometry_residual, argnums=(0, 1, 3)), in_axes=(0, 0, 0, None)
     )(*steps, scale)  # fmt: skip
     heavy_here, heavy_there = weight[:, :, None] * by_here, weight[:, :, None] * by_there
     pose = pose.at[:-1].add(_t(by_here) @ heavy_here).at[1:].add(_t(by_there) @ heavy_there)
@@ -320,7 +325,7 @@ def _with_links(problem: Problem, unknowns: Unknowns, arrow: Arrow) -> Arrow:
     arrow = arrow._replace(pose=pose, pose_g=pose_g, next=following)
     if not _has_scale(problem):
         return arrow
-    ring = problem.modes.shape[0]
+    ring = problem.basis.shape[0]
     own = slice(ring - 2, ring)
     heavy = weight[:, :, None] * by_scale
     return arrow._replace(
@@ -330,15 +335,15 @@ def _with_links(problem: Problem, unknowns: Unknowns, arrow: Arrow) -> Arrow:
     )
 
 
-def _shift(problem: Problem, arrow: Arrow, damping: Float[Array, ""]) -> Unknowns:
+def _shift(problem: LeastSquaresProblem, arrow: Arrow, damping: Float[Array, ""]) -> Unknowns:
     """The step of all unknowns."""
     shared, poses = solved(arrow, damping)
-    modes = problem.modes.shape[1]
-    held = jnp.zeros_like(problem.poses)
+    modes = problem.basis.shape[1]
+    held = jnp.zeros_like(problem.prior_poses)
     return Unknowns(shared[:modes], poses if len(arrow.pose) else held, shared[modes:].reshape(-1, 2))
 
 
-class _Local(NamedTuple):
+class EchoGeometry(NamedTuple):
     """All that ONE report depends on."""
 
     tx: Float[Array, "2"]
@@ -350,12 +355,12 @@ class _Local(NamedTuple):
     second: Float[Array, "2"]
 
 
-def _locally(
-    sensors: Sensors, scene: Scene, path: Int[Array, ""], reflection: Reflection, pose: Float[Array, "3"]
-) -> tuple[_Local, tuple[Scene, Scene]]:
+def echo_geometry(
+    sensors: Sensors, scene: Landmarks, path: Int[Array, ""], reflection: Reflection, pose: Float[Array, "3"]
+) -> tuple[EchoGeometry, tuple[Landmarks, Landmarks]]:
     tx, rx = sensors.tx[path], sensors.rx[path]
-    first, second = take(scene, reflection.first), take(scene, reflection.second)
-    local = _Local(
+    first, second = scene.take(reflection.first), scene.take(reflection.second)
+    local = EchoGeometry(
         tx=sensors.position[tx],
         rx=sensors.position[rx],
         offset=(sensors.range_offset[tx] + sensors.range_offset[rx]) / 2,
@@ -367,28 +372,30 @@ def _locally(
     return local, (first, second)
 
 
-def _report(local: _Local, reflectors: tuple[Scene, Scene], kind: Int[Array, ""]) -> Float[Array, ""]:
+def predicted_report(
+    local: EchoGeometry, reflectors: tuple[Landmarks, Landmarks], kind: Int[Array, ""]
+) -> Float[Array, ""]:
     """What the path reports, metres."""
     first, second = (
-        seen_from(local.pose, eqx.tree_at(lambda r: r.parameters, reflector, parameters))
+        landmark_in_robot_frame(local.pose, eqx.tree_at(lambda r: r.parameters, reflector, parameters))
         for reflector, parameters in zip(reflectors, (local.first, local.second), strict=True)
     )
     reach = expected_range(kind, first, second, local.tx, local.rx)
-    return expected_report(reach, range_offset=local.offset, range_scale=jnp.exp(local.speed))
+    return reported_range(reach, range_offset=local.offset, range_scale=jnp.exp(local.speed))
 
 
-def _has_scale(problem: Problem) -> bool:
-    return problem.modes.shape[0] > 3 * problem.sensors.heading.shape[0] + 1
+def _has_scale(problem: LeastSquaresProblem) -> bool:
+    return problem.basis.shape[0] > 3 * problem.sensors.heading.shape[0] + 1
 
 
-def _odometry_scale(problem: Problem, unknowns: Unknowns) -> Float[Array, "2"]:
+def _odometry_scale(problem: LeastSquaresProblem, unknowns: Unknowns) -> Float[Array, "2"]:
     """Logarithms of how much too long the odometry's ways are, and too far its turns; 0 where they are no unknowns."""
     if not _has_scale(problem):
         return jnp.zeros(2, unknowns.poses.dtype)
-    return problem.modes[-2:] @ unknowns.modes
+    return problem.basis[-2:] @ unknowns.coordinates
 
 
-def _slip(
+def odometry_residual(
     here: Float[Array, "3"], there: Float[Array, "3"], odometry: Float[Array, "3"], scale: Float[Array, "2"]
 ) -> Float[Array, "3"]:
     """How far the next pose is from where the odometry has it, in the frame of this one: metres and radians."""
@@ -403,7 +410,7 @@ def _pose_difference(a: Float[Array, "scans 3"], b: Float[Array, "scans 3"]) -> 
     return jnp.concatenate([a[:, :2] - b[:, :2], wrap_angle(a[:, 2:] - b[:, 2:])], axis=1)
 
 
-def _at(scene: Scene, parameters: Float[Array, "reflectors 2"]) -> Scene:
+def _at(scene: Landmarks, parameters: Float[Array, "reflectors 2"]) -> Landmarks:
     return eqx.tree_at(lambda s: s.parameters, scene, parameters)
 
 

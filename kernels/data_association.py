@@ -1,88 +1,91 @@
-"""Which reflector of a known scene each echo comes from."""
+"""Nearest-neighbor association of echoes with the landmarks of a map, by their ranges."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .array_geometry import WIDER, EchoPaths, Sensors, echo_paths, widened
-from .landmarks import AnyArray, Reflection, Scene, audible, expected_report, take
+from .array_geometry import EchoPaths, Sensors, echo_paths, widen_cones
+from .landmarks import AnyArray, Landmarks, Reflection, predict_reflection
+from .measurement_model import SETTINGS, reported_range
 
 
-class Candidates(eqx.Module):
-    """The reflections that may be heard in a scene."""
+class CandidateReflections(eqx.Module):
+    """The reflections that echoes may be associated with."""
 
     reflection: Reflection
-    """(candidates,) what is met."""
+    """(candidates,) kind and landmarks of each reflection; kind -1 for unused rows."""
     world: Int[AnyArray, " candidates"]
-    """Which world it stands in; -1 for padding."""
+    """The map that each reflection belongs to; -1 for unused rows."""
     group: Int[AnyArray, " candidates"]
-    """Candidates of one group do not compete: wall to wall in either order."""
+    """Candidates of one group do not compete with each other: second order reflections at two walls in either order."""
 
 
 class Association(eqx.Module):
-    """The best candidate of every echo."""
+    """The nearest candidate of every echo."""
 
     candidate: Int[Array, "scans echoes"]
-    """Row of the candidates; -1 where no reflector can be heard."""
+    """Row of the candidate; -1 where the path can receive no candidate."""
     residual: Float[Array, "scans echoes"]
     """Reported minus expected range, metres; infinite where there is no candidate."""
-    rival: Float[Array, "scans echoes"]
-    """How far the expected range of another group's candidate is from that of the best one, at least, metres; infinite
-    where there is no other. It says how doubtful the choice is without looking at the noise of the echo."""
+    competitor_gap: Float[Array, "scans echoes"]
+    """Smallest difference between the expected ranges of the nearest candidate and of a candidate of another group,
+    metres; infinite without one. It measures the ambiguity of the association independently of the echo's noise."""
 
 
 @jax.jit
 def associate(
     sensors: Sensors,
-    scene: Scene,
-    candidates: Candidates,
+    landmarks: Landmarks,
+    candidates: CandidateReflections,
     poses: Float[Array, "scans 3"],
     world: Int[Array, " scans"],
     path: Int[Array, "scans echoes"],
     reported: Float[Array, "scans echoes"],
     near: Int[Array, "scans near"],
 ) -> Association:
-    """The reflection with the range nearest to each echo's, of those that its path can hear.
+    """Associate every echo with the candidate of the nearest range that its path can receive.
 
     Args:
         sensors: the ring.
-        scene: the reflectors.
-        candidates: what may be heard of them.
+        landmarks: of all maps.
+        candidates: reflections at these landmarks.
         poses: world_from_robot of the scans, metres and radians.
-        world: which world each scan was taken in.
+        world: the map in which each scan was taken.
         path: row of the ring's ``paths`` of each echo.
         reported: half path lengths as reported, metres; NaN where there is no echo.
-        near: rows of the candidates that each scan may hear; -1 for none.
+        near: rows of the candidates that each scan may receive; -1 for unused entries.
     """
-    paths = widened(echo_paths(sensors), WIDER)
+    paths = widen_cones(echo_paths(sensors), SETTINGS.association_cone_factor)
 
     def report(pose, reflection, first, second, path: EchoPaths):
-        reach, share, _ = audible(pose, reflection, first, second, path)
-        said = expected_report(reach, range_offset=path.range_offset, range_scale=sensors.range_scale)
-        return jnp.where(share > 0, said, jnp.inf)
+        expected, weight, _ = predict_reflection(pose, reflection, first, second, path)
+        report = reported_range(expected, range_offset=path.range_offset, range_scale=sensors.range_scale)
+        return jnp.where(weight > 0, report, jnp.inf)
 
     each_path = jax.vmap(report, in_axes=(None, None, None, None, 0))
     each_candidate = jax.vmap(each_path, in_axes=(None, 0, 0, 0, None))
 
-    def one_scan(scan):
-        pose, here, path, reported, near = scan
-        own = jax.tree.map(lambda leaf: leaf[path], paths)
+    def associate_scan(scan):
+        pose, scan_world, path, reported, near = scan
+        # Expected ranges of all candidates on the path of each echo.
+        echo_path = jax.tree.map(lambda leaf: leaf[path], paths)
         reflection, world, group = jax.tree.map(
             lambda leaf: leaf[jnp.maximum(near, 0)], (candidates.reflection, candidates.world, candidates.group)
         )
-        first, second = take(scene, reflection.first), take(scene, reflection.second)
-        expected = each_candidate(pose, reflection, first, second, own)
-        expected = jnp.where(((world == here) & (near >= 0))[:, None], expected, jnp.inf)
-        off = jnp.abs(reported[None] - expected)  # (near, echoes)
-        off = jnp.where(jnp.isfinite(off), off, jnp.inf)
-        best = off.argmin(axis=0)
+        first, second = landmarks.take(reflection.first), landmarks.take(reflection.second)
+        expected = each_candidate(pose, reflection, first, second, echo_path)
+        expected = jnp.where(((world == scan_world) & (near >= 0))[:, None], expected, jnp.inf)
+        # The nearest one.
+        distance = jnp.abs(reported[None] - expected)  # (near, echoes)
+        distance = jnp.where(jnp.isfinite(distance), distance, jnp.inf)
+        best = distance.argmin(axis=0)
         nearest = jnp.take_along_axis(expected, best[None], axis=0)[0]
-        found = jnp.isfinite(off.min(axis=0))
-        residual = reported - nearest
-        other = group[:, None] != group[best][None]
-        apart = jnp.abs(expected - jnp.where(found, nearest, 0)[None])
-        rival = jnp.where(other, apart, jnp.inf).min(axis=0)
-        return jnp.where(found, near[best], -1), jnp.where(found, residual, jnp.inf), rival
+        found = jnp.isfinite(distance.min(axis=0))
+        # Its competitors.
+        competes = group[:, None] != group[best][None]
+        gap = jnp.abs(expected - jnp.where(found, nearest, 0)[None])
+        competitor_gap = jnp.where(competes, gap, jnp.inf).min(axis=0)
+        return jnp.where(found, near[best], -1), jnp.where(found, reported - nearest, jnp.inf), competitor_gap
 
-    return Association(*jax.lax.map(one_scan, (poses, world, path, reported, near)))
+    return Association(*jax.lax.map(associate_scan, (poses, world, path, reported, near)))

@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from . import hough_accumulator as hough
 from . import isorange_arcs as arcs
-from .array_geometry import EchoPaths, Sensors, echo_paths, moved_path
+from .array_geometry import EchoPaths, Sensors, echo_paths, transform_path
 from .hough_accumulator import HoughSettings
+from .measurement_model import corrected_range
 
 if TYPE_CHECKING:
     AnyArray = Array  # what kernels see
@@ -92,7 +93,7 @@ def moved_arcs(ring: RingArcs, pose: Float[Array, "paths 3"], *, settings: Hough
         pose: model_from_robot when the transmitter of each path fired: x, y (metres), theta (radians).
         settings: those of ``ring``.
     """
-    paths = jax.vmap(moved_path)(ring.paths, pose)
+    paths = jax.vmap(transform_path)(ring.paths, pose)
     points = ring.arcs.theta.shape[-1]
     arcs_of_paths = jax.vmap(partial(arcs.arc, pitch=settings.point_pitch, points=points))(paths)
     rows = hough.theta_row(arcs_of_paths.theta, settings)
@@ -122,7 +123,7 @@ def lines_of_scan(ring: RingArcs, echoes: Echoes, settings: HoughSettings) -> Ta
 
     def one_arc(arc: arcs.Arc, row: Int[Array, " points"], path: Int[Array, ""], echo: Int[Array, ""]) -> TangentLines:
         offset = ring.paths.range_offset[path]
-        reach = arcs.corrected_range(echoes.range[echo], range_offset=offset, range_scale=ring.range_scale)
+        reach = corrected_range(echoes.range[echo], range_offset=offset, range_scale=ring.range_scale)
         rho, counts = arcs.tangent_rho(arc, reach, max_range=ring.max_range)
         normal_x, normal_y = arc.normal_x, arc.normal_y
         if echoes.pose is not None:  # the line n . p = rho, seen from a frame in which the robot stands at the pose
@@ -211,3 +212,30 @@ def accumulators(
         return votes, hough.lowpass(votes, settings)
 
     return over_scans(one_scan, echoes)
+
+
+@partial(jax.jit, static_argnames="settings")
+def vote_lines(
+    rho: Float[Array, "clusters lines"], theta: Float[Array, "clusters lines"], *, settings: HoughSettings
+) -> tuple[Bool[Array, "clusters theta rho"], Int[Array, "clusters lines"]]:
+    """Highly occupied cells of each cluster of lines: votes, low pass, threshold.
+
+    Args:
+        rho: distances from the cluster's origin, metres, any sign; NaN where there is no line.
+        theta: directions of the normals, radians.
+        settings: the accumulator; its threshold is a number of lines.
+
+    Returns:
+        The highly occupied cells, and the flat cell of each line: one past the last cell for NaN and for lines beyond
+        the accumulator.
+    """
+
+    def one_cluster(lines: tuple[Array, Array]) -> tuple[Array, Array]:
+        rho, theta = lines
+        known = jnp.isfinite(rho)
+        row = hough.theta_row(jnp.where(known, theta, 0), settings)
+        cell = hough.cell_of(jnp.where(known, rho, 0), row, known, settings)
+        votes = hough.accumulate(cell, settings)
+        return hough.lowpass(votes, settings) > settings.threshold, cell
+
+    return jax.lax.map(one_cluster, (rho, theta))

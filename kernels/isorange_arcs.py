@@ -60,15 +60,6 @@ def arc(path: EchoPaths, *, pitch: float, points: int) -> Arc:
     )
 
 
-def corrected_range(
-    reported: Float[Array, ""], *, range_offset: Float[Array, ""], range_scale: Float[Array, ""]
-) -> Float[Array, ""]:
-    """Half the path length of ONE echo from what the ring reported, metres; 0 for NaN or inf: nothing heard."""
-    heard = jnp.isfinite(reported)
-    reported = jnp.where(heard, reported, 1)  # before the arithmetic, so that no gradient is NaN
-    return jnp.where(heard, (reported - range_offset) * range_scale, 0)
-
-
 def tangent_rho(
     arc: Arc, reach: Float[Array, ""], *, max_range: Float[Array, ""]
 ) -> tuple[Float[Array, " points"], Bool[Array, " points"]]:

@@ -1,185 +1,202 @@
-"""The robot's pose and the reflectors around it from ONE scan: iterated Kalman update on the ranges of its echoes.
+"""Iterated Kalman update of the robot's pose and the landmarks around it by the ranges of ONE scan.
 
-Pose and reflectors are one normal distribution, so that what is known of one through the other is not counted twice
-(paper, section 5, last paragraph; Bell and Cathey 1993: the iterated update is Gauss-Newton on prior and ranges).
+Pose and landmarks have one joint normal distribution, so that common errors are not counted twice (paper, section 5,
+last paragraph). The iterated update equals Gauss-Newton on prior and ranges (Bell and Cathey 1993).
 """
+
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from . import measurement_model as reflectors
-from .array_geometry import WIDER, EchoPaths, widened
+from .array_geometry import EchoPaths, widen_cones
 from .geometry import dot, normal, tangent
-from .landmarks import AnyArray, Scene, seen_from
-from .ml_detection import CORNER, EDGE, PLANE
+from .landmarks import AnyArray, Landmarks, landmark_in_robot_frame
+from .measurement_model import PLANE, SETTINGS, reflector_echo, visibility
 
-_STEPS, _CLOSER = 4, 0.05  # variance that the belief allows shrinks so much with each step
-_GATE = 4.0  # sigma; an echo farther off is as likely false
-_SLACK = 0.05  # m; farther behind what was seen of a wall an echo is more likely of its edge
+
+@dataclass(frozen=True)
+class EkfSettings:
+    """Constants of the iterated update; all chosen by hand."""
+
+    iterations: int = 4
+    """Gauss-Newton steps with robust weights before the last step."""
+    annealing_factor: float = 0.05
+    """Factor per iteration on the prior variance of a range in the scale of the robust weights."""
+    gate: float = 4.0
+    """Standard deviations of a range beyond which an echo is an outlier."""
+    wall_margin: float = 0.05
+    """Metres that a wall may extend beyond its observed endpoints; farther out an echo is more likely of an edge."""
+
+
+EKF_SETTINGS = EkfSettings()
 
 
 class Belief(eqx.Module):
-    """What is known of the robot and of the reflectors around it: mean and covariance of a normal distribution."""
+    """Joint normal distribution of the robot's pose and the landmarks around it."""
 
     pose: Float[AnyArray, "3"]
-    """frame_from_robot: x, y (metres), theta (radians)."""
-    scene: Scene
-    """(reflectors,) the mean of their parameters; rows of kind -1 are free."""
+    """Mean of frame_from_robot: x, y (metres), theta (radians)."""
+    landmarks: Landmarks
+    """(landmarks,) with the mean of their parameters; rows of kind -1 are unused."""
     covariance: Float[AnyArray, "unknowns unknowns"]
-    """Of the pose (3) and of the parameters (2 a reflector), square metres and radians."""
+    """Of the pose (3) and of the parameters (2 for each landmark), square metres and radians."""
 
 
-class Tracked(eqx.Module):
-    """A belief after a scan, and how its echoes fit."""
+class EkfUpdate(eqx.Module):
+    """The belief after a scan, and the residuals of its echoes."""
 
     belief: Belief
     residual: Float[Array, " echoes"]
-    """Measured minus expected range at the new belief, metres; 0 for echoes of no reflector."""
+    """Measured minus expected range at the new belief, metres; 0 for echoes without a landmark."""
     used: Float[Array, " echoes"]
-    """1 for the echoes that count, 0 for all others."""
+    """1 for echoes within the gate, which the update uses; 0 for all others."""
 
 
-class Predicted(eqx.Module):
-    """What paths would hear of a belief."""
+class RangePrediction(eqx.Module):
+    """Ranges that paths are expected to measure."""
 
-    expected: Float[Array, "reflectors echoes"]
-    """Range in which each path would hear each reflector, metres; infinite where it would not."""
-    variance: Float[Array, "reflectors echoes"]
-    """Of that, square metres."""
+    expected: Float[Array, "landmarks paths"]
+    """Range of each landmark on each path, metres; infinite where the path cannot receive its echo."""
+    variance: Float[Array, "landmarks paths"]
+    """Variance of that range by the belief, square metres; without measurement noise."""
 
 
 @jax.jit
-def track(
+def ekf_update(
     belief: Belief,
     paths: EchoPaths,
     ranges: Float[Array, " echoes"],
-    row: Int[Array, " echoes"],
+    landmark: Int[Array, " echoes"],
     variance: Float[Array, ""],
-) -> Tracked:
-    """Take in the echoes of one scan whose reflectors are known.
+) -> EkfUpdate:
+    """Update a belief with the echoes of one scan that are assigned to landmarks.
 
-    The scale of a robust weight (Geman and McClure) closes from what the belief allows to the noise of the ranges; in
-    the end an echo counts or does not, so that the covariance is that of least squares.
+    Robust weights (Geman-McClure) are annealed: their scale shrinks from the prior variance of a range to the
+    measurement noise. In the last step every echo has weight 0 or 1, so that the covariance is that of least squares.
 
     Args:
-        belief: before the scan, the robot's motion accounted for; a reflector that is new has a wide covariance.
-        paths: (echoes,) geometry of the path of each echo, in the frame of the pose.
-        ranges: half path lengths, corrected for offsets and the speed of sound, metres.
-        row: of the scene, where each echo comes from; -1 for none.
-        variance: of a range, square metres.
+        belief: prior, after the prediction step; a new landmark has a wide covariance.
+        paths: (echoes,) geometry of the path of each echo, robot frame.
+        ranges: half path lengths, corrected for range offsets and the speed of sound, metres.
+        landmark: row of the landmark that caused each echo; -1 for none.
+        variance: measurement noise of a range, square metres.
     """
-    mean = jnp.concatenate([jnp.asarray(belief.pose), jnp.asarray(belief.scene.parameters).ravel()])
+    mean = jnp.concatenate([jnp.asarray(belief.pose), jnp.asarray(belief.landmarks.parameters).ravel()])
     prior = jnp.asarray(belief.covariance)
-    known, at = row >= 0, jnp.maximum(row, 0)
-    first, second = 3 + 2 * at, 4 + 2 * at
-    each_echo = jax.vmap(_echo, in_axes=(None, 0, 0))
+    assigned, row = landmark >= 0, jnp.maximum(landmark, 0)
+    first, second = 3 + 2 * row, 4 + 2 * row
+    each_echo = jax.vmap(_range_and_jacobians, in_axes=(None, 0, 0))
 
-    def linear(state):
-        """Residuals, and the Jacobian of the expected ranges: by the pose, and by the parameters of the reflector."""
-        scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[at], _with(belief.scene, state[3:]))
-        reach, by_pose, by_own = each_echo(state[:3], scene, paths)
-        return jnp.where(known, ranges - reach, 0), by_pose, by_own
+    def linearize(state):
+        """Residuals; Jacobians of the expected ranges with respect to the pose and to the landmark's parameters."""
+        landmarks = jax.tree.map(lambda leaf: jnp.asarray(leaf)[row], _with_state(belief.landmarks, state))
+        expected, by_pose, by_landmark = each_echo(state[:3], landmarks, paths)
+        return jnp.where(assigned, ranges - expected, 0), by_pose, by_landmark
 
-    def solved(state, weight):
-        """One step of Gauss and Newton from a state: prior and weighted ranges."""
-        residual, by_pose, by_own = linear(state)
+    def gauss_newton_step(state, weight):
+        """One step from a state on the prior and the weighted ranges."""
+        residual, by_pose, by_landmark = linearize(state)
         root = jnp.sqrt(weight / variance)[:, None]
-        by_pose, by_own = root * by_pose, root * by_own
-        # Rows of the Jacobian have five entries: three of the pose, two of their reflector.
-        spread = prior[:, :3] @ by_pose.T + prior[:, first] * by_own[None, :, 0] + prior[:, second] * by_own[None, :, 1]
-        surprise = by_pose @ spread[:3] + by_own[:, :1] * spread[first] + by_own[:, 1:] * spread[second]
-        factor = jax.scipy.linalg.cho_factor(surprise + jnp.eye(len(row), dtype=state.dtype))
-        moved = state - mean
-        back = by_pose @ moved[:3] + by_own[:, 0] * moved[first] + by_own[:, 1] * moved[second]
-        step = jax.scipy.linalg.cho_solve(factor, root[:, 0] * residual + back)
-        return mean + spread @ step, spread, factor, surprise
+        by_pose, by_landmark = root * by_pose, root * by_landmark
+        # A row of the Jacobian H has five entries: three of the pose, two of one landmark.
+        p_ht = (
+            prior[:, :3] @ by_pose.T
+            + prior[:, first] * by_landmark[None, :, 0]
+            + prior[:, second] * by_landmark[None, :, 1]
+        )
+        h_p_ht = by_pose @ p_ht[:3] + by_landmark[:, :1] * p_ht[first] + by_landmark[:, 1:] * p_ht[second]
+        factor = jax.scipy.linalg.cho_factor(h_p_ht + jnp.eye(len(row), dtype=state.dtype))
+        change = state - mean
+        h_change = by_pose @ change[:3] + by_landmark[:, 0] * change[first] + by_landmark[:, 1] * change[second]
+        solution = jax.scipy.linalg.cho_solve(factor, root[:, 0] * residual + h_change)
+        return mean + p_ht @ solution, p_ht, factor, h_p_ht
 
-    *_, surprise = solved(mean, known.astype(mean.dtype))
-    allowed = variance * jnp.diag(surprise)
+    # Prior variances of the ranges.
+    *_, h_p_ht = gauss_newton_step(mean, assigned.astype(mean.dtype))
+    prior_variance = variance * jnp.diag(h_p_ht)
 
-    def closer(step, state):
-        scale = _GATE**2 * (variance + allowed * _CLOSER ** step.astype(mean.dtype))
-        residual, *_ = linear(state)
-        return solved(state, jnp.where(known, 1 / (1 + residual * residual / scale) ** 2, 0))[0]
+    # Annealed robust iterations.
+    def iterate(step, state):
+        annealed = prior_variance * EKF_SETTINGS.annealing_factor ** step.astype(mean.dtype)
+        scale = EKF_SETTINGS.gate**2 * (variance + annealed)
+        residual, *_ = linearize(state)
+        return gauss_newton_step(state, jnp.where(assigned, 1 / (1 + residual * residual / scale) ** 2, 0))[0]
 
-    state = jax.lax.fori_loop(0, _STEPS, closer, mean)
-    residual, *_ = linear(state)
-    used = (known & (residual * residual < _GATE**2 * variance)).astype(mean.dtype)
-    state, spread, factor, _ = solved(state, used)
-    half = jax.scipy.linalg.solve_triangular(factor[0], spread.T, lower=factor[1], trans=0 if factor[1] else 1)
-    found = Belief(state[:3], _with(belief.scene, state[3:]), prior - half.T @ half)
-    return Tracked(found, linear(state)[0], used)
+    state = jax.lax.fori_loop(0, EKF_SETTINGS.iterations, iterate, mean)
+
+    # Last step: echoes within the gate, with equal weights; covariance P - P H' S^-1 H P.
+    residual, *_ = linearize(state)
+    used = (assigned & (residual * residual < EKF_SETTINGS.gate**2 * variance)).astype(mean.dtype)
+    state, p_ht, factor, _ = gauss_newton_step(state, used)
+    half = jax.scipy.linalg.solve_triangular(factor[0], p_ht.T, lower=factor[1], trans=0 if factor[1] else 1)
+    posterior = Belief(state[:3], _with_state(belief.landmarks, state), prior - half.T @ half)
+    return EkfUpdate(posterior, linearize(state)[0], used)
 
 
 @jax.jit
-def predict(belief: Belief, paths: EchoPaths) -> Predicted:
-    """What paths (echoes,), in the robot frame, would hear of what a belief has, and how well that is known."""
-    return Predicted(expected_ranges(belief.pose, belief.scene, paths), _variance(belief, paths))
+def predict_ranges(belief: Belief, paths: EchoPaths) -> RangePrediction:
+    """Predict the ranges of all landmarks of a belief on paths (paths,) of the robot frame, with their variances."""
+    return RangePrediction(expected_ranges(belief.pose, belief.landmarks, paths), _range_variances(belief, paths))
 
 
 @jax.jit
-def expected_ranges(pose: Float[Array, "3"], scene: Scene, paths: EchoPaths) -> Float[Array, "reflectors echoes"]:
-    """Ranges in which paths hear reflectors, metres; infinite where they do not.
+def expected_ranges(pose: Float[Array, "3"], landmarks: Landmarks, paths: EchoPaths) -> Float[Array, "landmarks paths"]:
+    """Ranges that paths measure of landmarks, metres; infinite where a path cannot receive the echo.
 
     Args:
         pose: frame_from_robot.
-        scene: (reflectors,) in that frame; a wall is heard up to 5 cm behind what was seen of it.
-        paths: (echoes,) in the robot frame, their cones a little widened here.
+        landmarks: (landmarks,) in that frame.
+        paths: (paths,) in the robot frame; their cones are widened here (``association_cone_factor``).
     """
-    paths = widened(paths, WIDER)
+    paths = widen_cones(paths, SETTINGS.association_cone_factor)
 
-    def one(reflector: Scene, path: EchoPaths):
-        local = seen_from(pose, reflector)
-        sightings = (reflectors.plane(local, path), reflectors.corner(local, path), reflectors.edge(local, path))
-        reach = jnp.stack([sighting.range for sighting in sightings])
-        share = jnp.stack([reflectors.heard_share(sighting, path) for sighting in sightings])
-        along = dot(tangent(reflector.parameters[1]), pose[:2] - reflector.anchor) + sightings[PLANE].foot
-        beside = (along < reflector.ends[0] - _SLACK) | (along > reflector.ends[1] + _SLACK)
-        share = share.at[PLANE].multiply(1 - beside.astype(share.dtype))
-        kind = jnp.clip(reflector.kind, PLANE, EDGE)
-        return jnp.where((reflector.kind >= 0) & (share[kind] > 0), reach[kind], jnp.inf)
+    def expected_range(landmark: Landmarks, path: EchoPaths):
+        echo = reflector_echo(jnp.asarray(landmark.kind), landmark_in_robot_frame(pose, landmark), path)
+        along = dot(tangent(landmark.parameters[1]), pose[:2] - landmark.anchor) + echo.footpoint
+        margin = EKF_SETTINGS.wall_margin
+        beside = (along < landmark.extent[0] - margin) | (along > landmark.extent[1] + margin)
+        visible = (visibility(echo, path) > 0) & ((landmark.kind != PLANE) | ~beside)
+        return jnp.where(visible, echo.range, jnp.inf)
 
-    return jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None))(scene, paths)
+    return jax.vmap(jax.vmap(expected_range, in_axes=(None, 0)), in_axes=(0, None))(landmarks, paths)
 
 
-def _variance(belief: Belief, paths: EchoPaths) -> Float[Array, "reflectors echoes"]:
-    """Variance of the range in which each path would hear each reflector, square metres."""
-    count = belief.scene.kind.shape[0]
+def _range_variances(belief: Belief, paths: EchoPaths) -> Float[Array, "landmarks paths"]:
+    """Variances of the expected ranges, square metres."""
+    count = belief.landmarks.kind.shape[0]
     own = 3 + 2 * jnp.arange(count)[:, None] + jnp.arange(2)[None]
-    of_pose, between = belief.covariance[:3, :3], belief.covariance[:3, own]  # (3, reflectors, 2)
-    of_own = belief.covariance[own[:, :, None], own[:, None, :]]
+    pose_cov, cross_cov = belief.covariance[:3, :3], belief.covariance[:3, own]  # (3, landmarks, 2)
+    own_cov = belief.covariance[own[:, :, None], own[:, None, :]]
 
-    def one(reflector, between, of_own, path):
-        _, by_pose, by_own = _echo(jnp.asarray(belief.pose), reflector, path)
-        return by_pose @ of_pose @ by_pose + 2 * by_pose @ between @ by_own + by_own @ of_own @ by_own
+    def range_variance(landmark, cross, own, path):
+        _, by_pose, by_landmark = _range_and_jacobians(jnp.asarray(belief.pose), landmark, path)
+        return by_pose @ pose_cov @ by_pose + 2 * by_pose @ cross @ by_landmark + by_landmark @ own @ by_landmark
 
-    each_path = jax.vmap(one, in_axes=(None, None, None, 0))
-    return jax.vmap(each_path, in_axes=(0, 1, 0, None))(belief.scene, between, of_own, paths)
+    each_path = jax.vmap(range_variance, in_axes=(None, None, None, 0))
+    return jax.vmap(each_path, in_axes=(0, 1, 0, None))(belief.landmarks, cross_cov, own_cov, paths)
 
 
-def _echo(pose: Float[Array, "3"], reflector: Scene, path: EchoPaths):
-    """Range of ONE echo, and its slopes by the pose (3) and by the parameters of the reflector (2)."""
-    local = seen_from(pose, reflector)
-    sightings = {PLANE: reflectors.plane, CORNER: reflectors.corner, EDGE: reflectors.edge}
-    seen = {kind: model(local, path) for kind, model in sightings.items()}
-    reach = jnp.select([reflector.kind == kind for kind in seen], [one.range for one in seen.values()], 0)
-    a, b = (
-        jnp.select([reflector.kind == kind for kind in seen], [one.slope[k] for one in seen.values()], 0)
-        for k in (0, 1)
-    )
-    theta = reflector.parameters[1]
-    n, t, ahead, left = normal(theta), tangent(theta), normal(pose[2]), tangent(pose[2])
-    offset = jnp.asarray(reflector.anchor) - pose[:2]
-    # A plane is (distance + n . offset, theta - heading), a point the offset to it turned by the heading.
-    plane = reflector.kind == PLANE
-    across = a * ahead + b * left
-    by_place = jnp.where(plane, -a * n, -across)
+def _range_and_jacobians(
+    pose: Float[Array, "3"], landmark: Landmarks, path: EchoPaths
+) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "2"]]:
+    """Range of ONE landmark on ONE path; its derivatives with respect to the pose and to the landmark's parameters."""
+    local = landmark_in_robot_frame(pose, landmark)
+    echo = reflector_echo(jnp.asarray(landmark.kind), local, path)
+    a, b = echo.d_range_d_reflector
+    theta = landmark.parameters[1]
+    n, t, forward, left = normal(theta), tangent(theta), normal(pose[2]), tangent(pose[2])
+    offset = jnp.asarray(landmark.anchor) - pose[:2]
+    # In the robot frame a plane is (distance + n . offset, theta - heading), a point its rotated offset.
+    plane = landmark.kind == PLANE
+    by_point = a * forward + b * left
+    by_position = jnp.where(plane, -a * n, -by_point)
     by_heading = jnp.where(plane, -b, a * local[1] - b * local[0])
-    by_own = jnp.where(plane, jnp.stack([a, a * dot(t, offset) + b]), across)
-    return reach, jnp.append(by_place, by_heading), by_own
+    by_landmark = jnp.where(plane, jnp.stack([a, a * dot(t, offset) + b]), by_point)
+    return echo.range, jnp.append(by_position, by_heading), by_landmark
 
 
-def _with(scene: Scene, parameters: Float[Array, " all"]) -> Scene:
-    return eqx.tree_at(lambda s: s.parameters, scene, parameters.reshape(-1, 2))
+def _with_state(landmarks: Landmarks, state: Float[Array, " unknowns"]) -> Landmarks:
+    return landmarks.with_parameters(state[3:].reshape(-1, 2))

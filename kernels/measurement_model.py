@@ -1,93 +1,300 @@
-"""How ONE echo path hears ONE reflector: exact range, and the directions in which the sound leaves and arrives.
+"""The measurement model: the range that ONE echo path measures of ONE reflector, and the directions of the sound.
 
-Frames and units as everywhere: robot frame, metres, radians. A reflector is two numbers: a plane (rho, theta), a corner
-or an edge (x, y).
+This is the only range model of planes, corners and edges in the kernels. ``jaxsonar.sensors.range_models`` is its NumPy
+counterpart for code that cannot be compiled; the simulator has a geometry of its own, so that each checks the other.
+
+A reflector has two parameters: (rho, theta) of a plane, (x, y) of a corner or an edge. Robot frame, metres, radians. A
+range is half the length of the path transmitter -> reflector -> receiver.
 """
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .array_geometry import EchoPaths
-from .geometry import dot, mirrored, normal, tangent, towards
+from .geometry import dot, length, length_and_direction, mirror_point, normal, safe_sqrt, signed_angle, tangent
 
-_SOFT = 0.08  # of the chord of half a cone; where its border is neither inside nor outside
+PLANE, CORNER, EDGE = 0, 1, 2
+"""Kinds of reflectors: a wall; a right-angled concave corner; an edge or a thin pole."""
+SECOND_ORDER = 3
+"""Kind of a reflection only: reflected at one plane, then at another."""
 
 
-class Sighting(eqx.Module):
-    """What one path hears of one reflector."""
+@dataclass(frozen=True)
+class VisibilitySettings:
+    """When a path can receive an echo of a reflector."""
+
+    cone_border: float = 0.08
+    """Half width of the soft border of a detection cone, relative to the chord of half the cone; chosen by hand."""
+    association_cone_factor: float = 1.2
+    """Cones are taken this much wider when echoes are associated with landmarks, because the headings of sensors are
+    not exact; chosen by hand."""
+    association_wall_margin: float = 0.3
+    """Metres that a wall of a map may extend beyond its endpoints, which are the outermost observed footpoints; chosen
+    by hand."""
+
+
+SETTINGS = VisibilitySettings()
+
+
+class PredictedEcho(eqx.Module):
+    """What one path receives of one reflector."""
 
     range: Float[Array, "*paths"]
     """Half the path length, metres."""
-    slope: Float[Array, "*paths 2"]
-    """Its derivatives by the reflector's two parameters; 0 for second order."""
+    d_range_d_reflector: Float[Array, "*paths 2"]
+    """Derivatives of the range with respect to the reflector's two parameters; 0 for second order."""
     departure: Float[Array, "*paths 2"]
     """Unit vector along which the sound leaves the transmitter."""
     arrival: Float[Array, "*paths 2"]
     """Unit vector from the receiver to where the sound comes from."""
-    foot: Float[Array, "*paths"]
-    """Plane: where along it the sound is reflected, metres from the foot of the origin; else 0."""
+    footpoint: Float[Array, "*paths"]
+    """Planes: coordinate of the point of reflection along the tangent, metres from the foot of the origin; else 0."""
     exists: Bool[Array, "*paths"]
-    """Whether the path can exist: both sensors before the plane."""
+    """Whether the path is possible, cones aside; for a plane: both sensors are in front of it."""
 
 
-def plane(line: Float[Array, "2"], path: EchoPaths) -> Sighting:
-    """A wall (rho, theta), by the image source."""
+# Ranges
+
+
+class PlaneCoordinates(NamedTuple):
+    """ONE path in the coordinates of a plane: components along its normal n and its tangent t."""
+
+    normal: Float[Array, "2"]
+    tangent: Float[Array, "2"]
+    height: Float[Array, ""]
+    """Distance from the path's midpoint to the plane, along n; negative behind the plane."""
+    along: Float[Array, ""]
+    """Midpoint . t"""
+    baseline_normal: Float[Array, ""]
+    """Half baseline . n"""
+    baseline_tangent: Float[Array, ""]
+    """Half baseline . t"""
+
+
+def plane_coordinates(
+    line: Float[Array, "2"], midpoint: Float[Array, "2"], half_baseline: Float[Array, "2"]
+) -> PlaneCoordinates:
+    """Express ONE path in the coordinates of the plane (rho, theta)."""
     n, t = normal(line[1]), tangent(line[1])
-    height, across = line[0] - dot(path.midpoint, n), dot(path.half_baseline, t)
-    lean, beside = dot(path.half_baseline, n), dot(path.midpoint, t)
-    before = height > jnp.abs(lean)
-    height = jnp.where(before, height, 1)
-    reach = jnp.sqrt(height * height + across * across)
-    upright, along = height / reach, across / reach
-    return Sighting(
-        range=reach,
-        slope=jnp.stack([upright, -(upright * beside + along * lean)]),
-        departure=upright * n + along * t,
-        arrival=upright * n - along * t,
-        foot=beside + across * lean / height,
-        exists=before,
+    height = line[0] - dot(midpoint, n)
+    return PlaneCoordinates(n, t, height, dot(midpoint, t), dot(half_baseline, n), dot(half_baseline, t))
+
+
+def image_source(
+    path: PlaneCoordinates,
+) -> tuple[Float[Array, ""], Float[Array, "2"], Float[Array, ""], Float[Array, ""]]:
+    """Range of a plane echo by the image source, exact for direct and cross echoes.
+
+    Returns:
+        Range sqrt(height^2 + baseline_tangent^2), metres; its derivatives with respect to rho and theta; cosine and
+        sine of the angle between the normal and the sound at the transmitter.
+    """
+    distance = safe_sqrt(path.height * path.height + path.baseline_tangent * path.baseline_tangent)
+    divisor = jnp.where(distance > 0, distance, 1)
+    cosine, sine = path.height / divisor, path.baseline_tangent / divisor
+    return distance, jnp.stack([cosine, -(cosine * path.along + sine * path.baseline_normal)]), cosine, sine
+
+
+def plane_range(
+    line: Float[Array, "2"], midpoint: Float[Array, "2"], half_baseline: Float[Array, "2"]
+) -> Float[Array, ""]:
+    """Range of a plane (rho, theta) with rho of either sign, metres; arguments as ``EchoPaths``."""
+    return image_source(plane_coordinates(line, midpoint, half_baseline))[0]
+
+
+def corner_range(corner: Float[Array, "2"], midpoint: Float[Array, "2"]) -> Float[Array, ""]:
+    """Range of the double reflection in a right-angled corner, metres: its distance from the virtual sensor."""
+    return length(corner - midpoint)
+
+
+def edge_range(
+    edge: Float[Array, "2"], midpoint: Float[Array, "2"], half_baseline: Float[Array, "2"]
+) -> Float[Array, ""]:
+    """Range of the diffraction at an edge or a thin pole, metres: the mean of its distances from tx and rx."""
+    offset = edge - midpoint
+    return (length(offset + half_baseline) + length(offset - half_baseline)) / 2
+
+
+def second_order_range(
+    first: Float[Array, "2"], second: Float[Array, "2"], midpoint: Float[Array, "2"], half_baseline: Float[Array, "2"]
+) -> Float[Array, ""]:
+    """Range of the reflection at a first plane, then at a second, metres: by the image of the image."""
+    image = mirror_point(mirror_point(midpoint + half_baseline, second), first)
+    return length(image - (midpoint - half_baseline)) / 2
+
+
+def expected_range(
+    kind: Int[Array, ""],
+    first: Float[Array, "2"],
+    second: Float[Array, "2"],
+    tx: Float[Array, "2"],
+    rx: Float[Array, "2"],
+) -> Float[Array, ""]:
+    """Range of ONE echo of any kind in metres; differentiable in everything but the kind.
+
+    Args:
+        kind: PLANE, CORNER, EDGE or SECOND_ORDER.
+        first: the reflector in the robot frame (``landmark_in_robot_frame``).
+        second: the plane that is met second; used by SECOND_ORDER only.
+        tx: position of the transmitter in the robot frame, metres.
+        rx: position of the receiver, metres.
+    """
+    midpoint, half_baseline = (tx + rx) / 2, (rx - tx) / 2
+    ranges = (
+        plane_range(first, midpoint, half_baseline),
+        corner_range(first, midpoint),
+        edge_range(first, midpoint, half_baseline),
+        second_order_range(first, second, midpoint, half_baseline),
+    )
+    kinds = (PLANE, CORNER, EDGE, SECOND_ORDER)
+    return jnp.select([kind == k for k in kinds], ranges, jnp.zeros_like(ranges[0]))
+
+
+def reported_range(
+    true_range: Float[Array, ""], *, range_offset: Float[Array, ""], range_scale: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Range that a path reports for a true range, metres: the inverse of ``corrected_range``."""
+    return true_range / range_scale + range_offset
+
+
+def corrected_range(
+    reported: Float[Array, ""], *, range_offset: Float[Array, ""], range_scale: Float[Array, ""]
+) -> Float[Array, ""]:
+    """True range of ONE echo from the reported one, metres; 0 for NaN or inf, which mean that there is no echo."""
+    finite = jnp.isfinite(reported)
+    reported = jnp.where(finite, reported, 1)  # before the arithmetic, so that no gradient is NaN
+    return jnp.where(finite, (reported - range_offset) * range_scale, 0)
+
+
+# Echoes: ranges with derivatives and directions
+
+
+def plane_echo(line: Float[Array, "2"], path: EchoPaths) -> PredictedEcho:
+    """Echo of a wall (rho, theta), by the image source."""
+    here = plane_coordinates(line, path.midpoint, path.half_baseline)
+    in_front = here.height > jnp.abs(here.baseline_normal)
+    here = here._replace(height=jnp.where(in_front, here.height, 1))
+    distance, d_line, cosine, sine = image_source(here)
+    return PredictedEcho(
+        range=distance,
+        d_range_d_reflector=d_line,
+        departure=cosine * here.normal + sine * here.tangent,
+        arrival=cosine * here.normal - sine * here.tangent,
+        footpoint=here.along + here.baseline_tangent * here.baseline_normal / here.height,
+        exists=in_front,
     )
 
 
-def corner(place: Float[Array, "2"], path: EchoPaths) -> Sighting:
-    """A right-angled corner: double reflection, as if the virtual sensor sent and heard, for both sensors alike."""
-    reach, direction = towards(place - path.midpoint)
-    return Sighting(reach, direction, direction, direction, jnp.zeros_like(reach), reach > 0)
+def corner_echo(corner: Float[Array, "2"], path: EchoPaths) -> PredictedEcho:
+    """Echo of a right-angled corner: double reflection, as if the virtual sensor were transmitter and receiver."""
+    distance, direction = length_and_direction(corner - path.midpoint)
+    return PredictedEcho(distance, direction, direction, direction, jnp.zeros_like(distance), distance > 0)
 
 
-def edge(place: Float[Array, "2"], path: EchoPaths) -> Sighting:
-    """An edge or a thin pole: diffraction, each leg for itself."""
-    out, departure = towards(place - path.midpoint + path.half_baseline)
-    back, arrival = towards(place - path.midpoint - path.half_baseline)
-    slope = (departure + arrival) / 2
-    return Sighting((out + back) / 2, slope, departure, arrival, jnp.zeros_like(out), (out > 0) & (back > 0))
+def edge_echo(edge: Float[Array, "2"], path: EchoPaths) -> PredictedEcho:
+    """Echo of an edge or a thin pole: diffraction, with a leg from the transmitter and a leg to the receiver."""
+    out, departure = length_and_direction(edge - path.midpoint + path.half_baseline)
+    back, arrival = length_and_direction(edge - path.midpoint - path.half_baseline)
+    gradient = (departure + arrival) / 2
+    return PredictedEcho((out + back) / 2, gradient, departure, arrival, jnp.zeros_like(out), (out > 0) & (back > 0))
 
 
-def second_order(first: Float[Array, "2"], second: Float[Array, "2"], path: EchoPaths) -> Sighting:
-    """Wall to wall: reflected at one plane, then at another, by the image of the image."""
+def point_echo(is_edge: Float[Array, ""], point: Float[Array, "2"], path: EchoPaths) -> PredictedEcho:
+    """Echo of an edge (1) or a corner (0), in one program: a corner is an edge seen from the virtual sensor."""
+    return edge_echo(point, eqx.tree_at(lambda p: p.half_baseline, path, is_edge * path.half_baseline))
+
+
+def second_order_echo(first: Float[Array, "2"], second: Float[Array, "2"], path: EchoPaths) -> PredictedEcho:
+    """Echo that is reflected at one plane (rho, theta), then at another, by the image of the image."""
     tx, rx = path.midpoint - path.half_baseline, path.midpoint + path.half_baseline
-    behind_first, behind_second = mirrored(tx, first), mirrored(rx, second)
-    way, departure = towards(mirrored(behind_second, first) - tx)
-    _, arrival = towards(mirrored(behind_first, second) - rx)
-    # From behind the first to behind the second, before each other's plane, and through the first one first.
-    start, end = _before(tx, first), _before(rx, second)
-    last, next_ = _before(behind_second, first), _before(behind_first, second)
-    exists = (jnp.minimum(jnp.minimum(start, end), jnp.minimum(last, next_)) > 0) & (start * end < next_ * last)
-    return Sighting(way / 2, jnp.zeros(2, way.dtype), departure, arrival, jnp.zeros_like(way), exists)
+    tx_image, rx_image = mirror_point(tx, first), mirror_point(rx, second)
+    distance, departure = length_and_direction(mirror_point(rx_image, first) - tx)
+    _, arrival = length_and_direction(mirror_point(tx_image, second) - rx)
+    # The straight line from tx_image to rx_image must cross the first plane before the second; each sensor must be in
+    # front of its own plane, each image in front of the other plane.
+    tx_height, rx_height = _height(tx, first), _height(rx, second)
+    rx_image_height, tx_image_height = _height(rx_image, first), _height(tx_image, second)
+    heights = jnp.minimum(jnp.minimum(tx_height, rx_height), jnp.minimum(rx_image_height, tx_image_height))
+    exists = (heights > 0) & (tx_height * rx_height < tx_image_height * rx_image_height)
+    return PredictedEcho(
+        distance / 2, jnp.zeros(2, distance.dtype), departure, arrival, jnp.zeros_like(distance), exists
+    )
 
 
-def heard_share(sighting: Sighting, path: EchoPaths) -> Float[Array, ""]:
-    """How far a sighting lies within both cones: 1 inside, 0 outside, with a soft border; 0 where it cannot exist."""
-    share = jnp.clip(((1 + _SOFT) ** 2 - off_axis(sighting, path)) / (4 * _SOFT), 0, 1)
-    return jnp.where(sighting.exists, share * share * (3 - 2 * share), 0)
+def _height(point: Float[Array, "2"], line: Float[Array, "2"]) -> Float[Array, ""]:
+    return line[0] - dot(point, normal(line[1]))
 
 
-def off_axis(sighting: Sighting, path: EchoPaths) -> Float[Array, ""]:
-    """How far off the axes, the larger one of transmitter and receiver: 0 on the axis, 1 at the border, rising."""
-    out, back = sighting.departure - path.axes[0], sighting.arrival - path.axes[1]
+def echo_of_kind(kind: Int[Array, ""], *echoes: PredictedEcho) -> PredictedEcho:
+    """Choose by kind from the echoes of PLANE, CORNER, ..., in this order; not existing for any other kind."""
+    chosen = jax.tree.map(jnp.zeros_like, echoes[0])
+    for k, echo in enumerate(echoes):
+        chosen = jax.tree.map(lambda new, old, k=k: jnp.where(kind == k, new, old), echo, chosen)
+    return chosen
+
+
+def reflector_echo(kind: Int[Array, ""], reflector: Float[Array, "2"], path: EchoPaths) -> PredictedEcho:
+    """Echo of ONE reflector of kind PLANE, CORNER or EDGE; does not exist for any other kind."""
+    models = (plane_echo, corner_echo, edge_echo)
+    return echo_of_kind(kind, *(model(reflector, path) for model in models))
+
+
+# Detection cones
+
+
+def visibility(echo: PredictedEcho, path: EchoPaths) -> Float[Array, ""]:
+    """Weight of an echo by both detection cones: 1 inside, 0 outside or if it does not exist, smooth at the border."""
+    border = SETTINGS.cone_border
+    weight = jnp.clip(((1 + border) ** 2 - off_axis_ratio(echo, path)) / (4 * border), 0, 1)
+    return jnp.where(echo.exists, weight * weight * (3 - 2 * weight), 0)
+
+
+def off_axis_ratio(echo: PredictedEcho, path: EchoPaths) -> Float[Array, ""]:
+    """Off-axis angle relative to the cone, the larger one of tx and rx: 0 on the axis, 1 at the border, increasing."""
+    out, back = echo.departure - path.axes[0], echo.arrival - path.axes[1]
     return jnp.maximum(dot(out, out) / path.cone[0], dot(back, back) / path.cone[1])
 
 
-def _before(point: Float[Array, "2"], line: Float[Array, "2"]) -> Float[Array, ""]:
-    return line[0] - dot(point, normal(line[1]))
+class PredictionTable(eqx.Module):
+    """Predicted echoes of every path and reflector of a batch of scans: leading axes (scans, reflectors, paths)."""
+
+    range: Float[Array, "*table"]
+    """Half the path length, metres."""
+    d_range_d_reflector: Float[Array, "*table 2"]
+    """Derivatives of the range with respect to the reflector's two parameters."""
+    departure_angle: Float[Array, "*table"]
+    """Direction in which the sound leaves, from the axis of the transmitter, radians, counter-clockwise."""
+    footpoint: Float[Array, "*table"]
+    """As ``PredictedEcho``."""
+    visibility: Float[Array, "*table"]
+    """Weight by both detection cones: 1 inside, 0 outside or where there is no such reflector."""
+    exists: Bool[Array, "*table"]
+    """Whether the path is possible, cones aside."""
+
+
+@jax.jit
+def predict_all_echoes(
+    paths: EchoPaths, kind: Int[Array, "scans reflectors"], reflectors: Float[Array, "scans reflectors 2"]
+) -> PredictionTable:
+    """Predict the echo of every path from every reflector of a batch of scans.
+
+    Args:
+        paths: of the ring.
+        kind: PLANE, CORNER or EDGE; -1 where there is no reflector.
+        reflectors: (rho, theta) of planes, (x, y) of corners and edges; robot frame, metres, radians.
+    """
+
+    def one(kind: Int[Array, ""], reflector: Float[Array, "2"], path: EchoPaths) -> PredictionTable:
+        echo = reflector_echo(kind, reflector, path)
+        angle = signed_angle(path.axes[0], echo.departure)
+        return PredictionTable(
+            echo.range, echo.d_range_d_reflector, angle, echo.footpoint, visibility(echo, path), echo.exists
+        )
+
+    each_path = jax.vmap(one, in_axes=(None, None, 0))
+    return jax.vmap(jax.vmap(each_path, in_axes=(0, 0, None)), in_axes=(0, 0, None))(kind, reflectors, paths)

@@ -1,156 +1,169 @@
-"""Which reflector explains the ranges: a plane, or a point (corner or edge), fitted to the echoes around a candidate.
+"""Robust fit of ONE reflector to the echoes around a candidate line: as a plane, as a corner or as an edge.
 
-The Hough step votes for planes only, but a corner or a post answers to many poses as well, and its tangent lines pile
-up almost like those of a wall. The ranges themselves tell them apart: a wall's foot travels along with the sensor, a
-point stays where it is. Both are fitted robustly: the scale of Geman and McClure's loss is lowered from step to step
-(graduated non-convexity), so that echoes of other reflectors lose their weight.
+The Hough transform votes for planes only. A corner or a post is visible from many poses as well, and the tangent lines
+of its echoes accumulate almost like those of a wall. The ranges tell them apart: the footpoint of a wall moves along
+with the sensor, a point stays where it is. The fit is Gauss-Newton with the loss of Geman and McClure, whose scale is
+reduced from step to step (graduated non-convexity), so that echoes of other reflectors lose their weight.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from . import isorange_arcs as arcs
-from .geometry import dot, fold_line, normal, safe_sqrt, tangent, towards
+from .array_geometry import EchoPaths, transform_path
+from .geometry import dot, fold_line, length_and_direction, normal, tangent
 from .hough_voting import Echoes, RingArcs
-
-_STEPS = 8
-_WIDEST = 4.0  # the loss starts this many tolerances wide
-_SLACK = 0.05  # rad; how far beyond its nominal cone a sensor may have heard something
-_LONGEST_STEP = 0.1  # m and rad
+from .measurement_model import corner_echo, corrected_range, edge_echo, image_source, plane_coordinates
 
 
-Seen = tuple[Float[Array, ""], Float[Array, "2"], Float[Array, "2"]]
-"""Range of a reflector (metres), its derivatives by the two parameters, and the unit vector it is heard from."""
+@dataclass(frozen=True)
+class RobustFitSettings:
+    """Constants of the robust fit; all chosen by hand."""
+
+    steps: int = 8
+    """Gauss-Newton steps, each with a smaller scale of the loss."""
+    initial_scale: float = 4.0
+    """Scale of the loss in the first step, in tolerances."""
+    cone_margin: float = 0.05
+    """Angle beyond its nominal cone at which a sensor may still have received an echo, radians."""
+    max_step: float = 0.1
+    """Largest change of a parameter in one step, metres or radians."""
+    damping: float = 1e-4
+    """Levenberg-Marquardt damping, relative to the trace of the normal matrix."""
 
 
-class Heard(eqx.Module):
-    """One echo, or the echoes of ONE model, in its frame."""
-
-    tx: Float[Array, "*echoes 2"]
-    """Transmitters when they fired, metres."""
-    rx: Float[Array, "*echoes 2"]
-    """Receivers, metres."""
-    reach: Float[Array, "*echoes"]
-    """Half path lengths, corrected, metres; 0 where there is no echo."""
-    start: Float[Array, "*echoes"]
-    """First direction from which the path hears a plane, radians."""
-    width: Float[Array, "*echoes"]
-    """Width of its detection range, radians."""
+SETTINGS = RobustFitSettings()
 
 
-class Fits(eqx.Module):
-    """Planes and points that explain the echoes around candidate lines; see ``fit_candidates``."""
+class ReflectorRange(NamedTuple):
+    """What ONE echo path measures of a reflector."""
+
+    range: Float[Array, ""]
+    """Half the path length, metres."""
+    d_range_d_reflector: Float[Array, "2"]
+    """Derivatives with respect to the two parameters."""
+    bearing: Float[Array, "2"]
+    """Unit vector from the virtual sensor to the reflector."""
+
+
+class CandidateFits(eqx.Module):
+    """Planes and points fitted to the echoes around candidate lines; see ``fit_candidates``."""
 
     rho: Float[Array, "*lines"]
     """Distance of the fitted plane, metres, >= 0."""
     theta: Float[Array, "*lines"]
     """Direction of its normal, radians."""
     explained: Bool[Array, "*lines echoes"]
-    """Echoes that the plane explains, to the tolerance."""
-    foot: Float[Array, "*lines echoes"]
-    """Where along the plane each echo's virtual sensor stands before it, metres from the foot of the origin."""
+    """Echoes whose residual from the plane is within the tolerance."""
+    footpoint: Float[Array, "*lines echoes"]
+    """Footpoint of each echo's virtual sensor on the plane: coordinate along it, metres from the foot of the origin."""
     plane_score: Float[Array, "*lines"]
-    """Sum over the echoes of 1 - (residual / tolerance)^2, where positive: how much the plane explains."""
+    """Sum over the echoes of max(0, 1 - (residual / tolerance)^2): how much the plane explains."""
     point_score: Float[Array, "*lines"]
-    """The same of the better one of a corner and an edge."""
+    """The same for the better one of a corner and an edge."""
 
 
-def heard(ring: RingArcs, echoes: Echoes) -> Heard:
-    """Where the sensors of every echo of ONE model stood, and how far the echo came from."""
-
-    def one_echo(path, reported, pose):
-        paths = jax.tree.map(lambda leaf: leaf[path], ring.paths)
-        reach = arcs.corrected_range(reported, range_offset=paths.range_offset, range_scale=ring.range_scale)
-        reach = jnp.where(reach < ring.max_range, reach, 0)
-        tx, rx, start = paths.midpoint - paths.half_baseline, paths.midpoint + paths.half_baseline, paths.start
-        if pose is not None:
-            forward, left = normal(pose[2]), tangent(pose[2])
-            tx = pose[:2] + tx[0] * forward + tx[1] * left
-            rx = pose[:2] + rx[0] * forward + rx[1] * left
-            start = start + pose[2]
-        return Heard(tx, rx, jnp.maximum(reach, 0), start, paths.width)
-
-    poses = None if echoes.pose is None else 0
-    return jax.vmap(one_echo, in_axes=(0, 0, poses))(echoes.path, echoes.range, echoes.pose)
-
-
-def fit(
-    model: Callable[[Float[Array, "2"], Heard], Seen],
-    start: Float[Array, "2"],
-    echoes: Heard,
-    *,
-    tolerance: float | Float[Array, ""],
-    widest: float | Float[Array, ""] | None = None,
-) -> tuple[Float[Array, "2"], Float[Array, " echoes"]]:
-    """Robust Gauss-Newton fit of ONE reflector with two parameters to the echoes of ONE model.
-
-    Args:
-        model: how an echo hears the reflector.
-        start: first guess.
-        echoes: all echoes, those of other reflectors included.
-        tolerance: residual up to which an echo counts as explained, metres.
-        widest: scale of the loss in the first step, metres; four tolerances if left out.
+def paths_and_ranges(ring: RingArcs, echoes: Echoes) -> tuple[EchoPaths, Float[Array, " echoes"]]:
+    """Geometry of the path of every echo of ONE scan, in the frame of its poses, and the corrected ranges.
 
     Returns:
-        The parameters, and how well they explain every echo: 1 - (residual / tolerance)^2, at least 0.
+        Paths with a leading axis of echoes; ranges in metres, 0 where there is no echo within the maximum range.
     """
-    last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), echoes)  # loops over the echoes run along the memory
-    middle, border = normal(echoes.start + echoes.width / 2).T, jnp.cos(jnp.minimum(echoes.width / 2 + _SLACK, jnp.pi))
+    paths = jax.tree.map(lambda leaf: leaf[echoes.path], ring.paths)
+    ranges = jax.vmap(partial(corrected_range, range_scale=ring.range_scale))(
+        echoes.range, range_offset=paths.range_offset
+    )
+    if echoes.pose is not None:
+        paths = jax.vmap(transform_path)(paths, echoes.pose)
+    return paths, jnp.where((ranges > 0) & (ranges < ring.max_range), ranges, 0)
 
-    def look(x):
-        def one(echo: Heard, middle, border):
-            predicted, slope, direction = model(x, echo)
-            audible = (echo.reach > 0) & (dot(direction, middle) >= border)
-            return audible, echo.reach - predicted, slope
 
-        return jax.vmap(one, in_axes=-1, out_axes=-1)(last, middle, border)
+def fit_reflector(
+    model: Callable[[Float[Array, "2"], EchoPaths], ReflectorRange],
+    start: Float[Array, "2"],
+    paths: EchoPaths,
+    ranges: Float[Array, " echoes"],
+    *,
+    tolerance: float | Float[Array, ""],
+    initial_scale: float | Float[Array, ""] | None = None,
+) -> tuple[Float[Array, "2"], Float[Array, " echoes"]]:
+    """Robust Gauss-Newton fit of ONE reflector with two parameters to the echoes of ONE scan.
+
+    Args:
+        model: ``plane``, ``corner`` or ``edge``.
+        start: first guess.
+        paths: (echoes,) path of every echo, those of other reflectors included.
+        ranges: corrected ranges, metres; 0 where there is no echo.
+        tolerance: largest residual of an explained echo, metres; also the last scale of the loss.
+        initial_scale: scale of the loss in the first step, metres; default: a multiple of the tolerance.
+
+    Returns:
+        The parameters, and for every echo max(0, 1 - (residual / tolerance)^2).
+    """
+    # The axis of echoes comes last, so that loops over the echoes are contiguous in memory.
+    last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), paths)
+    cone_axis = normal(paths.start + paths.width / 2).T
+    min_cosine = jnp.cos(jnp.minimum(paths.width / 2 + SETTINGS.cone_margin, jnp.pi))
+
+    def residuals(x):
+        def one(path: EchoPaths, measured, cone_axis, min_cosine):
+            predicted, gradient, bearing = model(x, path)
+            visible = (measured > 0) & (dot(bearing, cone_axis) >= min_cosine)
+            return visible, measured - predicted, gradient
+
+        return jax.vmap(one, in_axes=-1, out_axes=-1)(last, ranges, cone_axis, min_cosine)
 
     def step(x, scale):
-        audible, residual, (along, across) = look(x)
-        root = jnp.where(audible, 1 / (1 + (residual / scale) ** 2), 0)
+        visible, residual, (along, across) = residuals(x)
+        root = jnp.where(visible, 1 / (1 + (residual / scale) ** 2), 0)
         weight = root * root
-        pull = weight * residual
+        weighted = weight * residual
         xx, xy, yy = ((weight * a * b).sum() for a, b in ((along, along), (along, across), (across, across)))
-        gx, gy = (along * pull).sum(), (across * pull).sum()
-        damping = 1e-4 * (xx + yy) + 1e-9
+        gx, gy = (along * weighted).sum(), (across * weighted).sum()
+        damping = SETTINGS.damping * (xx + yy) + 1e-9
         xx, yy = xx + damping, yy + damping
-        move = jnp.stack([yy * gx - xy * gy, xx * gy - xy * gx]) / (xx * yy - xy * xy)
-        return x + jnp.clip(move, -_LONGEST_STEP, _LONGEST_STEP), None
+        change = jnp.stack([yy * gx - xy * gy, xx * gy - xy * gx]) / (xx * yy - xy * xy)
+        return x + jnp.clip(change, -SETTINGS.max_step, SETTINGS.max_step), None
 
-    widest = _WIDEST * tolerance if widest is None else widest
-    scales = tolerance * (widest / tolerance) ** jnp.linspace(1, 0, _STEPS, dtype=start.dtype)
+    initial_scale = SETTINGS.initial_scale * tolerance if initial_scale is None else initial_scale
+    scales = tolerance * (initial_scale / tolerance) ** jnp.linspace(1, 0, SETTINGS.steps, dtype=start.dtype)
     x, _ = jax.lax.scan(step, start, scales)
-    audible, residual, _ = look(x)
-    return x, jnp.where(audible, jnp.maximum(1 - (residual / tolerance) ** 2, 0), 0)
+    visible, residual, _ = residuals(x)
+    return x, jnp.where(visible, jnp.maximum(1 - (residual / tolerance) ** 2, 0), 0)
 
 
-def plane(line: Float[Array, "2"], echo: Heard) -> Seen:
-    """A wall (rho, theta), by the image source; a robot that has passed it hears its back."""
-    n, t = normal(line[1]), tangent(line[1])
-    middle, half = (echo.tx + echo.rx) / 2, (echo.rx - echo.tx) / 2
-    height, across = line[0] - dot(middle, n), dot(half, t)
-    reach = safe_sqrt(height * height + across * across)
-    inverse = 1 / jnp.where(reach > 0, reach, 1)
-    turn = -(height * dot(middle, t) + across * dot(half, n))
-    return reach, jnp.stack([height * inverse, turn * inverse]), jnp.where(height >= 0, n, -n)
+def plane(line: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:
+    """A wall (rho, theta), visible from both of its sides: during a window the robot may drive past its line."""
+    here = plane_coordinates(line, path.midpoint, path.half_baseline)
+    distance, gradient, _, _ = image_source(here)
+    return ReflectorRange(distance, gradient, jnp.where(here.height >= 0, here.normal, -here.normal))
 
 
-def corner(place: Float[Array, "2"], echo: Heard) -> Seen:
-    """A right-angled corner."""
-    reach, direction = towards(place - (echo.tx + echo.rx) / 2)
-    return reach, direction, direction
+def corner(point: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:
+    """A right-angled corner (x, y)."""
+    echo = corner_echo(point, path)
+    return ReflectorRange(echo.range, echo.d_range_d_reflector, echo.arrival)
 
 
-def edge(place: Float[Array, "2"], echo: Heard) -> Seen:
-    """An edge or a thin pole."""
-    (out, departure), (back, arrival) = towards(place - echo.tx), towards(place - echo.rx)
-    _, direction = towards(place - (echo.tx + echo.rx) / 2)
-    return (out + back) / 2, (departure + arrival) / 2, direction
+def edge(point: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:
+    """An edge or a thin pole (x, y)."""
+    echo = edge_echo(point, path)
+    return ReflectorRange(echo.range, echo.d_range_d_reflector, length_and_direction(point - path.midpoint)[1])
+
+
+def start_of_point(
+    line: Float[Array, "2"], midpoint: Float[Array, "echoes 2"], score: Float[Array, " echoes"]
+) -> Float[Array, "2"]:
+    """First guess of a corner or an edge: the centre of what a fitted plane explains, metres."""
+    footpoint = midpoint @ tangent(line[1])
+    mean = (score * footpoint).sum() / jnp.maximum(score.sum(), 1e-6)
+    return line[0] * normal(line[1]) + mean * tangent(line[1])
 
 
 @partial(jax.jit, static_argnames="tolerance")
@@ -161,7 +174,7 @@ def fit_candidates(
     theta: Float[Array, "scans lines"],
     *,
     tolerance: float,
-) -> Fits:
+) -> CandidateFits:
     """Fit a plane, a corner and an edge to the echoes around every candidate line of a batch of scans.
 
     Args:
@@ -169,21 +182,21 @@ def fit_candidates(
         echoes: (scans, echoes) packed echoes.
         rho: distances of the candidates, metres; NaN where there is none.
         theta: directions of their normals, radians.
-        tolerance: residual up to which an echo counts as explained, metres.
+        tolerance: largest residual of an explained echo, metres.
     """
 
-    def one_scan(scan: Echoes, rho: Float[Array, " lines"], theta: Float[Array, " lines"]) -> Fits:
-        echo = heard(ring, scan)
-        middle = (echo.tx + echo.rx) / 2
+    def one_scan(scan: Echoes, rho: Float[Array, " lines"], theta: Float[Array, " lines"]) -> CandidateFits:
+        paths, ranges = paths_and_ranges(ring, scan)
 
-        def one_candidate(rho: Float[Array, ""], theta: Float[Array, ""]) -> Fits:
-            line, score = fit(plane, jnp.stack([rho, theta]), echo, tolerance=tolerance)
-            foot = middle @ tangent(line[1])
-            mean = (score * foot).sum() / jnp.maximum(score.sum(), 1e-6)
-            place = line[0] * normal(line[1]) + mean * tangent(line[1])
-            points = [fit(model, place, echo, tolerance=tolerance)[1].sum() for model in (corner, edge)]
+        def one_candidate(rho: Float[Array, ""], theta: Float[Array, ""]) -> CandidateFits:
+            line, score = fit_reflector(plane, jnp.stack([rho, theta]), paths, ranges, tolerance=tolerance)
+            start = start_of_point(line, paths.midpoint, score)
+            points = [
+                fit_reflector(model, start, paths, ranges, tolerance=tolerance)[1].sum() for model in (corner, edge)
+            ]
             rho, theta = fold_line(line[0], line[1])
-            return Fits(rho, theta, score > 0, middle @ tangent(theta), score.sum(), jnp.maximum(*points))
+            footpoint = paths.midpoint @ tangent(theta)
+            return CandidateFits(rho, theta, score > 0, footpoint, score.sum(), jnp.maximum(*points))
 
         return jax.vmap(one_candidate)(rho, theta)
 

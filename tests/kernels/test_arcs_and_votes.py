@@ -228,50 +228,17 @@ def test_threshold_does_not_depend_on_the_point_pitch(faw_ring):
     assert votes[1] == pytest.approx(4 * votes[0])
 
 
-# clusters
-
-
 @pytest.mark.slow
 @ways
-def test_centres_of_gravity(rng, run):
-    """Around theta = pi, around rho = 0, an ordinary one, and one without points."""
-    centres = [(1.0, np.pi - 0.02), (0.02, 1.0), (1.5, -2.0)]
-    rho = np.stack([c + rng.normal(0, 0.03, 40) for c, _ in centres]).astype(np.float32)
-    theta = np.stack([c + rng.normal(0, 0.05, 40) for _, c in centres]).astype(np.float32)
-    rho, theta = (np.array(a) for a in kernels.fold_line(jnp.asarray(rho), jnp.asarray(theta)))
-    label = np.array([[1], [2], [4]]) * np.ones((3, 40), np.int32)
-    far = np.cos(theta[1] - 1.0) < 0
-    assert far.any()
-    assert not far.all()
-    label = np.where((np.arange(3) == 1)[:, None] & far[None], -label, label).astype(np.int32)
-    label[0, :5] = 0  # points in no component
-    other_side = rng.random(rho.shape) < 0.3  # (rho, n) and (-rho, -n) are one line
-    side = np.where(other_side, -1, 1).astype(np.float32)
-    points = (side * rho, side * np.cos(theta), side * np.sin(theta))
-    came = run(partial(kernels.centres_of_gravity, clusters=5, echoes=3), *points, label, np.arange(3))
-    np.testing.assert_array_equal(came.votes, [35, 40, 0, 40, 0])
-    np.testing.assert_array_equal(np.isnan(came.rho), [False, False, True, False, True])
-    np.testing.assert_array_equal(came.involved[:, :], np.eye(5, 3, dtype=bool)[[0, 1, 4, 2, 4]])
-    for k, row in [(0, 0), (1, 1), (3, 2)]:
-        points = [(float(r), float(t)) for r, t, m in zip(rho[row], theta[row], label[row], strict=True) if m]
-        wanted = oracles.centre_of_gravity(
-            sorted(points, key=lambda line: abs(oracles.wrap(line[1] - centres[row][1])))
-        )
-        assert float(came.rho[k]) == pytest.approx(wanted[0], abs=1e-5)
-        assert abs(oracles.wrap(float(came.theta[k]) - wanted[1])) < 1e-5
-
-
-@pytest.mark.slow
-@ways
-def test_extent_is_bounded_by_the_outermost_feet(rng, run):
+def test_segment_endpoints_are_the_outermost_feet(rng, run):
     sensors = rng.normal(size=(7, 2)).astype(np.float32)
     involved = np.array([True, False, True, True, False, False, True])
     rho, theta = jnp.float32(1.2), jnp.float32(2.2)
-    ends = np.asarray(run(kernels.extent, rho, theta, sensors, involved))
+    ends = np.asarray(run(kernels.segment_endpoints, rho, theta, sensors, involved))
     n, t = np.array([np.cos(2.2), np.sin(2.2)]), np.array([-np.sin(2.2), np.cos(2.2)])
     np.testing.assert_allclose(ends @ n, 1.2, atol=1e-6)
     np.testing.assert_allclose(ends @ t, [(sensors[involved] @ t).min(), (sensors[involved] @ t).max()], atol=1e-6)
-    assert np.isnan(run(kernels.extent, rho, theta, sensors, np.zeros(7, bool))).all()
+    assert np.isnan(run(kernels.segment_endpoints, rho, theta, sensors, np.zeros(7, bool))).all()
 
 
 # gradients

@@ -12,7 +12,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from jaxsonar import Ring, kernels
-from jaxsonar.estimation import sparse_lm as adjusting
+from jaxsonar.estimation import sparse_adjustment
 from jaxsonar.kernels import (
     CORNER,
     EDGE,
@@ -268,11 +268,11 @@ def test_the_covariance_is_that_of_the_dense_equations(rng, linked):
 def test_sparse_elimination_finds_the_same(rng, linked):
     """Steps, cost and covariances are those of the dense block of all reflectors, for echoes of all kinds."""
     problem, start, _ = a_problem(rng, linked=linked)
-    one, other = adjusted(problem, start), adjusting.adjust(problem, start, poses_free=True)
+    one, other = adjusted(problem, start), sparse_adjustment.adjust(problem, start, poses_free=True)
     assert_same(one.unknowns, other.unknowns, atol=1e-8)
     assert float(one.cost) == pytest.approx(float(other.cost), rel=1e-9)
     assert float(one.before) == pytest.approx(float(other.initial_cost), rel=1e-12)
-    known = adjusting.known(problem, one.unknowns)
+    known = sparse_adjustment.known(problem, one.unknowns)
     modes = problem.modes.shape[1]
     np.testing.assert_allclose(known.modes, one.covariance[:modes, :modes], rtol=1e-5, atol=1e-10)
     np.testing.assert_allclose(known.poses, kernels.pose_covariances(problem, one.unknowns), rtol=1e-5, atol=1e-10)
@@ -284,7 +284,7 @@ def test_sparse_elimination_finds_the_same(rng, linked):
 @pytest.mark.slow
 def test_sparse_elimination_with_poses_held(rng):
     problem, start, _ = a_problem(rng)
-    found = adjusting.adjust(problem, start, poses_free=False)
+    found = sparse_adjustment.adjust(problem, start, poses_free=False)
     assert_same(held(problem, start).unknowns, found.unknowns, atol=1e-8)
     np.testing.assert_array_equal(found.unknowns.poses, start.poses)
 

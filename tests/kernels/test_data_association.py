@@ -9,7 +9,7 @@ import pytest
 
 from jaxsonar import Ring, Room, kernels, simulate
 from jaxsonar.kernels import CORNER, EDGE, PLANE, SECOND_ORDER, CandidateReflections, Landmarks, Reflection
-from jaxsonar.simulation.image_sources import Kind
+from jaxsonar.simulation.image_sources import EchoKind
 
 WIDE = 1.2  # cones, and the soft border around them
 SOFT = 0.08
@@ -84,8 +84,8 @@ def heard():
     path[found.scan, column], reported[found.scan, column] = found.path, found.range
     places = np.concatenate([CORNERS, FREE])
     point = np.linalg.norm(ROOM.junctions.vertices[:, None] - places, axis=-1).argmin(axis=1)
-    single = found.kind == Kind.PLANE
-    points = (found.kind == Kind.CORNER) | (found.kind == Kind.EDGE)
+    single = found.kind == EchoKind.PLANE
+    points = (found.kind == EchoKind.CORNER) | (found.kind == EchoKind.EDGE)
     candidate = np.full(len(found.scan), -1)
     candidate[single] = found.reflector[single]
     candidate[points] = 5 + point[found.reflector[points]]

@@ -211,7 +211,7 @@ def test_a_wall_has_two_sides_and_no_direction(rng, kind):
 
     def about(scene):
         parameters = np.column_stack([-scene.parameters[:, 0], scene.parameters[:, 1] + np.pi])
-        return dataclasses.replace(scene, parameters=parameters, ends=-scene.ends[:, ::-1])
+        return dataclasses.replace(scene, parameters=parameters, extent=-scene.extent[:, ::-1])
 
     behind = np.asarray(seen_from(*arrays((poses, first))))[:, 0] < 0
     assert 0.2 < behind.mean() < 0.8

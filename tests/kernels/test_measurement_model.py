@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from jaxsonar import Room
 from jaxsonar.kernels import EchoPaths
 from jaxsonar.kernels import measurement_model as reflectors
-from jaxsonar.simulation.image_sources import Kind, reflections
+from jaxsonar.simulation.image_sources import EchoKind, trace_between
 
 PATHS = 64
 FAR = 60.0  # m; walls as long as this have no ends that any path sees
@@ -82,7 +82,7 @@ def some_reflectors(rng, model):
 
 def traced(room, tx, rx, kind, reflector=None):
     """Per path the oracle's (range, departure, arrival, first point), and whether there is one at all."""
-    found = reflections(room, tx, rx)
+    found = trace_between(room, tx, rx)
     found = found[found.kind == kind]
     if reflector is not None:
         found = found[found.reflector == reflector]
@@ -118,7 +118,7 @@ def test_a_plane_is_heard_by_its_image_source(seed):
     rng = np.random.default_rng(seed)
     rho, theta = rng.uniform(0.1, 2), rng.uniform(-3.1, 3.1)
     tx, rx = some_sensors(rng)
-    oracle = traced(Room(wall_along(rho, theta)[None]), tx, rx, Kind.PLANE)
+    oracle = traced(Room(wall_along(rho, theta)[None]), tx, rx, EchoKind.PLANE)
     sighting = sighted("plane", [(rho, theta)], tx, rx)
     before = (tx @ unit(theta) < rho) & (rx @ unit(theta) < rho)
     np.testing.assert_array_equal(sighting.exists, before)
@@ -137,7 +137,7 @@ def test_a_right_angled_corner_is_heard_through_both_of_its_walls(seed):
     inward = bearing + math.pi + rng.uniform(-0.3, 0.3)
     walls = [np.stack([place, place + FAR * unit(inward + side)]) for side in (math.pi / 4, -math.pi / 4)]
     tx, rx = some_sensors(rng, spread=0.3)
-    oracle = traced(Room(np.stack(walls)), tx, rx, Kind.CORNER)
+    oracle = traced(Room(np.stack(walls)), tx, rx, EchoKind.CORNER)
     assert oracle[0].sum() > PATHS / 2
     sighting = sighted("corner", [place], tx, rx)
     assert sighting.exists.all()
@@ -153,8 +153,8 @@ def test_an_edge_and_a_pole_are_heard_by_their_two_legs(seed, pole):
     wall = np.stack([place, place + unit(bearing + rng.uniform(-0.5, 0.5))])
     room = Room(np.zeros((0, 2, 2)), poles=place[None]) if pole else Room(wall[None])
     tx, rx = some_sensors(rng)
-    found = reflections(room, tx, rx)
-    kind = Kind.POLE if pole else Kind.EDGE
+    found = trace_between(room, tx, rx)
+    kind = EchoKind.POLE if pole else EchoKind.EDGE
     vertex = 0 if pole else int(np.argmin(np.linalg.norm(room.junctions.vertices - place, axis=-1)))
     assert (found.kind == kind).any()
     oracle = traced(room, tx, rx, kind, reflector=vertex)
@@ -185,8 +185,8 @@ def test_second_order_is_heard_by_the_image_of_the_image(opening_deg, rng):
     for line, wall in zip(lines, walls, strict=True):
         np.testing.assert_allclose(wall @ unit(line[1]), line[0], atol=1e-6)
     tx, rx = some_sensors(rng, spread=0.3)
-    found = reflections(Room(walls), tx, rx)
-    found = found[found.kind == Kind.SECOND_ORDER]
+    found = trace_between(Room(walls), tx, rx)
+    found = found[found.kind == EchoKind.SECOND_ORDER]
     for first, second in ((0, 1), (1, 0)):
         sighting = sighted("second order", [lines[first], lines[second]], tx, rx)
         # A direct path hears the same sound both ways around, and the oracle counts it once.

@@ -15,11 +15,11 @@ from support import oracles
 
 from jaxsonar import HoughSettings, Ring, Room, kernels, load_ring, random_pose, random_room, simulate
 from jaxsonar.detection.arc_tables import arc_tables
-from jaxsonar.floor_plans.room import lines_in
+from jaxsonar.floor_plans.room import walls_in_robot_frame
 from jaxsonar.scans.echo_batches import SLOW_SCANS
-from jaxsonar.simulation.simulator import Acoustics, Kind
+from jaxsonar.simulation.simulator import Acoustics, EchoKind
 
-RING, SETTINGS, EXPECTED = Ring.circular(), HoughSettings(), kernels.Expectations()
+RING, SETTINGS, EXPECTED = Ring.circular(), HoughSettings(), kernels.DetectionSettings()
 SCANS, ROOM, PATHS, POINTS = SLOW_SCANS.rows[0], 64, 168, 64
 DECIDED = 0.7
 PLAIN: dict[str, Any] = {"box": 0.0, "segment": 0.0, "pole": 0.0}
@@ -50,7 +50,7 @@ def explained(scans, sigma=math.nan, arcs=None):
             if len(echoes):
                 path[row, : len(echoes)], reported[row, : len(echoes)] = zip(*echoes, strict=True)
         echoes = kernels.Echoes(jnp.asarray(path), jnp.asarray(reported))
-        found = kernels.explain(arcs, echoes, jnp.float32(sigma), settings=SETTINGS, expected=EXPECTED)
+        found = kernels.detect_ml(arcs, echoes, jnp.float32(sigma), hough_settings=SETTINGS, settings=EXPECTED)
         real = slice(0, len(some))
         parts.append(jax.tree.map(lambda leaf, rows=real: np.asarray(leaf)[rows], found))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
@@ -233,7 +233,7 @@ def test_echoes_beyond_the_maximum_range_change_nothing():
 
 def test_compiles_once_whatever_is_heard():
     explained([[]])
-    compiled: Any = kernels.explain
+    compiled: Any = kernels.detect_ml
     size = compiled._cache_size()
     explained(scans_of_rooms(3), 0.002)
     explained([[]] * 40)
@@ -329,10 +329,10 @@ def bound(line, paths, sigma):
 
 def wall_errors(found, came, scan, room, pose, sigma):
     """Per wall with many first-order echoes the error (rho, theta) of its line, NaN without one, and its bound."""
-    truth = np.stack(lines_in(room, pose), axis=-1)
+    truth = np.stack(walls_in_robot_frame(room, pose), axis=-1)
     lines = reflectors_of(found, scan, kernels.PLANE)
     for wall in range(len(truth)):
-        own = (came.scan == scan) & (came.kind == Kind.PLANE) & (came.reflector == wall)
+        own = (came.scan == scan) & (came.kind == EchoKind.PLANE) & (came.reflector == wall)
         if own.sum() < 8:
             continue
         off = lines - truth[wall]
@@ -350,7 +350,7 @@ def test_covariances_are_those_of_the_errors():
     poses = np.tile(pose, (320, 1))
     scans, _ = heard(TRIANGLE, poses, sigma=sigma, seed=3)
     found = explained(scans, sigma)
-    truth = np.stack(lines_in(TRIANGLE, pose), axis=-1)
+    truth = np.stack(walls_in_robot_frame(TRIANGLE, pose), axis=-1)
     first = one_row(found, 0)
     walls = reflectors_of(found, 0, kernels.PLANE)
     assert len(walls) >= 3

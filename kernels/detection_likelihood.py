@@ -1,0 +1,162 @@
+"""Likelihood of the maximum-likelihood detector: received echoes, missed detections and second-order clutter."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .array_geometry import EchoPaths
+from .detection_settings import DetectionSettings
+from .detection_state import Hypotheses, Model, ScanData, SceneEstimate, log_normal, regularized_inverse
+from .measurement_model import off_axis_ratio, plane_echo, second_order_echo, visibility
+
+
+def clutter_log_density(scan: ScanData, scene: SceneEstimate, settings: DetectionSettings) -> Float[Array, " echoes"]:
+    """Log density of clutter at each echo's range, 1/m: unexplained echoes and those that two walls reflect."""
+    return jnp.log(settings.clutter_density + _second_order_density(scan, scene, settings))
+
+
+def _second_order_density(scan: ScanData, scene: SceneEstimate, settings: DetectionSettings) -> Float[Array, " echoes"]:
+    size = min(len(scene.is_wall), settings.second_order_walls)
+    first, second = np.nonzero(~np.eye(size, dtype=bool))
+
+    def pair(first: Float[Array, "2"], second: Float[Array, "2"], known: Bool[Array, ""]) -> Float[Array, " echoes"]:
+        def one(path: EchoPaths, measured: Float[Array, ""]) -> Float[Array, ""]:
+            echo = second_order_echo(first, second, path)
+            sd = 2 * scene.sigma + 0.002
+            return visibility(echo, path) * jnp.exp(log_normal(measured - echo.range, sd))
+
+        each_echo = jax.vmap(one, in_axes=-1)
+        return jnp.where(known, scene.detection_probability * each_echo(scan.echo_paths, scan.ranges), 0)
+
+    known = scene.is_wall[first] & scene.is_wall[second]
+    densities = jax.vmap(pair)(scene.walls[first], scene.walls[second], known)
+    return jnp.where(scan.valid, densities.max(axis=0), 0)
+
+
+def refine(
+    scan: ScanData,
+    model: Model,
+    start: Float[Array, "2"],
+    scene: SceneEstimate,
+    clutter: Float[Array, " echoes"],
+    settings: DetectionSettings,
+) -> Hypotheses:
+    """Maximum likelihood of ONE reflector: each echo is weighted by its probability of coming from this reflector.
+
+    Args:
+        scan: the echoes.
+        model: measurement model of the reflector's kind.
+        start: its parameters after the previous pass.
+        scene: detection probability and sigma.
+        clutter: log density of clutter at each echo's range, 1/m.
+        settings: step sizes.
+    """
+
+    def predict(x: Float[Array, "2"], path: EchoPaths):
+        echo = model(x, path)
+        return echo, visibility(echo, path)
+
+    def step(x: Float[Array, "2"], _: None):
+        echo, visible = jax.vmap(predict, in_axes=(None, -1), out_axes=-1)(x, scan.echo_paths)
+        detection = scene.detection_probability * visible
+        residual, (a, b) = scan.ranges - echo.range, echo.d_range_d_reflector
+        odds = jnp.log(detection / (1 - detection) + 1e-9) + log_normal(residual, scene.sigma) - clutter
+        log_ratio = jnp.where(scan.valid, odds, -jnp.inf)
+        weight = jax.nn.sigmoid(log_ratio) / scene.sigma**2
+        aa, ab, bb = (weight * a * a).sum(), (weight * a * b).sum(), (weight * b * b).sum()
+        information = jnp.stack([jnp.stack([aa, ab]), jnp.stack([ab, bb])])
+        gradient = jnp.stack([(weight * residual * a).sum(), (weight * residual * b).sum()])
+        most = settings.max_refinement
+        x = x + jnp.clip(regularized_inverse(information) @ gradient, -most, most)
+        return x, (information, log_ratio, echo.footpoint, residual)
+
+    x, steps = jax.lax.scan(step, start, None, length=settings.refinement_steps)
+    # Values before the last step, which is tiny.
+    information, log_ratio, footpoint, residual = jax.tree.map(lambda leaf: leaf[-1], steps)
+    return Hypotheses(x, information, log_ratio, footpoint, residual, jnp.zeros(()))
+
+
+class MissedDetections(NamedTuple):
+    """What every path should receive of ONE reflector, and the echoes that explain why some of them did."""
+
+    footpoint: Float[Array, " paths"]
+    """As ``PredictedEcho``."""
+    visibility: Float[Array, " paths"]
+    """Weight by both cones; 0 beyond the maximum range."""
+    off_axis: Float[Array, " paths"]
+    """As ``off_axis_ratio``."""
+    cost: Float[Array, " paths"]
+    """Log probability that the path receives no echo, nats."""
+    echo_footpoint: Float[Array, " echoes"]
+    """As ``footpoint``, for the path of each echo."""
+    echo_off_axis: Float[Array, " echoes"]
+    """As ``off_axis``, for the path of each echo."""
+    excuse: Float[Array, " echoes"]
+    """Cost that each echo cancels, nats: it is the echo of this reflector, or its blanking hides that echo."""
+
+    def total(self, paths: Bool[Array, " paths"], echoes: Bool[Array, " echoes"]) -> Float[Array, ""]:
+        """Log likelihood of the missed detections of some of the paths, at most 0 nats."""
+        return jnp.minimum(jnp.where(paths, self.cost, 0).sum() - jnp.where(echoes, self.excuse, 0).sum(), 0)
+
+
+def missed_detections(
+    scan: ScanData, model: Model, reflector: Hypotheses, scene: SceneEstimate, settings: DetectionSettings
+) -> MissedDetections:
+    """Predict what every path should receive of ONE reflector."""
+
+    def predict(path: EchoPaths):
+        echo = model(reflector.parameters, path)
+        in_range = echo.range < scan.max_range - settings.range_margin - 2 * scene.sigma
+        visible = jnp.where(in_range, visibility(echo, path), 0)
+        cost = jnp.log(1 - scene.detection_probability * visible)
+        return echo.range, echo.footpoint, visible, off_axis_ratio(echo, path), cost
+
+    each_path = jax.vmap(predict, in_axes=-1, out_axes=-1)
+    _, footpoint, visible, off_axis, cost = each_path(scan.paths)
+    predicted, echo_footpoint, _, echo_off_axis, echo_cost = each_path(scan.echo_paths)
+    behind, gate = scan.ranges - predicted, settings.excuse_gate * scene.sigma
+    excused = scan.valid & (behind < gate) & (behind > -settings.blanking_distance - gate)
+    excuse = jnp.where(excused, echo_cost, 0)
+    return MissedDetections(footpoint, visible, off_axis, cost, echo_footpoint, echo_off_axis, excuse)
+
+
+def point_missed_log_likelihood(
+    scan: ScanData,
+    model: Model,
+    is_edge: Float[Array, ""],
+    point: Hypotheses,
+    scene: SceneEstimate,
+    settings: DetectionSettings,
+) -> Float[Array, ""]:
+    """Log likelihood of the missed detections of ONE corner (0) or edge (1), at most 0 nats."""
+    missed = missed_detections(scan, model, point, scene, settings)
+    # A faint edge is received near the axes only: up to the farthest of its echoes.
+    border = jnp.where(point.log_ratio > 0, missed.echo_off_axis, 0).max() + 1e-3
+    border = jnp.where(is_edge > 0, border, jnp.inf)
+    inside = missed.total(missed.off_axis < border, missed.echo_off_axis < border)
+    outside = missed.total(missed.off_axis >= border, missed.echo_off_axis >= border)
+    return jnp.maximum(inside, -settings.max_occlusion_cost) + jnp.maximum(outside, -settings.max_faint_edge_cost)
+
+
+def plane_missed_log_likelihood(
+    scan: ScanData, plane: Hypotheses, scene: SceneEstimate, settings: DetectionSettings
+) -> Float[Array, ""]:
+    """Log likelihood of the missed detections of ONE wall, at most 0 nats.
+
+    The wall may end beyond the outermost footpoints of its echoes, before the next footpoint without an echo.
+    """
+    missed = missed_detections(scan, plane_echo, plane, scene, settings)
+    footpoint, echo_footpoint, own = missed.footpoint, missed.echo_footpoint, plane.log_ratio > 0
+    low, high = jnp.where(own, plane.footpoint, jnp.inf).min(), jnp.where(own, plane.footpoint, -jnp.inf).max()
+    inside = missed.total((footpoint >= low) & (footpoint <= high), (echo_footpoint >= low) & (echo_footpoint <= high))
+    total = jnp.maximum(inside, -settings.max_occlusion_cost)
+    for gap, echo_gap in ((low - footpoint, low - echo_footpoint), (footpoint - high, echo_footpoint - high)):
+        silent = (missed.visibility > settings.gap_visibility) & (gap > settings.footpoint_margin)
+        next_silent = jnp.where(silent, gap, jnp.inf).min()
+        ends = jnp.log(jnp.clip(next_silent, settings.min_gap, settings.wall_length) / settings.wall_length)
+        beyond = jnp.maximum(missed.total(gap > 0, echo_gap > 0), ends)
+        total += jnp.where(jnp.isfinite(next_silent), beyond, 0)
+    return total
