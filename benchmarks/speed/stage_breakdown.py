@@ -63,13 +63,13 @@ def hough_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None 
 def ml_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = None) -> Stages:
     """A batch by maximum likelihood."""
     settings = settings or HoughSettings()
-    arcs, expected = arc_tables(ring, settings).arcs, kernels.Expectations()
+    arcs, expected = arc_tables(ring, settings).arcs, kernels.DetectionSettings()
     packed = [step.packed for step in _batches(ring, FlatEchoes.from_dense(ring, ranges), settings, SLOW_SCANS)]
     noise = jnp.asarray(np.nan, jnp.float32)
     found = list(ml_detections(ring, FlatEchoes.from_dense(ring, ranges), settings, None))
 
     def explain() -> Any:
-        return [kernels.explain(arcs, one, noise, settings=settings, expected=expected) for one in packed]
+        return [kernels.detect_ml(arcs, one, noise, hough_settings=settings, settings=expected) for one in packed]
 
     return {
         WHOLE: lambda: extract_lines(ring, ranges, method="ml", settings=settings),

@@ -93,7 +93,7 @@ def likeness(ring: Ring, scene: Scene, log: Log) -> Float[np.ndarray, "sensors s
 
     The other end of a cross echo is taken to be right; a pair that the ring does not listen to gives no echo.
     """
-    expected = kernels.Expectations()
+    expected = kernels.DetectionSettings()
     everyone = replace(ring, neighbors=ring.count // 2)
     listens = ring.path_index[tuple(everyone.paths.T)] >= 0
     blur = float(np.hypot(noise_of(scene), _BLUR))
@@ -104,7 +104,7 @@ def likeness(ring: Ring, scene: Scene, log: Log) -> Float[np.ndarray, "sensors s
         if not scene.solid[block].any():
             continue
         seen, wanted = outlook_of(everyone, scene, block)
-        share = seen.share * listens
+        share = seen.visibility * listens
         of = slice(int(log.start[block.start]), int(log.start[block.stop]))
         scan, tx, rx, reported = log.echo_scan[of] - first, log.tx[of], log.rx[of], log.range[of]
         direct, cross = np.flatnonzero(tx == rx), np.flatnonzero(tx != rx)
@@ -116,5 +116,5 @@ def likeness(ring: Ring, scene: Scene, log: Log) -> Float[np.ndarray, "sensors s
             where = (scan[echo, None, None], np.arange(share.shape[1])[:, None], paths[:, None, :])
             away = (reported[echo, None, None] - wanted[where]) / blur
             rate = (share[where] * np.exp(-0.5 * away**2) / (blur * np.sqrt(2 * np.pi))).sum(axis=1)
-            np.add.at(nats, sensor, np.log1p(expected.heard / expected.clutter * rate))
+            np.add.at(nats, sensor, np.log1p(expected.detection_probability / expected.clutter_density * rate))
     return nats

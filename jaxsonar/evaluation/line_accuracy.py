@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from jaxsonar.detection.local_map import LocalModel
-from jaxsonar.floor_plans.room import Room, lines_in
+from jaxsonar.floor_plans.room import Room, walls_in_robot_frame
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.sensors.range_models import plane_range
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.simulation.simulator import Kind, Simulation
+from jaxsonar.simulation.simulator import EchoKind, Simulation
 
 GATE_RHO = 0.10
 """Metres up to which a line counts as that wall; the paper's largest deviation is a third of it."""
@@ -86,7 +86,7 @@ def compare(
     position = np.asarray(ring.position)
     rows = [np.zeros((0, 4))]
     for index, (model, pose) in enumerate(zip(models, poses, strict=True)):
-        truth = np.stack(lines_in(room, pose), axis=-1)
+        truth = np.stack(walls_in_robot_frame(room, pose), axis=-1)
         mine = _plane_echoes(simulation, index)
         heard = np.bincount(simulation.reflector[mine], minlength=len(truth))
         expected = np.bincount(judge.reflector[_plane_echoes(judge, index)], minlength=len(truth)) >= CLEAR_ECHOES
@@ -161,7 +161,7 @@ def line_bound(
 
 
 def _plane_echoes(simulation: Simulation, scan: int) -> Bool[np.ndarray, " echoes"]:
-    return (simulation.scan == scan) & (simulation.kind == Kind.PLANE)
+    return (simulation.scan == scan) & (simulation.kind == EchoKind.PLANE)
 
 
 def _at_corner(

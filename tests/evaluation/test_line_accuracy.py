@@ -14,7 +14,7 @@ from support import oracles
 
 from jaxsonar import Line, LocalModel, Ring, Room, kernels, simulate
 from jaxsonar.evaluation.line_accuracy import CLEAR_ECHOES, GATE_RHO, GATE_THETA, compare, line_bound, match, pooled
-from jaxsonar.simulation.simulator import Kind
+from jaxsonar.simulation.simulator import EchoKind
 
 RECTANGLE = Room(
     np.array([[[-1, -1.2], [2.5, -1.2]], [[2.5, -1.2], [2.5, 1.6]], [[2.5, 1.6], [-1, 1.6]], [[-1, 1.6], [-1, -1.2]]])
@@ -199,7 +199,7 @@ def corner_from(pose, corner):
 def plane_echoes(simulation, scan, wall):
     """How many first-order echoes a wall gave in a scan, one by one."""
     rows = zip(simulation.scan, simulation.kind, simulation.reflector, strict=True)
-    return sum(s == scan and kind == Kind.PLANE and r == wall for s, kind, r in rows)
+    return sum(s == scan and kind == EchoKind.PLANE and r == wall for s, kind, r in rows)
 
 
 def judged(ring, lines_of_pose, poses=POSES, **more):
@@ -236,7 +236,7 @@ def test_deviations_have_their_sign_and_bound(faw_ring):
     wanted = []
     for scan in range(len(POSES)):
         for wall, line in enumerate(walls_from(POSES[scan])):
-            mine = (simulation.scan == scan) & (simulation.kind == Kind.PLANE) & (simulation.reflector == wall)
+            mine = (simulation.scan == scan) & (simulation.kind == EchoKind.PLANE) & (simulation.reflector == wall)
             if mine.any():
                 tx, rx = np.asarray(faw_ring.position)[faw_ring.paths[simulation.path[mine]].T]
                 wanted.append(line_bound(np.array(line), tx, rx, 0.001))
