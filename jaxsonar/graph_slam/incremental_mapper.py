@@ -14,8 +14,8 @@ from jaxsonar.detection.local_map_builder import hough_models
 from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import transform_points
-from jaxsonar.graph_slam.slam import Tracker
 from jaxsonar.graph_slam.submap_evidence import SubmapEvidence
+from jaxsonar.graph_slam.tracker import Tracker
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import assemble_map, check_merging, required_scans
 from jaxsonar.mapping.global_map import GlobalMap
@@ -93,7 +93,9 @@ class Mapper:
     def start(self) -> MapState:
         """A state that knows nothing."""
         nothing = MapEvidence.empty()
-        return MapState(nothing, WindowBuffer(), (), None if self._tracker is None else SubmapEvidence(self._tracker.start()))
+        return MapState(
+            nothing, WindowBuffer(), (), None if self._tracker is None else SubmapEvidence(self._tracker.start())
+        )
 
     def step(
         self,
@@ -157,7 +159,11 @@ class Mapper:
 
     def map(self, state: MapState) -> GlobalMap:
         """The map so far."""
-        evidence = state.evidence if state.submap_evidence is None else state.submap_evidence.evidence(self.ring) or state.evidence
+        evidence = (
+            state.evidence
+            if state.submap_evidence is None
+            else state.submap_evidence.evidence(self.ring) or state.evidence
+        )
         return assemble_map(evidence, merging=self.merging, min_scans=required_scans(self.window))
 
     def trajectory(self, state: MapState) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:

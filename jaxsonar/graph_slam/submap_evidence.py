@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.geometry.se2 import compose, wrap_angle
-from jaxsonar.graph_slam.slam import TrackerStep, Tracker, TrackerState
+from jaxsonar.graph_slam.tracker import Tracker, TrackerState, TrackerStep
 from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
@@ -43,7 +43,7 @@ class SubmapEvidence:
         for number, part in enumerate(self.scans):
             if not part:
                 continue
-            base = compose(self.tracker_state.start, self.tracker_state.graph.poses[number])
+            base = compose(self.tracker_state.world_from_first, self.tracker_state.graph.poses[number])
             known = self.cache.get(number)
             if known is None or known[1] != len(part) or _apart(base, known[0]):
                 known = (base, len(part), self._of(ring, number, base))

@@ -9,10 +9,10 @@ import pytest
 from jaxsonar import Ring, Room, kernels, local_model, simulate
 from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
 from jaxsonar.geometry.se2 import rotation, unit, wrap_angle
-from jaxsonar.graph_slam.frontend import Track, begin, finished, update
-from jaxsonar.graph_slam.joint_compatibility import Features, Known, match, seen_from
+from jaxsonar.graph_slam.frontend import SubmapState, close_submap, start_submap, update
+from jaxsonar.graph_slam.joint_compatibility import FeatureMeasurements, associate_features
 from jaxsonar.simulation.office import load_office
-from jaxsonar.simulation.simulator import Kind
+from jaxsonar.simulation.simulator import EchoKind
 
 RING = Ring.circular()
 PLANE, CORNER, EDGE = kernels.PLANE, kernels.CORNER, kernels.EDGE
@@ -96,7 +96,7 @@ def dense(mean, prior, path, ranges, rows=ROWS):
 def tracked(mean, prior, path, ranges, rows=ROWS, kinds=KINDS, anchors=ANCHORS):
     belief = kernels.Belief(mean[:3], scene_of(mean[3:].reshape(-1, 2), kinds, anchors), prior)
     found = kernels.ekf_update(belief, paths_of(path), ranges, rows.astype(np.int32), np.float64(SIGMA**2))
-    state = np.concatenate([found.belief.pose, np.asarray(found.belief.scene.parameters).ravel()])
+    state = np.concatenate([found.belief.pose, np.asarray(found.belief.landmarks.parameters).ravel()])
     return state, np.asarray(found.belief.covariance), found
 
 
@@ -187,7 +187,7 @@ def test_ranges_are_those_that_the_simulator_hears():
         half[:, None] * [-1.0, 1.0],
     )
     expected = np.asarray(kernels.expected_ranges(pose, scene, paths_of(np.arange(len(RING.paths)))))
-    wall = heard.kind == Kind.PLANE
+    wall = heard.kind == EchoKind.PLANE
     assert wall.sum() > 20
     np.testing.assert_allclose(expected[heard.reflector[wall], heard.path[wall]], heard.range[wall], atol=2e-6)
 
@@ -214,15 +214,13 @@ def known_of(walls, points=(), *, pose_sd=(0.05, 0.05, 0.02), own_sd=1e-3):
     size = 3 + 2 * count
     covariance = np.eye(size) * own_sd**2
     covariance[:3, :3] = np.diag(np.square(pose_sd))
-    return Known(
-        pose=np.zeros(3),
+    landmarks = kernels.Landmarks(
         kind=np.array([PLANE] * len(walls) + [CORNER] * len(points), np.int32),
         parameters=np.array([(0.0, theta) for _, theta in walls] + [(0.0, 0.0)] * len(points)).reshape(-1, 2),
         anchor=np.array([*foot, *points], dtype=np.float64).reshape(-1, 2),
-        ends=np.array([(-1.0, 1.0)] * len(walls) + [(0.0, 0.0)] * len(points)).reshape(-1, 2),
-        covariance=covariance,
-        scans=np.full(count, 3, np.int64),
+        extent=np.array([(-1.0, 1.0)] * len(walls) + [(0.0, 0.0)] * len(points)).reshape(-1, 2),
     )
+    return kernels.Belief(np.zeros(3), landmarks, covariance)
 
 
 def seen_of(walls, points=(), *, sd=1e-3):
@@ -231,32 +229,18 @@ def seen_of(walls, points=(), *, sd=1e-3):
         [rho * unit(np.array(theta)) + way * unit(np.array(theta + np.pi / 2)) for way in (-0.1, 0.1)]
         for rho, theta in walls
     ]
-    return Features(
+    return FeatureMeasurements(
         kind=np.array([PLANE] * len(walls) + [CORNER] * len(points), np.int32),
-        place=np.array([*walls, *points], dtype=np.float64).reshape(-1, 2),
-        cov=np.tile(np.eye(2) * sd**2, (count, 1, 1)),
+        parameters=np.array([*walls, *points], dtype=np.float64).reshape(-1, 2),
+        covariance=np.tile(np.eye(2) * sd**2, (count, 1, 1)),
         segment=np.array([*segments, *([p, p] for p in points)], dtype=np.float64).reshape(-1, 2, 2),
         echoes=np.full(count, 12),
     )
 
 
 def matched(known, seen):
-    found = match(known, seen, full=12.0)
-    return found.reflector.tolist(), found.fresh.tolist()
-
-
-def test_slopes_of_what_is_seen_are_differences():
-    known = known_of([(1.0, 0.2), (1.5, 2.0)], [(0.5, -0.8)])
-    known = replace(known, pose=np.array([0.1, 0.2, 0.4]))
-    _, slope = seen_from(known.pose, known)
-    for row in range(3):
-
-        def place(v, row=row):
-            parameters = known.parameters.copy()
-            parameters[row] = v[3:]
-            return seen_from(v[:3], replace(known, pose=v[:3], parameters=parameters))[0][row]
-
-        np.testing.assert_allclose(slope[row], slopes(place, np.append(known.pose, known.parameters[row])), atol=1e-8)
+    found = associate_features(known, seen, full_wall_echoes=12.0)
+    return found.landmark.tolist(), found.is_new.tolist()
 
 
 def test_each_is_the_others_nearest():
@@ -269,7 +253,7 @@ def test_each_is_the_others_nearest():
 def test_what_is_far_from_all_is_new():
     known = known_of([(1.0, 0.0)])
     assert matched(known, seen_of([(1.0, 0.0), (1.4, 1.8)], [(0.3, -0.9)])) == ([0, -1, -1], [False, True, True])
-    assert matched(begin().known, seen_of([(1.0, 0.0)])) == ([-1], [True])
+    assert matched(start_submap().belief, seen_of([(1.0, 0.0)])) == ([-1], [True])
 
 
 def test_pairs_must_agree_with_each_other():
@@ -308,39 +292,44 @@ def test_only_walls_that_should_be_heard_tell_that_the_robot_was_carried(distanc
     x, y = 1.5, 1.3
     room = Room(np.array([[[x, -y], [x, y]], [[x, y], [-x, y]], [[-x, y], [-x, -y]], [[-x, -y], [x, -y]]]))
     scan = simulate(RING, room, np.zeros((1, 3)), sigma=SIGMA, seed=1).as_log(RING, np.zeros((1, 3)))[0]
-    known = replace(known_of([(distance, 0.0), (distance, 2.0)]), scans=np.array([5, 5]))
+    known = known_of([(distance, 0.0), (distance, 2.0)])
     with jax.enable_x64(False):
         model = local_model(RING, scan, method="hough")
-    track = update(RING, Track(known), scan, model, row=7)
-    assert track.strange == int(carried)
-    assert (len(track.known) == 2) == carried
+    state = update(RING, SubmapState(known, np.array([5, 5])), scan, model, row=7)
+    assert state.track_loss_count == int(carried)
+    assert (len(state.scan_counts) == 2) == carried
+    assert len(state.belief.landmarks.kind) == len(state.scan_counts)
 
 
-def test_a_submap_forgets_what_one_scan_saw():
+def test_a_closed_submap_has_no_landmark_of_a_single_scan():
     known = known_of([(1.0, 0.0), (1.5, 1.0), (2.0, 2.0)])
     root = np.random.default_rng(0).standard_normal((9, 9))
-    known = replace(known, scans=np.array([3, 1, 2]), covariance=root @ root.T, pose=np.array([0.5, 0.1, 0.2]))
+    known = replace(known, covariance=root @ root.T, pose=np.array([0.5, 0.1, 0.2]))
     poses = tuple(np.full(3, 0.1 * k) for k in range(4))
-    track = Track(known, rows=(4, 5, 6, 7), poses=poses, covs=tuple(np.eye(3) * k for k in range(4)))
-    submap = finished(track)
-    np.testing.assert_array_equal(submap.anchor, known.anchor[[0, 2]])
+    covariances = tuple(np.eye(3) * k for k in range(4))
+    state = SubmapState(known, np.array([3, 1, 2]), rows=(4, 5, 6, 7), poses=poses, covariances=covariances)
+    submap = close_submap(state)
+    np.testing.assert_array_equal(submap.anchor, known.landmarks.anchor[[0, 2]])
     np.testing.assert_array_equal(
         submap.covariance, known.covariance[np.ix_([0, 1, 2, 3, 4, 7, 8], [0, 1, 2, 3, 4, 7, 8])]
     )
     np.testing.assert_array_equal(submap.exit, known.pose)
     assert submap.rows.tolist() == [4, 5, 6, 7]
     np.testing.assert_array_equal(submap.poses, poses)
-    lost = finished(track, lost=True)
+    lost = close_submap(replace(state, track_loss_count=3))
     assert (np.diag(lost.covariance - submap.covariance)[:3] > 0.2).all()
     np.testing.assert_allclose(submap.segments[0], [[1.0, -1.0], [1.0, 1.0]], atol=1e-12)
 
 
-def test_the_next_submap_begins_at_its_own_origin():
+def test_the_next_submap_starts_at_its_own_origin():
     known = known_of([(1.0, 0.0)])
-    before = Track(known, rows=(0, 1), odometry=np.array([1.0, 2.0, 3.0]), squares=4e-6, free=4.0)
-    after = begin(before)
-    assert not len(after.known)
+    before = SubmapState(
+        known, np.array([3]), rows=(0, 1), odometry=np.array([1.0, 2.0, 3.0]), sum_of_squares=4e-6, dof=4.0
+    )
+    after = start_submap(before)
+    assert not len(after.belief.landmarks.kind)
+    assert not len(after.scan_counts)
     assert not after.rows
     assert not after.pose.any()
-    assert not after.covariance.any()
+    assert not after.pose_covariance.any()
     assert after.sigma == before.sigma == pytest.approx(0.001)

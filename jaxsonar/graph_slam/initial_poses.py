@@ -1,0 +1,143 @@
+"""First estimate of all poses of a log, before smoothing: tracked with odometry, or registered without."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsonar.detection.extract import local_models
+from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.geometry.se2 import compose, relative, wrap_angle
+from jaxsonar.graph_slam.tracker import Tracker, TrackerState
+from jaxsonar.loop_closure.closure_candidate import ACCEPTED
+from jaxsonar.loop_closure.submap_graph import SubmapGraph
+from jaxsonar.registration.agglomerative import register_by_ranges
+from jaxsonar.registration.sequential import register_scans
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.ring import Ring
+from jaxsonar.smoothing.covisibility import Traversals
+from jaxsonar.smoothing.smoother import BLUR
+
+Progress = Callable[[str, int, int], None]
+"""Called with the current task, the number of finished scans, and the number of scans; (0, 0) where it is unknown."""
+
+MAX_REGISTERED_BY_RANGES = 64
+"""Scans; a log without odometry is registered by ranges up to this length, which takes some seconds for each scan.
+Longer logs are registered by walls and corners alone, which leaves more scans without a pose. Chosen by hand."""
+
+
+class LoopClosure(NamedTuple):
+    """A loop closure between two submaps."""
+
+    first: int
+    """Row of the first scan of the earlier submap."""
+    second: int
+    """Row of the first scan of the later submap."""
+    first_from_second: Float[np.ndarray, "3"]
+    """Pose of the later submap in the frame of the earlier one, metres and radians."""
+    state: str
+    """One of "counted" (in the graph), "withdrawn" (accepted, later rejected),
+    "refused" (rejected), "proposed" (not verified)."""
+    determined: Float[np.ndarray, "3 rank"]
+    """Unit vectors of (x, y, theta) that the measurement determines, in the earlier frame. Parallel walls leave one
+    direction undetermined; there ``first_from_second`` is that of the graph."""
+
+
+@dataclass(frozen=True, eq=False)
+class InitialPoses:
+    """Poses of a log before smoothing."""
+
+    poses: Float[np.ndarray, "scans 3"]
+    """world_from_robot; NaN for scans without an estimate."""
+    covariance: Float[np.ndarray, "scans 3 3"]
+    """With respect to the first scan; NaN where it is not estimated."""
+    closures: tuple[LoopClosure, ...] = ()
+    traversals: Traversals | None = None
+    """The submaps and how well they are known relative to each other; None without submaps."""
+
+
+def detect(ring: Ring, log: Log, *, sigma: float | None, progress: Progress) -> list[LocalModel]:
+    """The local models of all scans."""
+    models: list[LocalModel] = []
+    for model in local_models(ring, log, sigma=sigma):
+        models.append(model)
+        progress("local models", len(models), len(log))
+    return models
+
+
+def track(
+    tracker: Tracker, log: Log, models: Sequence[LocalModel] | None, *, progress: Progress
+) -> tuple[TrackerState, list[LocalModel], Float[np.ndarray, " scans"]]:
+    """Track all scans of a log with odometry.
+
+    Args:
+        tracker: estimates the poses.
+        log: scans whose poses are odometry.
+        models: local models of all scans; None: the tracker detects them.
+        progress: is informed after each scan.
+
+    Returns:
+        The last state, the local models, and the milliseconds that each scan took.
+    """
+    state, found, step_ms = tracker.start(), [], np.zeros(len(log))
+    for row in range(len(log)):
+        begin = perf_counter()
+        state, step = tracker.step(state, log[row], model=None if models is None else models[row])
+        step_ms[row] = 1e3 * (perf_counter() - begin)
+        found.append(step.model)
+        progress("tracking", row + 1, len(log))
+    return state, found, step_ms
+
+
+def close_loops(tracker: Tracker, state: TrackerState) -> InitialPoses:
+    """Finish the loop closures of a tracked log; all poses after that."""
+    state = tracker.finish(state)
+    poses, covariance = tracker.poses(state)
+    return InitialPoses(poses, covariance, loop_closures(state.graph), submap_traversals(state))
+
+
+def register(
+    ring: Ring, log: Log, models: Sequence[LocalModel], *, sigma: float | None, progress: Progress
+) -> InitialPoses:
+    """Register the scans of a log without odometry; scans outside of the largest reliable cluster have no pose."""
+
+    def report(done: int, total: int) -> None:
+        progress("placing", done, total)
+
+    if len(log) <= MAX_REGISTERED_BY_RANGES:
+        cluster = register_by_ranges(ring, log, models, sigma=sigma, progress=report)[0]
+        return InitialPoses(cluster.poses, cluster.pose_covariance)
+    poses = register_scans(models, None, noise_scale=BLUR, progress=report)[0]
+    return InitialPoses(poses, np.full((len(log), 3, 3), np.nan))
+
+
+def submap_traversals(state: TrackerState) -> Traversals | None:
+    """The submaps of a finished run, and the covariances of their relative poses; None without submaps."""
+    submaps = state.graph.submaps
+    if not submaps:
+        return None
+    segment = np.full(state.scan_count, -1)
+    for number, submap in enumerate(submaps):
+        segment[submap.rows] = number
+    segment = np.maximum(np.maximum.accumulate(segment), 0)
+    nodes = np.arange(len(submaps))
+    covariances = state.graph.graph.relative_covariances(nodes)
+    return Traversals(segment, compose(state.world_from_first, state.graph.poses[nodes]), covariances)
+
+
+def loop_closures(graph: SubmapGraph) -> tuple[LoopClosure, ...]:
+    """The loop closures of a graph, by the rows of scans."""
+    first_row = [int(submap.rows[0]) for submap in graph.submaps]
+    closures = []
+    for candidate in graph.verifier.candidates:
+        estimate = relative(graph.poses[candidate.earlier], graph.poses[candidate.newest])
+        basis = candidate.measurement.basis
+        residual = candidate.measurement.earlier_from_newest - estimate
+        residual[2] = wrap_angle(float(residual[2]))
+        pose = estimate + basis @ (basis.T @ residual)
+        state = "counted" if candidate.state == ACCEPTED else candidate.state
+        closures.append(LoopClosure(first_row[candidate.earlier], first_row[candidate.newest], pose, state, basis))
+    return tuple(closures)
