@@ -26,8 +26,8 @@ from .graph_slam.incremental_mapper import Mapper as Mapper
 from .graph_slam.incremental_mapper import MapState as MapState
 from .graph_slam.incremental_mapper import StepInfo as StepInfo
 from .graph_slam.slam import Slam as Slam
-from .graph_slam.slam import Tracker as Tracker
 from .graph_slam.slam import slam as slam
+from .graph_slam.tracker import Tracker as Tracker
 from .hardware.errors import SonarError as SonarError
 from .kernels.hough_accumulator import HoughSettings as HoughSettings
 from .live.live_map import LiveMap as LiveMap

@@ -24,10 +24,11 @@ from rich.table import Table
 from benchmarks.detection.accuracy import versions, without_nan
 from jaxsonar import Log, Ring, Room, SonarError, calibrate, random_pose, random_room, simulate
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder
-from jaxsonar.floor_plans.room import point_to_walls
-from jaxsonar.geometry.se2 import composed, relative, wrap_angle
+from jaxsonar.geometry.se2 import compose, relative, wrap_angle
+from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.simulation.office import load_office
-from jaxsonar.simulation.simulator import Kind, Simulation
+from jaxsonar.simulation.simulator import Simulation
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 SIGMA = 0.001
 """Metres; noise of the ranges."""
@@ -45,7 +46,7 @@ NUDGE = 1e-6
 """Metres, radians or relative; of the central differences."""
 CONVERGED = 3.0
 """Root mean square of the errors over that of the bound, and whitened, up to which a start led to the right ring."""
-FIRST_ORDER = (Kind.PLANE, Kind.CORNER, Kind.EDGE, Kind.POLE)
+FIRST_ORDER = (EchoKind.PLANE, EchoKind.CORNER, EchoKind.EDGE, EchoKind.POLE)
 TIMED = 25, 100, 1000
 
 
@@ -122,7 +123,7 @@ def path_in(room: Room, rng: np.random.Generator, count: int) -> Float[np.ndarra
         ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         to = poses[-1][:2] + rng.uniform(*STEP, len(sharp))[:, None] * ahead
         # No step is long enough to pass through a wall that both of its ends are clear of.
-        clear = (point_to_walls(to, room.walls) >= CLEARANCE).all(axis=1)
+        clear = (point_to_segments(to, room.walls) >= CLEARANCE).all(axis=1)
         clear &= (np.linalg.norm(to[:, None] - room.poles, axis=-1) >= CLEARANCE).all(axis=1)
         if not clear.any():
             poses = [random_pose(rng, room, clearance=CLEARANCE)]  # a nook: begin elsewhere
@@ -140,7 +141,7 @@ def slipped(
     steps *= 1 + share * rng.standard_normal(steps.shape)
     out = [poses[0]]
     for step in steps:
-        out.append(composed(out[-1], step))
+        out.append(compose(out[-1], step))
     return np.array(out)
 
 
@@ -169,7 +170,7 @@ def reports(
     wall = np.sqrt(np.maximum(base + 4 * height[:, 0] * height[:, 1], 0)) / 2
     corner = np.linalg.norm(at.mean(axis=1) - place, axis=-1)
     edge = np.linalg.norm(at - place[:, None], axis=-1).mean(axis=1)
-    return np.select([kind == Kind.PLANE, kind == Kind.CORNER], [wall, corner], edge) * scale
+    return np.select([kind == EchoKind.PLANE, kind == EchoKind.CORNER], [wall, corner], edge) * scale
 
 
 def scene(room: Room, heard: Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -178,12 +179,12 @@ def scene(room: Room, heard: Simulation) -> tuple[np.ndarray, np.ndarray, np.nda
     found, own = np.unique(np.stack([heard.kind, heard.reflector])[:, first], axis=1, return_inverse=True)
     places = np.zeros((found.shape[1], 2))
     for k, (kind, number) in enumerate(found.T):
-        if kind == Kind.PLANE:
+        if kind == EchoKind.PLANE:
             along = room.walls[number, 1] - room.walls[number, 0]
             theta = np.arctan2(-along[0], along[1])
             places[k] = room.walls[number, 0] @ [np.cos(theta), np.sin(theta)], theta
         else:
-            places[k] = (room.poles if kind == Kind.POLE else room.junctions.vertices)[number]
+            places[k] = (room.poles if kind == EchoKind.POLE else room.junctions.vertices)[number]
     return first, own.ravel(), places
 
 

@@ -33,10 +33,11 @@ from benchmarks.detection.plots import ANSWERS, KINDS
 from jaxsonar import LocalModel, Log, Ring, Room, local_models, random_pose, random_room, simulate
 from jaxsonar.evaluation.line_accuracy import CLEAR_ECHOES, line_bound, match
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder
-from jaxsonar.floor_plans.room import lines_in
+from jaxsonar.floor_plans.room import walls_in_robot_frame
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.reports import plot_style as figures
-from jaxsonar.simulation.simulator import Acoustics, Kind
+from jaxsonar.simulation.acoustics import Acoustics
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 POSES = 4
 """Poses in each room; 64 rooms fill a batch of 256 scans, 12 (quick) three of 16, so that few programs compile."""
@@ -238,19 +239,19 @@ def reflectors_in(
 
     Walls on one line, as the two parts beside a door, are one plane.
     """
-    walls = np.stack(lines_in(room, pose), axis=-1)
+    walls = np.stack(walls_in_robot_frame(room, pose), axis=-1)
     apart = np.abs(walls[:, None] - walls)
     line = ((apart[..., 0] < 1e-6) & (np.minimum(apart[..., 1], 2 * np.pi - apart[..., 1]) < 1e-6)).argmax(axis=1)
     vertices = room.junctions.vertices
     points = np.concatenate([vertices, vertices, room.poles]) - pose[:2]
     seen = np.stack([np.hypot(*points.T), wrap_angle(np.arctan2(points[:, 1], points[:, 0]) - pose[2])], axis=-1)
     first = {
-        Kind.CORNER: len(walls),
-        Kind.EDGE: len(walls) + len(vertices),
-        Kind.POLE: len(walls) + 2 * len(vertices),
+        EchoKind.CORNER: len(walls),
+        EchoKind.EDGE: len(walls) + len(vertices),
+        EchoKind.POLE: len(walls) + 2 * len(vertices),
     }
     owner = np.full(len(kind), -1)
-    plane = kind == Kind.PLANE
+    plane = kind == EchoKind.PLANE
     owner[plane] = line[reflector[plane]]
     for of, begin in first.items():
         owner[kind == of] = begin + reflector[kind == of]
@@ -295,7 +296,7 @@ def echoes_of_one(condition: Condition, room: Room, pose, place, kind: str, toge
     heard = simulate(
         ring, room, pose, sigma=condition.sigma, seed=seed, max_echoes=9, blanking=0.0, acoustics=everything
     )
-    own = heard.kind == Kind[kind.upper()]
+    own = heard.kind == EchoKind[kind.upper()]
     scan, row = np.divmod(heard.scan[own], together)
     path, kinds = heard.path[own], np.full(together, KINDS.index(kind))
     scans = len(pose) // together

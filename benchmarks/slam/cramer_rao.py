@@ -16,8 +16,8 @@ from benchmarks.calibration.accuracy import LOOSE, NUDGE, reports
 from benchmarks.calibration.accuracy import scene as reflectors_of
 from benchmarks.slam.scenarios import DISTANCE, TURN, Scene
 from jaxsonar.geometry.se2 import relative, wrap_angle
-from jaxsonar.simulation.simulator import Kind
-from jaxsonar.simulation.wheel_odometry import step_sd
+from jaxsonar.simulation.traced_echoes import EchoKind
+from jaxsonar.simulation.wheel_odometry import odometry_step_sd
 
 EXACT = 1e-5
 """Metres and radians: what is exact in odometry (a robot that turns on the spot stays there) is known so well."""
@@ -128,7 +128,7 @@ class _Slopes:
 
 def _links(poses: np.ndarray, distance: float, turn: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Information of every step: on the pose before it, on the one after it, and between these, (steps, 3, 3) each."""
-    sd = np.maximum(step_sd(poses, distance=distance, turn=turn), EXACT)
+    sd = np.maximum(odometry_step_sd(poses, distance=distance, turn=turn), EXACT)
     step = relative(poses[:-1], poses[1:])
     ahead = np.arctan2(step[:, 1], step[:, 0])
     c, s = np.cos(ahead), np.sin(ahead)
@@ -177,7 +177,7 @@ class _Chain:
 
 def _walls(scene: Scene, slopes: _Slopes, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Number, variance of the distance in the middle, and of the direction, of every wall that was heard."""
-    row = np.flatnonzero(slopes.kinds[:, 0] == Kind.PLANE)
+    row = np.flatnonzero(slopes.kinds[:, 0] == EchoKind.PLANE)
     number = slopes.kinds[row, 1]
     middle = scene.room.walls[number].mean(axis=1)
     theta = slopes.places[row, 1]

@@ -20,8 +20,9 @@ from shapely.ops import unary_union
 from jaxsonar import Log, Ring, Room, random_pose, random_room, simulate
 from jaxsonar.geometry.se2 import unit, wrap_angle
 from jaxsonar.simulation.office import load_office
-from jaxsonar.simulation.simulator import Kind, Simulation
-from jaxsonar.simulation.wheel_odometry import drifted
+from jaxsonar.simulation.simulator import Simulation
+from jaxsonar.simulation.traced_echoes import EchoKind
+from jaxsonar.simulation.wheel_odometry import simulate_odometry
 
 SIGMA = 0.001
 """Metres; noise of the ranges."""
@@ -72,7 +73,7 @@ class Scene:
 
     def odometry(self, seed: int = 0) -> Float[np.ndarray, "scans 3"]:
         """The poses as the wheels tell them."""
-        return drifted(self.poses, distance=DISTANCE, turn=TURN, seed=seed)
+        return simulate_odometry(self.poses, distance=DISTANCE, turn=TURN, seed=seed)
 
     def log(self, seed: int = 0) -> Log:
         """What the robot has: echoes, and odometry of this seed."""
@@ -90,7 +91,7 @@ def one_scan(seed: int = 0, **errors: Any) -> Scene:
         room = random_room(rng)
         scene = Scene(f"one scan {seed}", room, random_pose(rng, room, clearance=0.45)[None], seed=seed, **errors)
         heard = scene.heard
-        wall, echoes = np.unique(heard.reflector[heard.kind == Kind.PLANE], return_counts=True)
+        wall, echoes = np.unique(heard.reflector[heard.kind == EchoKind.PLANE], return_counts=True)
         along = (room.walls[:, 1] - room.walls[:, 0])[wall[echoes >= 6]]
         direction = along / np.linalg.norm(along, axis=-1, keepdims=True)
         if np.abs(direction[:, :1] * direction[:, 1] - direction[:, 1:] * direction[:, 0]).max(initial=0) > 0.3:

@@ -45,12 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """``jaxsonar emulate``."""
     from jaxsonar.hardware.device_emulator import emulate as emulate_device
-    from jaxsonar.hardware.fault_injection import Faults, parse_stall
+    from jaxsonar.hardware.fault_injection import FaultSettings, parse_stall
     from jaxsonar.hardware.transport_servers import listen
     from jaxsonar.sensors.ring_toml import load_ring
 
     stall, every = parse_stall(options.stall) if options.stall else (0.0, 10.0)
-    faults = Faults(
+    faults = FaultSettings(
         corrupt=options.corrupt,
         drop=options.drop,
         reorder=options.reorder,
@@ -86,7 +86,7 @@ def _messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
         raise SonarError("a room came without --path; needed is the way through it, --path CSV")
     from jaxsonar.floor_plans.room_geojson import load_room
     from jaxsonar.simulation.device_messages import room_messages
-    from jaxsonar.simulation.poses_csv import load_path
+    from jaxsonar.simulation.poses_csv import load_poses
 
-    poses, stamps = load_path(options.path)
+    poses, stamps = load_poses(options.path)
     return room_messages(ring, load_room(options.log), poses, stamps, sigma=options.sigma, seed=options.seed)

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.scans.log_file import save_log
     from jaxsonar.scans.scan_log import log_format
     from jaxsonar.sensors.ring_toml import load_ring
-    from jaxsonar.simulation.poses_csv import load_path
+    from jaxsonar.simulation.poses_csv import load_poses
     from jaxsonar.simulation.simulator import simulate as simulate_scans
 
     beside = settings_beside(options.output)
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> None:
     if options.output != "-":
         log_format(options.output)  # complain before the work, not after it
     ring, room = load_ring(options.ring), load_room(options.room)
-    poses, stamps = load_path(options.path)
+    poses, stamps = load_poses(options.path)
     with progress_bar("scans", len(poses)) as show:
         simulation = simulate_scans(
             ring,
@@ -89,11 +89,11 @@ def _logged_poses(poses: "np.ndarray", options: argparse.Namespace) -> "np.ndarr
     """The poses that a simulated log has in it: the true ones, none, or those of odometry."""
     import numpy as np
 
-    from jaxsonar.simulation.wheel_odometry import drifted
+    from jaxsonar.simulation.wheel_odometry import simulate_odometry
 
     if options.no_odometry:
         return np.full_like(poses, np.nan)
     if options.odometry is None:
         return poses
     percent, degrees = options.odometry
-    return drifted(poses, distance=percent / 100, turn=float(np.radians(degrees)), seed=options.seed)
+    return simulate_odometry(poses, distance=percent / 100, turn=float(np.radians(degrees)), seed=options.seed)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.evaluation.laser_segments import polygonal_model
-from jaxsonar.floor_plans.room import ranges_in
+from jaxsonar.floor_plans.room import laser_ranges
 from jaxsonar.geometry.se2 import transform_points, unit
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.occupancy.occupancy_grid import OccupancyGrid
@@ -47,7 +47,7 @@ def draw(
     ring, room, poses = office.ring, office.room, office.poses
     first = poses[0]
     bearing = np.arange(BEAMS) * (2 * np.pi / BEAMS) - np.pi
-    ranges = ranges_in(room, first, bearing)
+    ranges = laser_ranges(room, first, bearing)
     seen = transform_points(first, (ranges[:, None] * unit(bearing))[np.isfinite(ranges)])
     laser = polygonal_model(bearing, ranges).moved(first)
     return {

@@ -29,11 +29,11 @@ from jaxsonar.scans.log_file import save_log
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_toml import save_ring
-from jaxsonar.simulation.image_sources import Kind
 from jaxsonar.simulation.office import Office, load_office
-from jaxsonar.simulation.poses_csv import save_path
+from jaxsonar.simulation.poses_csv import save_poses
 from jaxsonar.simulation.random_rooms import random_pose, random_room
 from jaxsonar.simulation.simulator import Simulation, simulate
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 SIGMA = 0.003
 """Range noise of every scan in the demo, metres."""
@@ -104,7 +104,7 @@ def run_demo(
     on_step("files and figures")
     save_ring(office.ring, output / "ring.toml")
     save_room(office.room, output / "office.geojson")
-    save_path(office.poses, office.stamps, output / "path.csv")
+    save_poses(office.poses, office.stamps, output / "path.csv")
     save_log(log, output / "office.csv")
     save_models(models, output / "lines.jsonl")
     save_settings(hough_settings(office.ring, None), output / "lines.settings.toml")
@@ -124,7 +124,7 @@ def run_demo(
 
 def walls_in_reach(simulation: Simulation, room: Room, scans: int) -> Bool[np.ndarray, " walls"]:
     """Walls with so many echoes in one of the scans that it should show them."""
-    plane = simulation.kind == Kind.PLANE
+    plane = simulation.kind == EchoKind.PLANE
     heard = np.zeros((scans, len(room.walls)), dtype=np.int64)
     np.add.at(heard, (simulation.scan[plane], simulation.reflector[plane]), 1)
     return np.any(heard >= CLEAR_ECHOES, axis=0)

@@ -13,7 +13,8 @@ from jaxsonar.floor_plans.room import Room, walls_in_robot_frame
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.sensors.range_models import plane_range
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.simulation.simulator import EchoKind, Simulation
+from jaxsonar.simulation.simulator import Simulation
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 GATE_RHO = 0.10
 """Metres up to which a line counts as that wall; the paper's largest deviation is a third of it."""

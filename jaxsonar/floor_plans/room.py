@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.geometry.segments import cross, crossings, point_to_segments
 from jaxsonar.hardware.errors import SonarError
 
 TOUCH = 1e-3
@@ -93,29 +94,7 @@ class Room:
         return _junctions(self.walls)
 
 
-def point_to_walls(
-    points: Float[np.ndarray, "points 2"], walls: Float[np.ndarray, "walls 2 2"]
-) -> Float[np.ndarray, "points walls"]:
-    """Distance of every point from every wall, metres."""
-    start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
-    offset = points[:, None] - start
-    share = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
-    return np.linalg.norm(offset - share[..., None] * along, axis=-1)
-
-
-def crossings(
-    first: Float[np.ndarray, "a 2 2"], second: Float[np.ndarray, "b 2 2"]
-) -> tuple[Float[np.ndarray, "a b"], Float[np.ndarray, "a b"]]:
-    """Where the lines through every two segments cross, as shares (0 start, 1 end) of both; NaN if parallel."""
-    u = (first[:, 1] - first[:, 0])[:, None]
-    v = (second[:, 1] - second[:, 0])[None]
-    offset = second[None, :, 0] - first[:, None, 0]
-    turn = cross(u, v)
-    turn = np.where(np.abs(turn) > 1e-12, turn, np.nan)
-    return cross(offset, v) / turn, cross(offset, u) / turn
-
-
-def lines_in(
+def walls_in_robot_frame(
     room: Room, world_from_robot: Float[np.ndarray, " 3"]
 ) -> tuple[Float[np.ndarray, " walls"], Float[np.ndarray, " walls"]]:
     """The line through each wall as a robot sees it: (rho, theta) with n(theta) . p = rho in the robot frame.
@@ -136,7 +115,7 @@ def lines_in(
     return np.abs(rho), wrap_angle(theta)
 
 
-def ranges_in(
+def laser_ranges(
     room: Room, pose: Float[np.ndarray, " 3"], bearing: Float[np.ndarray, " beams"]
 ) -> Float[np.ndarray, " beams"]:
     """How far a laser at a pose sees along each beam, metres; NaN where it meets no wall.
@@ -153,11 +132,6 @@ def ranges_in(
     meets = (way > 0) & (share >= 0) & (share <= 1)  # False for NaN, a parallel wall
     nearest = np.where(meets, way, np.inf).min(axis=1, initial=np.inf)
     return np.where(np.isfinite(nearest), nearest, np.nan)
-
-
-def cross(u: Float[np.ndarray, "*#batch 2"], v: Float[np.ndarray, "*#batch 2"]) -> Float[np.ndarray, "..."]:
-    """Cross product of vectors in the plane: positive where v is counter-clockwise from u."""
-    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
 def _closed(walls: np.ndarray) -> np.ndarray:
@@ -192,7 +166,7 @@ def _junctions(walls: np.ndarray) -> Junctions:
         if (np.linalg.norm(np.array(vertices) - point, axis=-1) > TOUCH).all():
             vertices.append(tuple(point.tolist()))
     corners = np.array(vertices).reshape(-1, 2)
-    touching = point_to_walls(corners, walls) <= TOUCH
+    touching = point_to_segments(corners, walls) <= TOUCH
     rows: list[tuple[int, float, float, float, float]] = []
     right_angled = np.zeros((len(walls), len(walls)), dtype=bool)
     for vertex, point in enumerate(corners):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxsonar.floor_plans.room import Room, lines_in
+from jaxsonar.floor_plans.room import Room, walls_in_robot_frame
 from jaxsonar.mapping.global_map import GlobalMap
 
 _SD = 1e-6
@@ -13,7 +13,7 @@ _ECHOES = 1000
 
 def map_from_room(room: Room) -> GlobalMap:
     """The walls of a floor plan as a global map. Poles are left out."""
-    rho, theta = lines_in(room, np.zeros(3))
+    rho, theta = walls_in_robot_frame(room, np.zeros(3))
     count = len(room.walls)
     sd = np.full(count, _SD)
     return GlobalMap(np.array(room.walls), rho, theta, sd, sd, np.full(count, _ECHOES), ((0, 1),) * count)

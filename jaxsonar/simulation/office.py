@@ -10,7 +10,7 @@ from jaxsonar.floor_plans.room import Room
 from jaxsonar.floor_plans.room_geojson import load_room
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_toml import load_ring
-from jaxsonar.simulation.poses_csv import load_path
+from jaxsonar.simulation.poses_csv import load_poses
 
 
 class Office(NamedTuple):
@@ -28,4 +28,4 @@ def load_office() -> Office:
     """The office as it is shipped: walls up to 2 m from the first pose, recesses, and a chair back-rest."""
     folder = files("jaxsonar") / "data"
     with as_file(folder / "office.geojson") as room, as_file(folder / "office-path.csv") as path:
-        return Office(load_ring("faw"), load_room(room), *load_path(path))
+        return Office(load_ring("faw"), load_room(room), *load_poses(path))

@@ -8,12 +8,12 @@ from jaxtyping import Float
 
 from jaxsonar.fileio.atomic_files import DECIMAL, atomic_write, read_bytes, shown
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.simulation.simulator import SECONDS_PER_SCAN
+from jaxsonar.simulation.simulator import SCAN_PERIOD
 
 NUMBER = re.compile(DECIMAL)
 
 
-def save_path(
+def save_poses(
     poses: Float[np.ndarray, "poses 3"], stamps: Float[np.ndarray, " poses"], path: str | os.PathLike[str]
 ) -> None:
     """Write poses and stamps so that ``load_path`` gives the same ones."""
@@ -23,7 +23,7 @@ def save_path(
             file.write(",".join(map(repr, (stamp, *pose))) + "\n")
 
 
-def load_path(
+def load_poses(
     path: str | os.PathLike[str],
 ) -> tuple[Float[np.ndarray, "poses 3"], Float[np.ndarray, " poses"]]:
     """Poses and stamps from CSV with the columns x, y (metres), theta (radians) and optionally stamp (seconds).
@@ -69,4 +69,4 @@ def load_path(
         place = f"{shown(path)}: row {number}, column stamp"
         raise SonarError(f"{place}: {came} came; allowed is no earlier than in the row before")
     poses = np.stack([column_of["x"], column_of["y"], column_of["theta"]], axis=-1)
-    return poses, column_of.get("stamp", np.arange(len(poses)) * SECONDS_PER_SCAN)
+    return poses, column_of.get("stamp", np.arange(len(poses)) * SCAN_PERIOD)

@@ -3,7 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxsonar.floor_plans.room import Room, crossings, point_to_walls
+from jaxsonar.floor_plans.room import Room
+from jaxsonar.geometry.segments import crossings, point_to_segments
 from jaxsonar.hardware.errors import SonarError
 
 
@@ -76,7 +77,7 @@ def random_pose(rng: np.random.Generator, room: Room, *, clearance: float = 0.45
 
 def _free(room: Room, points: np.ndarray, clearance: float) -> np.ndarray:
     """Which points lie inside, with walls in every one of 64 directions, and clear of everything."""
-    inside = (point_to_walls(points, room.walls) >= clearance).all(axis=1)
+    inside = (point_to_segments(points, room.walls) >= clearance).all(axis=1)
     inside &= (np.linalg.norm(points[:, None] - room.poles, axis=-1) >= clearance).all(axis=1)
     kept = np.flatnonzero(inside)
     angle = 2 * np.pi * np.arange(64) / 64

@@ -10,7 +10,7 @@ ACROSS = 0.5
 """Sideways error of a step, as a share of that along it: wheels roll along and slip across."""
 
 
-def drifted(
+def simulate_odometry(
     poses: Float[np.ndarray, "scans 3"],
     *,
     distance: float,
@@ -50,7 +50,9 @@ def drifted(
     if len(poses) < 2:
         return poses.copy()
     steps = relative(poses[:-1], poses[1:])
-    error = step_sd(poses, distance=distance, turn=turn) * np.random.default_rng(seed).standard_normal(steps.shape)
+    error = odometry_step_sd(poses, distance=distance, turn=turn) * np.random.default_rng(seed).standard_normal(
+        steps.shape
+    )
     way = np.linalg.norm(steps[:, :2], axis=-1, keepdims=True)
     along = np.divide(steps[:, :2], way, out=np.zeros((len(steps), 2)), where=way > 0)
     across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
@@ -62,7 +64,9 @@ def drifted(
     return np.column_stack([place, wrap_angle(heading)])
 
 
-def step_sd(poses: Float[np.ndarray, "scans 3"], *, distance: float, turn: float) -> Float[np.ndarray, "steps 3"]:
+def odometry_step_sd(
+    poses: Float[np.ndarray, "scans 3"], *, distance: float, turn: float
+) -> Float[np.ndarray, "steps 3"]:
     """Standard deviations of the steps between poses: along and across the step (metres), heading (radians).
 
     Args:

@@ -16,17 +16,16 @@ import pytest
 
 import jaxsonar
 from jaxsonar import Log, SonarError, batch, load_log, load_ring, local_models, save_log
-from jaxsonar.batch_jobs import process_pool as engines
-from jaxsonar.batch_jobs import worker as batch_worker
+from jaxsonar.batch_jobs import process_pool, worker_environment
 from jaxsonar.batch_jobs.inputs import Input, find_inputs
-from jaxsonar.batch_jobs.manifest import opened
-from jaxsonar.batch_jobs.parquet_tables import TABLES, parquet
-from jaxsonar.batch_jobs.scan_tables import tables
-from jaxsonar.batch_jobs.shards import shards_of
-from jaxsonar.batch_jobs.worker import do, job_of
+from jaxsonar.batch_jobs.manifest import open_manifest
+from jaxsonar.batch_jobs.parquet_tables import TABLES, encode_parquet
+from jaxsonar.batch_jobs.scan_tables import scan_tables
+from jaxsonar.batch_jobs.shards import split_input
+from jaxsonar.batch_jobs.worker import job_spec, run_shard
 from jaxsonar.detection.settings import hough_settings
 from jaxsonar.scans.log_chunks import csv_parts, csv_reader, parquet_parts, parquet_reader
-from jaxsonar.simulation.poses_csv import load_path
+from jaxsonar.simulation.poses_csv import load_poses
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -46,7 +45,7 @@ HEADER = "scan,stamp,x,y,theta,tx,rx,range\n"
 def office(scans, *, first=0):
     """Scans of the office, as often as it takes; one of them heard nothing, some have no pose."""
     data = Path(jaxsonar.__file__).with_name("data")
-    poses, stamps = load_path(data / "office-path.csv")
+    poses, stamps = load_poses(data / "office-path.csv")
     room = jaxsonar.load_room(data / "office.geojson")
     seen = jaxsonar.simulate(RING, room, poses, sigma=0.003, seed=first, stamps=stamps).as_log(RING, poses)
     rows = [seen[k % len(seen)] for k in range(scans)]
@@ -90,11 +89,11 @@ def manifest(folder):
 def found(log, *, method, rows=None):
     rows = np.arange(len(log)) if rows is None else rows
     settings = hough_settings(RING, None)
-    return tables(RING, log, rows, source="log", method=method, settings=settings, sigma=None)
+    return scan_tables(RING, log, rows, source="log", method=method, settings=settings, sigma=None)
 
 
 def as_rows(name, columns):
-    return pq.read_table(pa.BufferReader(parquet(name, columns))).to_pylist()
+    return pq.read_table(pa.BufferReader(encode_parquet(name, columns))).to_pylist()
 
 
 # What it gives
@@ -172,13 +171,13 @@ def test_two_workers_write_the_same_bytes(logs, done, tmp_path):
     report = batch([logs], RING, tmp_path, **with_(workers=2), on_planned=told.append, on_done=told.append)
     assert contents(tmp_path) == contents(done)
     assert (told[0], told[-1], sorted(told[1:])) == (56, 56, told[1:])
-    assert (report.scans, report.shards, report.before, report.set_aside) == (56, 8, 0, ())
+    assert (report.scans, report.shards, report.resumed, report.set_aside) == (56, 8, 0, ())
 
 
 @pytest.mark.slow
 def test_a_dask_cluster_writes_the_same_bytes(logs, done, tmp_path):
     pytest.importorskip("distributed")
-    names = (*batch_worker.KEPT_MEMORY, *batch_worker.ONE_THREAD)
+    names = (*worker_environment.MALLOC, *worker_environment.SINGLE_THREAD)
     before = [os.environ.get(name) for name in names]
     batch([logs], RING, tmp_path, engine="dask", **HOUGH)
     assert contents(tmp_path) == contents(done)
@@ -209,7 +208,7 @@ batch([{str(logs)!r}], load_ring("faw"), {str(tmp_path)!r}, on_done=wait, **{HOU
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "now\n"
-        with pytest.raises(SonarError, match="another batch is at work there; allowed is one at a time"):
+        with pytest.raises(SonarError, match="another batch is running there; allowed is one at a time"):
             batch([logs], RING, tmp_path, **HOUGH)
         process.send_signal(signal.SIGKILL)
     # What a process leaves that is killed while it writes.
@@ -218,15 +217,15 @@ batch([{str(logs)!r}], load_ring("faw"), {str(tmp_path)!r}, on_done=wait, **{HOU
     with open(tmp_path / "manifest.jsonl", "ab") as file:
         file.write(b'{"shard": "a.csv-0000')
     report = batch([logs], RING, tmp_path, **HOUGH)
-    assert report.before == 1
+    assert report.resumed == 1
     assert contents(tmp_path) == contents(done)
 
 
 @pytest.mark.slow
 def test_what_is_done_stays_done(done, logs, monkeypatch):
     before = contents(done)
-    monkeypatch.setattr(engines, "run_local", None)
-    assert batch([logs], RING, done, **HOUGH).before == 8
+    monkeypatch.setattr(process_pool, "run_local", None)
+    assert batch([logs], RING, done, **HOUGH).resumed == 8
     assert contents(done) == before
 
 
@@ -237,7 +236,7 @@ def test_a_log_can_be_added(logs, done, tmp_path):
         line.unlink()
     lines = [line for line in manifest(done) if "b.parquet" not in json.dumps(line)]
     (tmp_path / "out" / "manifest.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert batch([logs / "a.csv", logs / "b.parquet"], RING, tmp_path / "out", **HOUGH).before == 5
+    assert batch([logs / "a.csv", logs / "b.parquet"], RING, tmp_path / "out", **HOUGH).resumed == 5
     assert contents(tmp_path / "out") == contents(done)
 
 
@@ -247,25 +246,25 @@ def test_a_shard_whose_process_dies_is_tried_once_more(logs, done, tmp_path, mon
     """The first process, or every one, dies in the third shard of b."""
     code = f"""
 import os, sys
-from jaxsonar import batch_worker
-work, flag = batch_worker.do, {str(tmp_path / "died")!r}
-def do(job, shard):
+from jaxsonar.batch_jobs import worker
+work, flag = worker.run_shard, {str(tmp_path / "died")!r}
+def run_shard(job, shard):
     if shard.key == "b.parquet-000002" and ({always} or not os.path.exists(flag)):
         open(flag, "w").close()
         os.kill(os.getpid(), 9)
     return work(job, shard)
-batch_worker.do = do
-batch_worker.serve(int(sys.argv[1]))
+worker.run_shard = run_shard
+worker.worker_loop(int(sys.argv[1]))
 """
-    monkeypatch.setattr(engines, "STARTED_BY", code)
+    monkeypatch.setattr(process_pool, "WORKER_CODE", code)
     report = batch([logs / "b.parquet"], RING, tmp_path / "out", **HOUGH)
     assert (tmp_path / "died").exists()
     if not always:
         expected = {name: data for name, data in contents(done).items() if "b.parquet" in name}
         assert contents(tmp_path / "out").items() >= expected.items()
         return
-    assert (report.shards, report.aside) == (2, "1 shard")
-    assert report.set_aside == (f"b.parquet: {engines.LOST}",)
+    assert (report.shards, report.set_aside_summary) == (2, "1 shard")
+    assert report.set_aside == (f"b.parquet: {process_pool.WORKER_DIED}",)
     assert manifest(tmp_path / "out")[-1]["state"] == "set aside"
     monkeypatch.undo()
     assert not batch([logs / "b.parquet"], RING, tmp_path / "out", **HOUGH).set_aside, "it is tried again in a new run"
@@ -276,10 +275,10 @@ batch_worker.serve(int(sys.argv[1]))
 
 def shard(path, *, scans=100, part=0):
     (log,) = find_inputs([path])
-    return shards_of(log, copies=Path(path).parent / "copies", sensors=RING.count, scans=scans)[part]
+    return split_input(log, staging=Path(path).parent / "copies", sensors=RING.count, scans=scans)[part]
 
 
-JOB = job_of(RING, method="hough", settings=hough_settings(RING, None), sigma=None)
+JOB = job_spec(RING, method="hough", settings=hough_settings(RING, None), sigma=None)
 
 BAD_ROWS = {
     "5,0.0,0,0,0,24,3,1.0\n": "scan 5: echo of sensors tx 24, rx 3; allowed are 0 to 23, the sensors of 'FAW ring'",
@@ -298,10 +297,10 @@ def test_a_bad_row_sets_its_scan_aside_and_nothing_else(tmp_path, bad, why, scan
     good = [f"{k},0.0,0,0,0,{k},{k},1.0\n" for k in range(8) if k != 5]
     path = tmp_path / "log.csv"
     path.write_text(HEADER + "".join(good[:4]) + bad + "".join(good[4:]))
-    came = [do(JOB, one) for one in shards_of(*find_inputs([path]), copies=tmp_path, sensors=24, scans=scans)]
+    came = [run_shard(JOB, one) for one in split_input(*find_inputs([path]), staging=tmp_path, sensors=24, scans=scans)]
     assert [one.failure for one in came] == [""] * len(came)
-    assert sum(one.bad for one in came) == 1
-    ((reason,),) = [one.reasons for one in came if one.bad]
+    assert sum(one.bad_scans for one in came) == 1
+    ((reason,),) = [one.reasons for one in came if one.bad_scans]
     assert reason.startswith("log.csv: ")
     assert why in reason
     rows = [row for one in came for row in pq.read_table(pa.BufferReader(one.tables["scans"])).to_pylist()]
@@ -312,8 +311,8 @@ def test_a_bad_row_sets_its_scan_aside_and_nothing_else(tmp_path, bad, why, scan
 def test_rows_without_a_number_spoil_the_scans_beside_them(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(HEADER + "0,,,,,1,1,1.0\n1,,,,,1,1,1.0\nrubbish\n2,,,,,1,1,1.0\n3,,,,,1,1,1.0\n4,,,,,1,1")
-    came = do(JOB, shard(path))
-    assert came.bad == 2
+    came = run_shard(JOB, shard(path))
+    assert came.bad_scans == 2
     assert came.reasons[0].startswith("log.csv: row 4: 1 columns came")
     assert came.reasons[1].startswith("log.csv: row 7: 7 columns came")
     assert pq.read_table(pa.BufferReader(came.tables["scans"]))["scan"].to_pylist() == [0, 3]
@@ -330,10 +329,10 @@ def test_bad_scans_of_parquet_are_set_aside(tmp_path):
     schema = pq.read_schema(tmp_path / "log.parquet")
     pq.write_table(pa.Table.from_pylist(rows, schema=schema), tmp_path / "log.parquet", row_group_size=5)
     came = [
-        do(JOB, one)
-        for one in shards_of(*find_inputs([tmp_path / "log.parquet"]), copies=tmp_path, sensors=24, scans=4)
+        run_shard(JOB, one)
+        for one in split_input(*find_inputs([tmp_path / "log.parquet"]), staging=tmp_path, sensors=24, scans=4)
     ]
-    assert [one.bad for one in came] == [1, 1, 2]
+    assert [one.bad_scans for one in came] == [1, 1, 2]
     assert came[0].reasons[0].startswith("log.parquet: row 3, column echoes[5].range: -1.0 came")
     assert came[1].reasons == ["log.parquet: scan 1 came again; allowed is each scan number once"]
     assert came[2].reasons[0].startswith("log.parquet: row 10, column x, y, theta: [nan")
@@ -372,9 +371,9 @@ def test_a_log_that_changes_meanwhile_is_set_aside(tmp_path):
     one = shard(tmp_path / "log.csv")
     with open(tmp_path / "log.csv", "a") as file:
         file.write("99,,,,,,,\n")
-    assert do(JOB, one).failure.startswith("log.csv: changed since it was looked at")
+    assert run_shard(JOB, one).failure.startswith("log.csv: changed during the batch")
     (tmp_path / "log.csv").unlink()
-    assert do(JOB, one).failure.startswith("log.csv: No such file or directory")
+    assert run_shard(JOB, one).failure.startswith("log.csv: No such file or directory")
 
 
 # Going on with something else
@@ -384,7 +383,9 @@ def test_a_log_that_changes_meanwhile_is_set_aside(tmp_path):
 def test_another_job_is_refused(logs, done):
     before = contents(done)
     other = replace(RING, neighbors=2)
-    with pytest.raises(SonarError, match="another ring came; allowed is to go on as it was begun, or another folder"):
+    with pytest.raises(
+        SonarError, match="another ring came; allowed is the ring and the settings of the first"
+    ):
         batch([logs], other, done, **HOUGH)
     with pytest.raises(SonarError, match='method "ml", before "hough", came'):
         batch([logs], RING, done, **with_(method="ml"))
@@ -408,7 +409,7 @@ def test_a_folder_with_other_things_is_refused(logs, tmp_path):
     with pytest.raises(SonarError, match=r"tables without a manifest.jsonl lie there"):
         batch([logs], RING, tmp_path, **HOUGH)
     (tmp_path / "manifest.jsonl").write_text("hello\n")
-    with pytest.raises(SonarError, match="this is no manifest of a batch"), opened(tmp_path, {"batch": 1}):
+    with pytest.raises(SonarError, match="this is no manifest of a batch"), open_manifest(tmp_path, {"batch": 1}):
         pass
 
 
@@ -433,7 +434,7 @@ def test_csv_and_parquet_give_the_same_rows(tmp_path):
     save_log(log, tmp_path / "log.parquet")
     text = (tmp_path / "log.csv").read_bytes()
     (tmp_path / "log.windows.csv").write_bytes(b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n").removesuffix(b"\r\n"))
-    came = [do(JOB, shard(tmp_path / name)) for name in ("log.csv", "log.parquet", "log.windows.csv")]
+    came = [run_shard(JOB, shard(tmp_path / name)) for name in ("log.csv", "log.parquet", "log.windows.csv")]
     for name in TABLES:
         rows = [pq.read_table(pa.BufferReader(one.tables[name])).drop_columns("source").to_pylist() for one in came]
         assert rows[0] == rows[1] == rows[2]
@@ -444,14 +445,14 @@ def test_scans_may_come_in_any_order(tmp_path):
     mixed = Log.from_scans([log[k] for k in (5, 2, 8, 0, 1, 7, 3, 6, 4)])
     save_log(mixed, tmp_path / "log.csv")
     assert not any(part.repeated for part in csv_parts(tmp_path / "log.csv", name="log", scans=4))
-    rows = pq.read_table(pa.BufferReader(do(JOB, shard(tmp_path / "log.csv")).tables["scans"]))
+    rows = pq.read_table(pa.BufferReader(run_shard(JOB, shard(tmp_path / "log.csv")).tables["scans"]))
     assert rows["scan"].to_pylist() == mixed.scan.tolist()
 
 
 def test_a_log_without_scans_has_no_shards(tmp_path):
     for name in ("log.csv", "log.parquet"):
         save_log(Log.from_scans([]), tmp_path / name)
-    assert [shards_of(one, copies=tmp_path, sensors=24) for one in find_inputs([tmp_path])] == [[], []]
+    assert [split_input(one, staging=tmp_path, sensors=24) for one in find_inputs([tmp_path])] == [[], []]
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
@@ -478,12 +479,12 @@ def test_planning_holds_no_log(tmp_path, suffix, monkeypatch):
 
 
 def test_huge_row_groups_are_made_small_first(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxsonar.batch_jobs.shards.LARGEST_GROUP", 8)
+    monkeypatch.setattr("jaxsonar.batch_jobs.shards.MAX_ROW_GROUP", 8)
     save_log(office(20), tmp_path / "log.parquet")
-    parts = shards_of(*find_inputs([tmp_path / "log.parquet"]), copies=tmp_path / "copies", sensors=24, scans=4)
-    assert parts[0].path == str(tmp_path / "copies" / "log.parquet.parquet")
-    assert pq.ParquetFile(parts[0].path).metadata.num_row_groups == 5
-    assert load_log(parts[0].path) == load_log(tmp_path / "log.parquet")
+    parts = split_input(*find_inputs([tmp_path / "log.parquet"]), staging=tmp_path / "copies", sensors=24, scans=4)
+    assert parts[0].filename == str(tmp_path / "copies" / "log.parquet.parquet")
+    assert pq.ParquetFile(parts[0].filename).metadata.num_row_groups == 5
+    assert load_log(parts[0].filename) == load_log(tmp_path / "log.parquet")
 
 
 def test_names_are_safe_and_different():

@@ -29,8 +29,8 @@ from benchmarks.slam.scenarios import (
 from jaxsonar import GlobalMap, Room
 from jaxsonar.estimation.trajectory import Trajectory
 from jaxsonar.geometry.se2 import relative
-from jaxsonar.graph_slam.slam import Tie
-from jaxsonar.simulation.simulator import Kind
+from jaxsonar.graph_slam.initial_poses import LoopClosure
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 PLACES = {
     "office": slam_scenes.office,
@@ -91,7 +91,7 @@ def test_walls_are_in_reach_and_the_same_seed_is_the_same_place():
     scene, again = scene_of("loop 3"), loop(3)
     np.testing.assert_array_equal(scene.poses, again.poses)
     np.testing.assert_array_equal(scene.room.walls, again.room.walls)
-    walls = np.bincount(scene.heard.scan[scene.heard.kind == Kind.PLANE], minlength=len(scene.poses))
+    walls = np.bincount(scene.heard.scan[scene.heard.kind == EchoKind.PLANE], minlength=len(scene.poses))
     assert np.mean(walls >= 8) > 0.9
     assert len(scene_of("loop 4").poses) != len(scene.poses)
     log = scene.log(7)
@@ -180,7 +180,7 @@ def fake(scene, off):
     covariance[0] = 0
     right = relative(scene.poses[1], scene.poses[9])
     closures = [
-        Tie(1, 9, right + off, state, np.eye(3))
+        LoopClosure(1, 9, right + off, state, np.eye(3))
         for off, state in (
             (np.array([0.02, 0, 0]), "counted"),
             (np.array([0.5, 0, 0]), "counted"),
@@ -238,7 +238,7 @@ def test_wrong_closures_are_those_that_are_off():
     right = relative(poses[0], poses[1])
 
     def wrong(off, determined):
-        return slam.wrong(poses, Tie(0, 1, right + off, "counted", determined))
+        return slam.wrong(poses, LoopClosure(0, 1, right + off, "counted", determined))
 
     whole, along_x = np.eye(3), np.eye(3)[:, 1:]  # walls along x leave x open
     assert not wrong([0.1, 0.1, 0.1], whole)

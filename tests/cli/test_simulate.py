@@ -10,7 +10,7 @@ from jaxsonar import load_log
 from jaxsonar.cli import app as cli
 from jaxsonar.estimation.trajectory import load_trajectory
 from jaxsonar.simulation.office import load_office
-from jaxsonar.simulation.wheel_odometry import drifted
+from jaxsonar.simulation.wheel_odometry import simulate_odometry
 
 DATA = Path(__file__).resolve().parents[2] / "jaxsonar" / "data"
 SIMULATE = ["simulate", DATA / "office.geojson", "--ring", "faw", "--path", DATA / "office-path.csv", "--seed", "5"]
@@ -38,7 +38,7 @@ def test_the_same_echoes_with_any_poses():
         for column in ("scan", "stamp", "start", "tx", "rx", "range"):
             np.testing.assert_array_equal(getattr(log, column), getattr(true, column))
     np.testing.assert_array_equal(true.pose, OFFICE.poses)
-    expected = drifted(OFFICE.poses, distance=0.02, turn=float(np.radians(1.0)), seed=5)
+    expected = simulate_odometry(OFFICE.poses, distance=0.02, turn=float(np.radians(1.0)), seed=5)
     np.testing.assert_array_equal(drift.pose, expected)
     assert np.isnan(none.pose).all()
     truth = load_trajectory("truth.tum")

@@ -30,7 +30,7 @@ from jaxsonar.cli import app as cli
 from jaxsonar.detection.local_map import KIND_NAMES
 from jaxsonar.detection.settings import SETTINGS
 from jaxsonar.sensors.ring_toml import load_ring
-from jaxsonar.simulation.simulator import Acoustics
+from jaxsonar.simulation.acoustics import Acoustics
 
 RING = Ring.circular()
 SCANS, ROOM = 16, 64

@@ -6,7 +6,7 @@ from support import oracles
 
 from jaxsonar import HoughSettings, Log, Room, SonarError, load_ring, local_models, simulate
 from jaxsonar.detection.settings import SETTINGS
-from jaxsonar.floor_plans.room import lines_in
+from jaxsonar.floor_plans.room import walls_in_robot_frame
 from jaxsonar.geometry.se2 import transform_points
 
 RING = load_ring("corridor8")
@@ -44,7 +44,7 @@ def models_of(room, seed, poses=None, **how):
 
 def is_wall(room, pose, line):
     """For every wall of a room whether a line is within 15 mm and 1 deg of it."""
-    rho, theta = lines_in(room, pose)
+    rho, theta = walls_in_robot_frame(room, pose)
     return (np.abs(rho - line.rho) < 0.015) & (np.abs(oracles.wrap(theta - line.theta)) < np.radians(1))
 
 

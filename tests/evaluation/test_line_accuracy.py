@@ -14,7 +14,7 @@ from support import oracles
 
 from jaxsonar import Line, LocalModel, Ring, Room, kernels, simulate
 from jaxsonar.evaluation.line_accuracy import CLEAR_ECHOES, GATE_RHO, GATE_THETA, compare, line_bound, match, pooled
-from jaxsonar.simulation.simulator import EchoKind
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 RECTANGLE = Room(
     np.array([[[-1, -1.2], [2.5, -1.2]], [[2.5, -1.2], [2.5, 1.6]], [[2.5, 1.6], [-1, 1.6]], [[-1, 1.6], [-1, -1.2]]])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsonar import Room, load_room, random_pose, random_room, save_room
-from jaxsonar.floor_plans.room import lines_in
+from jaxsonar.floor_plans.room import walls_in_robot_frame
 from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.hardware.errors import SonarError
 
@@ -257,7 +257,7 @@ def test_lines_go_through_their_walls_in_the_robot_frame(seed):
     rng = np.random.default_rng(seed)
     room = random_room(rng)
     pose = np.append(rng.uniform(-5, 5, 2), rng.uniform(-10, 10))
-    rho, theta = lines_in(room, pose)
+    rho, theta = walls_in_robot_frame(room, pose)
     assert (rho >= 0).all()
     assert ((theta >= -np.pi) & (theta < np.pi)).all()
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
@@ -268,10 +268,10 @@ def test_lines_go_through_their_walls_in_the_robot_frame(seed):
 
 def test_theta_stays_below_pi():
     room = Room(np.array([[[-1.0, -1.0], [-1.0, 1.0]]]))
-    rho, theta = lines_in(room, np.zeros(3))
+    rho, theta = walls_in_robot_frame(room, np.zeros(3))
     assert rho[0] == 1.0
     assert theta[0] == -np.pi
-    assert lines_in(room, np.array([0.0, 0.0, 1e-17]))[1][0] == -np.pi
+    assert walls_in_robot_frame(room, np.array([0.0, 0.0, 1e-17]))[1][0] == -np.pi
 
 
 @given(seed=seeds)

@@ -12,7 +12,7 @@ from jaxsonar.geometry.se2 import rotation, unit, wrap_angle
 from jaxsonar.graph_slam.frontend import SubmapState, close_submap, start_submap, update
 from jaxsonar.graph_slam.joint_compatibility import FeatureMeasurements, associate_features
 from jaxsonar.simulation.office import load_office
-from jaxsonar.simulation.simulator import EchoKind
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 RING = Ring.circular()
 PLANE, CORNER, EDGE = kernels.PLANE, kernels.CORNER, kernels.EDGE
@@ -309,11 +309,11 @@ def test_a_closed_submap_has_no_landmark_of_a_single_scan():
     covariances = tuple(np.eye(3) * k for k in range(4))
     state = SubmapState(known, np.array([3, 1, 2]), rows=(4, 5, 6, 7), poses=poses, covariances=covariances)
     submap = close_submap(state)
-    np.testing.assert_array_equal(submap.anchor, known.landmarks.anchor[[0, 2]])
+    np.testing.assert_array_equal(submap.landmarks.anchor, known.landmarks.anchor[[0, 2]])
     np.testing.assert_array_equal(
         submap.covariance, known.covariance[np.ix_([0, 1, 2, 3, 4, 7, 8], [0, 1, 2, 3, 4, 7, 8])]
     )
-    np.testing.assert_array_equal(submap.exit, known.pose)
+    np.testing.assert_array_equal(submap.exit_pose, known.pose)
     assert submap.rows.tolist() == [4, 5, 6, 7]
     np.testing.assert_array_equal(submap.poses, poses)
     lost = close_submap(replace(state, track_loss_count=3))

@@ -9,7 +9,7 @@ import pytest
 
 from jaxsonar import Ring, Room, kernels, simulate
 from jaxsonar.kernels import CORNER, EDGE, PLANE, SECOND_ORDER, CandidateReflections, Landmarks, Reflection
-from jaxsonar.simulation.image_sources import EchoKind
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 WIDE = 1.2  # cones, and the soft border around them
 SOFT = 0.08
@@ -248,7 +248,9 @@ def test_other_worlds_are_never_chosen(heard):
     own = the_candidates()
     half = np.arange(SCANS) % 2
     for number in (0, 1):
-        candidates = CandidateReflections(own.reflection, np.where(own.world == 0, number, -1).astype(np.int32), own.group)
+        candidates = CandidateReflections(
+            own.reflection, np.where(own.world == 0, number, -1).astype(np.int32), own.group
+        )
         candidate, residual, _ = associated(poses, path, reported, half.astype(np.int32), candidates)
         assert (candidate[half != number] == -1).all()
         assert np.isinf(residual[half != number]).all()

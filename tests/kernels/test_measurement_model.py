@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from jaxsonar import Room
 from jaxsonar.kernels import EchoPaths
 from jaxsonar.kernels import measurement_model as reflectors
-from jaxsonar.simulation.image_sources import EchoKind, trace_between
+from jaxsonar.simulation.echo_tracing import trace_between
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 PATHS = 64
 FAR = 60.0  # m; walls as long as this have no ends that any path sees

@@ -17,7 +17,8 @@ from jaxsonar import HoughSettings, Ring, Room, kernels, load_ring, random_pose,
 from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.floor_plans.room import walls_in_robot_frame
 from jaxsonar.scans.echo_batches import SLOW_SCANS
-from jaxsonar.simulation.simulator import Acoustics, EchoKind
+from jaxsonar.simulation.acoustics import Acoustics
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 RING, SETTINGS, EXPECTED = Ring.circular(), HoughSettings(), kernels.DetectionSettings()
 SCANS, ROOM, PATHS, POINTS = SLOW_SCANS.rows[0], 64, 168, 64

@@ -16,7 +16,7 @@ from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.simulation.office import load_office
-from jaxsonar.simulation.simulator import Kind
+from jaxsonar.simulation.traced_echoes import EchoKind
 
 LEAST_SCANS = SETTINGS.evidence.min_scans
 SIGMA = 0.003
@@ -111,7 +111,7 @@ def on_walls(world, walls, **gates):
 def well_heard(sim, room, scans, *, least=8):
     """Walls with that many true echoes in each of two scans or more."""
     counts = np.zeros((scans, len(room.walls)), int)
-    plane = sim.kind == Kind.PLANE
+    plane = sim.kind == EchoKind.PLANE
     np.add.at(counts, (sim.scan[plane], sim.reflector[plane]), 1)
     return np.flatnonzero((counts >= least).sum(axis=0) >= LEAST_SCANS)
 

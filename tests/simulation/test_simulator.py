@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from jaxsonar import Room, random_pose, random_room
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.simulation.image_sources import Reflections, reflections
-from jaxsonar.simulation.simulator import Acoustics, Kind, Simulation, simulate
+from jaxsonar.simulation.acoustics import Acoustics
+from jaxsonar.simulation.echo_tracing import trace_between
+from jaxsonar.simulation.simulator import Simulation, simulate
+from jaxsonar.simulation.traced_echoes import EchoKind, TracedEchoes
 
 seeds = st.integers(0, 2**32 - 1)
 RING = Ring.circular()
@@ -91,7 +93,7 @@ def pra_images(pra, corners, tx, rx):
     return np.sort(raw), np.sort(refined)
 
 
-SPECULAR = (Kind.PLANE, Kind.CORNER, Kind.SECOND_ORDER)
+SPECULAR = (EchoKind.PLANE, EchoKind.CORNER, EchoKind.SECOND_ORDER)
 
 
 @pytest.mark.filterwarnings("default")
@@ -106,7 +108,7 @@ def test_path_lengths_agree_with_pyroomacoustics():
         along = np.diff(room.walls, axis=1)[:, 0]
         convex += (np.linalg.det(np.stack([along, np.roll(along, -1, axis=0)], axis=1)) > 0).all()
         tx, rx = places(rng, room, 6), places(rng, room, 6)
-        found = reflections(room, tx, rx)
+        found = trace_between(room, tx, rx)
         for k in range(len(tx)):
             lengths = np.sort(found.length[(found.pair == k) & np.isin(found.kind, SPECULAR)])
             raw, refined = pra_images(pra, corners, tx[k], rx[k])
@@ -178,20 +180,20 @@ def opening(room, c, sensor):
     return turns.min() + 360 - turns.max()
 
 
-def lengths_of(found: Reflections, pair, *kinds):
+def lengths_of(found: TracedEchoes, pair, *kinds):
     return np.sort(found.length[(found.pair == pair) & np.isin(found.kind, kinds)])
 
 
 def assert_as_oracle(room, tx, rx):
     shapely = pytest.importorskip("shapely")
-    found = reflections(room, tx, rx)
+    found = trace_between(room, tx, rx)
     for k in range(len(tx)):
         planes, doubles, edges, poles = oracle(shapely, room, tx[k], rx[k])
         for expected, kinds in (
-            (planes, [Kind.PLANE]),
-            (doubles, [Kind.CORNER, Kind.SECOND_ORDER]),
-            (edges, [Kind.EDGE]),
-            (poles, [Kind.POLE]),
+            (planes, [EchoKind.PLANE]),
+            (doubles, [EchoKind.CORNER, EchoKind.SECOND_ORDER]),
+            (edges, [EchoKind.EDGE]),
+            (poles, [EchoKind.POLE]),
         ):
             lengths = lengths_of(found, k, *kinds)
             assert len(lengths) == len(expected), kinds
@@ -213,7 +215,7 @@ def test_junctions_within_walls_agree_with_the_oracle(rng):
     plus = [[[-1.0, 0.0], [-0.2, 0.1]], [[-0.6, -0.3], [-0.5, 0.5]]]  # X
     room = Room(np.concatenate([hall, [stub], plus]))
     found = assert_as_oracle(room, places(rng, room, 40), places(rng, room, 40))
-    assert set(found.kind.tolist()) == {Kind.PLANE, Kind.CORNER, Kind.EDGE, Kind.SECOND_ORDER}
+    assert set(found.kind.tolist()) == {EchoKind.PLANE, EchoKind.CORNER, EchoKind.EDGE, EchoKind.SECOND_ORDER}
 
 
 @settings(max_examples=25, deadline=None)
@@ -224,11 +226,11 @@ def test_occlusion_is_that_of_shapely(seed):
     screens = rng.uniform(-2, 2, (12, 2, 2))
     poles = rng.uniform(-2, 2, (30, 2))
     tx, rx = rng.uniform(-2, 2, (2, 30, 2))
-    found = reflections(Room(screens, (), poles), tx, rx)
+    found = trace_between(Room(screens, (), poles), tx, rx)
     heard = {
         (int(p), int(r))
         for p, r, kind in zip(found.pair, found.reflector, found.kind, strict=True)
-        if kind == Kind.POLE
+        if kind == EchoKind.POLE
     }
     walls = shapely.MultiLineString(list(screens))
     for k, pole in np.ndindex(30, 30):
@@ -242,17 +244,17 @@ def test_points_of_a_path_make_up_its_length_and_lie_on_its_reflectors(seed):
     rng = np.random.default_rng(seed)
     room = room_of_exact_angles(rng, box=0.7, segment=0.7, pole=0.7)
     tx, rx = places(rng, room, 8), places(rng, room, 8)
-    found = reflections(room, tx, rx)
+    found = trace_between(room, tx, rx)
     legs = [found.first - tx[found.pair], found.last - found.first, rx[found.pair] - found.last]
     assert np.allclose(sum(np.linalg.norm(leg, axis=-1) for leg in legs), found.length, atol=1e-9)
-    assert (found.second[found.kind != Kind.SECOND_ORDER] == -1).all()
-    for kind, points in ((Kind.POLE, room.poles), (Kind.EDGE, room.junctions.vertices)):
+    assert (found.second[found.kind != EchoKind.SECOND_ORDER] == -1).all()
+    for kind, points in ((EchoKind.POLE, room.poles), (EchoKind.EDGE, room.junctions.vertices)):
         mine = found[found.kind == kind]
         assert np.allclose(mine.first, points[mine.reflector], atol=1e-12)
     for kind, wall, point in (
-        (Kind.PLANE, found.reflector, found.first),
-        (Kind.SECOND_ORDER, found.reflector, found.first),
-        (Kind.SECOND_ORDER, found.second, found.last),
+        (EchoKind.PLANE, found.reflector, found.first),
+        (EchoKind.SECOND_ORDER, found.reflector, found.first),
+        (EchoKind.SECOND_ORDER, found.second, found.last),
     ):
         mine = found.kind == kind
         ends = room.walls[wall[mine]]
@@ -273,7 +275,7 @@ def test_reciprocity_of_single_pairs(seed):
         table = np.column_stack([found.pair, found.kind, np.where(low < 0, high, low), high, found.length, first, last])
         return table[np.lexsort(table.T[4::-1])]
 
-    there, back = reflections(room, tx, rx), reflections(room, rx, tx)
+    there, back = trace_between(room, tx, rx), trace_between(room, rx, tx)
     assert np.allclose(rows(there, there.first, there.last), rows(back, back.last, back.first), atol=1e-8)
 
 
@@ -281,8 +283,8 @@ def test_far_from_the_origin_nothing_is_lost(rng):
     room = room_of_exact_angles(rng, segment=1.0, box=1.0)
     tx, rx = places(rng, room, 20), places(rng, room, 20)
     shift = np.array([4e5, 5e6])  # a map in UTM coordinates
-    here = reflections(room, tx, rx)
-    there = reflections(Room(room.walls + shift, (), room.poles + shift), tx + shift, rx + shift)
+    here = trace_between(room, tx, rx)
+    there = trace_between(Room(room.walls + shift, (), room.poles + shift), tx + shift, rx + shift)
     assert np.array_equal(np.bincount(here.kind), np.bincount(there.kind))
     assert np.allclose(np.sort(here.length), np.sort(there.length), atol=1e-7)
 
@@ -290,7 +292,7 @@ def test_far_from_the_origin_nothing_is_lost(rng):
 def test_range_limit_of_the_geometry(rng):
     room = random_room(rng, segment=1.0)
     tx, rx = places(rng, room, 30), places(rng, room, 30)
-    far, near = reflections(room, tx, rx), reflections(room, tx, rx, max_range=1.7)
+    far, near = trace_between(room, tx, rx), trace_between(room, tx, rx, max_range=1.7)
     assert np.allclose(np.sort(far.length[far.length <= 3.4]), np.sort(near.length))
     assert 0 < len(near) < len(far)
 
@@ -304,8 +306,8 @@ coordinate = st.floats(-1.5, 1.5)
 def test_length_of_a_plane_echo(xi, xj, yi, yj, angle):
     walls = turned([[[-9.0, 0.0], [9.0, 0.0]]], angle)
     tx, rx = turned([[xi, yi]], angle), turned([[xj, yj]], angle)
-    found = reflections(Room(walls), tx, rx)
-    plane = found.length[found.kind == Kind.PLANE]
+    found = trace_between(Room(walls), tx, rx)
+    plane = found.length[found.kind == EchoKind.PLANE]
     normal, tangent = turned([[0.0, 1.0], [1.0, 0.0]], angle)
     middle, half = (tx + rx)[0] / 2, (rx - tx)[0] / 2
     # rho = 0 here: the wall goes through the origin.
@@ -325,11 +327,11 @@ def test_length_of_a_corner_echo(xi, xj, yi, yj, angle, off):
     e1, e2 = directions / 9.0
     tx, rx = (corner + np.array([x]) * e1 + np.array([y]) * e2 for x, y in ((xi, yi), (xj, yj)))
     for a, b in ((tx, rx), (tx, tx)):  # the direct echo goes through the corner itself
-        found = reflections(room, a[None], b[None])
-        corners = found[found.kind == Kind.CORNER]
+        found = trace_between(room, a[None], b[None])
+        corners = found[found.kind == EchoKind.CORNER]
         assert np.allclose(corners.length, [2 * np.linalg.norm((a + b) / 2 - corner)])
         assert np.allclose(room.junctions.vertices[corners.reflector], corner)
-        assert (found.kind != Kind.SECOND_ORDER).all()
+        assert (found.kind != EchoKind.SECOND_ORDER).all()
 
 
 @pytest.mark.parametrize("off_deg", [0.0, 0.9, -0.9, 1.5, -1.5, 20.0])
@@ -337,20 +339,20 @@ def test_only_right_angled_corners_reflect_twice_to_the_sender(off_deg):
     walls = [[[3.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], turned([0.0, 3.0], np.radians(off_deg))]]
     inside, outside = np.array([[1.0, 0.8]]), np.array([[-1.0, -0.8]])
     room = Room(np.array(walls))
-    found = reflections(room, inside, inside)
-    assert (np.count_nonzero(found.kind == Kind.CORNER) == 1) == (abs(off_deg) < 1)
+    found = trace_between(room, inside, inside)
+    assert (np.count_nonzero(found.kind == EchoKind.CORNER) == 1) == (abs(off_deg) < 1)
     # A wedge below 90 deg sends the sound back as well, by way of both walls; one above does not.
-    assert np.count_nonzero(found.kind == Kind.SECOND_ORDER) == (off_deg < -1)
-    found = reflections(room, outside, outside)
-    assert not np.isin(found.kind, [Kind.CORNER, Kind.SECOND_ORDER]).any()
-    assert np.allclose(lengths_of(found, 0, Kind.EDGE)[0], 2 * np.hypot(1.0, 0.8))
+    assert np.count_nonzero(found.kind == EchoKind.SECOND_ORDER) == (off_deg < -1)
+    found = trace_between(room, outside, outside)
+    assert not np.isin(found.kind, [EchoKind.CORNER, EchoKind.SECOND_ORDER]).any()
+    assert np.allclose(lengths_of(found, 0, EchoKind.EDGE)[0], 2 * np.hypot(1.0, 0.8))
 
 
 def test_a_corner_ends_where_its_walls_end():
     room = Room(np.array([[[0.4, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 3.0]]]))
     tx = np.array([[1.0, 1.0]])
-    assert Kind.CORNER in reflections(room, tx, np.array([[1.0, 0.6]])).kind  # meets the short wall at 0.25 m
-    assert Kind.CORNER not in reflections(room, tx, np.array([[1.0, 0.2]])).kind  # would meet it at 0.67 m
+    assert EchoKind.CORNER in trace_between(room, tx, np.array([[1.0, 0.6]])).kind  # meets the short wall at 0.25 m
+    assert EchoKind.CORNER not in trace_between(room, tx, np.array([[1.0, 0.2]])).kind  # would meet it at 0.67 m
 
 
 @pytest.mark.slow
@@ -358,8 +360,8 @@ def test_a_corner_ends_where_its_walls_end():
 def test_length_of_echoes_of_poles_and_free_ends(tx, rx):
     pole, wall = np.array([[3.0, 1.0]]), np.array([[[2.0, 2.0], [2.0, 3.0]]])
     a, b = np.array(tx), np.array(rx)
-    found = reflections(Room(wall, (), pole), a[None], b[None])
-    for kind, points in ((Kind.POLE, pole), (Kind.EDGE, wall[0])):
+    found = trace_between(Room(wall, (), pole), a[None], b[None])
+    for kind, points in ((EchoKind.POLE, pole), (EchoKind.EDGE, wall[0])):
         expected = [np.linalg.norm(a - c) + np.linalg.norm(b - c) for c in points]
         assert np.allclose(lengths_of(found, 0, kind), np.sort(expected))
 
@@ -367,9 +369,9 @@ def test_length_of_echoes_of_poles_and_free_ends(tx, rx):
 def test_an_edge_is_not_heard_from_within_the_wall(rng):
     box = Room(loop(np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) / 2))
     inside = rng.uniform(0.05, 0.45, (10, 2))
-    assert Kind.EDGE not in reflections(box, inside, inside).kind
+    assert EchoKind.EDGE not in trace_between(box, inside, inside).kind
     outside = np.array([[-0.5, -0.6]])
-    assert np.count_nonzero(reflections(box, outside, outside).kind == Kind.EDGE) == 3  # the fourth is hidden
+    assert np.count_nonzero(trace_between(box, outside, outside).kind == EchoKind.EDGE) == 3  # the fourth is hidden
 
 
 # What a ring hears.
@@ -405,7 +407,7 @@ def test_a_ring_hears_what_geometry_gives_within_both_cones(seed, beam, neighbor
     for scan, (x, y, theta) in enumerate(poses):
         sensors = turned(position, theta, (x, y))
         tx, rx = ring.paths.T
-        found = reflections(room, sensors[tx], sensors[rx])
+        found = trace_between(room, sensors[tx], sensors[rx])
         keep = found.length / 2 <= 1.8
         for sensor, point in ((tx[found.pair], found.first), (rx[found.pair], found.last)):
             leg = point - sensors[sensor]
@@ -497,11 +499,11 @@ def test_amplitude_of_points_and_corners():
     assert np.isclose(pole.amplitude[0], 0.3 / 2.0**1.5)
     stick = Room(np.array([[[1.5, 0.0], [3.0, 1.0]]]))
     edge = simulate(sensor(), stick, np.zeros((1, 3)), acoustics=still)
-    assert edge.kind[0] == Kind.EDGE
+    assert edge.kind[0] == EchoKind.EDGE
     assert np.isclose(edge.amplitude[0], 0.2 / 1.5**1.5)
     corner = Room(np.array([[[2.0, 0.0], [-7.0, 9.0]], [[2.0, 0.0], [-7.0, -9.0]]]))
     heard = simulate(sensor(), corner, np.zeros((1, 3)), acoustics=still)
-    assert np.isclose(heard.amplitude[heard.kind == Kind.CORNER], 0.5**2 / 2.0)
+    assert np.isclose(heard.amplitude[heard.kind == EchoKind.CORNER], 0.5**2 / 2.0)
 
 
 def test_faint_echoes_are_not_heard(rng):
@@ -626,7 +628,7 @@ def test_lost_echoes():
 def test_false_echoes():
     everything, more = many(), many(clutter=0.2, max_echoes=1000)
     real = many(max_echoes=1000)
-    false = more.kind == Kind.CLUTTER
+    false = more.kind == EchoKind.CLUTTER
     count = np.count_nonzero(false)
     expected = 0.2 * len(real.range)
     assert abs(count - expected) < 5 * np.sqrt(expected)
@@ -644,7 +646,7 @@ def test_false_echoes_only_where_cones_overlap():
     narrow = Ring.circular(beam=np.radians(20), neighbors=3)  # 15 deg apart: the second neighbor hears nothing
     room = Room(loop([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
     heard = simulate(narrow, room, np.zeros((50, 3)), clutter=2.0, max_echoes=1000)
-    assert set(heard.path[heard.kind == Kind.CLUTTER].tolist()) == set(range(72))
+    assert set(heard.path[heard.kind == EchoKind.CLUTTER].tolist()) == set(range(72))
 
 
 def test_seeds_decide_everything_and_streams_are_separate():

@@ -5,7 +5,7 @@ import pytest
 
 from jaxsonar import SonarError
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
-from jaxsonar.simulation.wheel_odometry import ACROSS, drifted, step_sd
+from jaxsonar.simulation.wheel_odometry import ACROSS, simulate_odometry, odometry_step_sd
 
 
 def straight(metres, steps):
@@ -20,31 +20,31 @@ def round_trip(rng):
 
 def test_without_errors_it_is_the_truth(rng):
     poses = round_trip(rng)
-    got = drifted(poses, distance=0.0, turn=0.0)
+    got = simulate_odometry(poses, distance=0.0, turn=0.0)
     np.testing.assert_allclose(got, poses, atol=1e-12)
     for few in (poses[:0], poses[:1]):
-        np.testing.assert_array_equal(drifted(few, distance=0.1, turn=0.1), few)
+        np.testing.assert_array_equal(simulate_odometry(few, distance=0.1, turn=0.1), few)
 
 
 def test_it_begins_at_the_truth_and_is_the_same_again(rng):
     poses = round_trip(rng)
-    got = drifted(poses, distance=0.02, turn=0.02, seed=3)
+    got = simulate_odometry(poses, distance=0.02, turn=0.02, seed=3)
     np.testing.assert_array_equal(got[0], poses[0])
-    np.testing.assert_array_equal(got, drifted(poses, distance=0.02, turn=0.02, seed=3))
-    assert not np.array_equal(got, drifted(poses, distance=0.02, turn=0.02, seed=4))
+    np.testing.assert_array_equal(got, simulate_odometry(poses, distance=0.02, turn=0.02, seed=3))
+    assert not np.array_equal(got, simulate_odometry(poses, distance=0.02, turn=0.02, seed=4))
     assert (np.abs(got[:, 2]) <= np.pi).all()
 
 
 def test_it_does_not_hang_on_the_frame(rng):
     poses, motion = round_trip(rng), np.array([1.0, 2.0, 3.0])
-    moved = drifted(compose(motion, poses), distance=0.02, turn=0.02)
-    there = compose(motion, drifted(poses, distance=0.02, turn=0.02))
+    moved = simulate_odometry(compose(motion, poses), distance=0.02, turn=0.02)
+    there = compose(motion, simulate_odometry(poses, distance=0.02, turn=0.02))
     np.testing.assert_allclose(relative(there, moved), 0, atol=1e-9)
 
 
 def errors_of_parts(poses, length, **errors):
     """Of every so many steps by themselves: they are independent."""
-    told = drifted(poses, **errors)[::length]
+    told = simulate_odometry(poses, **errors)[::length]
     true = poses[::length]
     return relative(relative(true[:-1], true[1:]), relative(told[:-1], told[1:]))
 
@@ -73,16 +73,16 @@ def test_turning_on_the_spot_costs_heading_alone():
 
 def test_what_is_wrong_for_good(rng):
     poses = round_trip(rng)
-    long = drifted(poses, distance=0.0, turn=0.0, scale=0.03)
+    long = simulate_odometry(poses, distance=0.0, turn=0.0, scale=0.03)
     np.testing.assert_allclose(long[:, :2] - poses[0, :2], 1.03 * (poses[:, :2] - poses[0, :2]), atol=1e-12)
-    far = drifted(poses, distance=0.0, turn=0.0, turn_scale=0.5)
+    far = simulate_odometry(poses, distance=0.0, turn=0.0, turn_scale=0.5)
     steps, told = relative(poses[:-1], poses[1:]), relative(far[:-1], far[1:])
     np.testing.assert_allclose(wrap_angle(told[:, 2] - 1.5 * steps[:, 2]), 0, atol=1e-9)
 
 
 def test_standard_deviations_are_those_of_the_steps(rng):
     poses = np.concatenate([straight(0.25, 1), [[0.25, 0.0, 0.4]]])
-    sd = step_sd(poses, distance=0.02, turn=0.1)
+    sd = odometry_step_sd(poses, distance=0.02, turn=0.1)
     np.testing.assert_allclose(sd, [[0.01, 0.01 * ACROSS, 0.05], [0, 0, 0.02 * np.sqrt(0.4)]])
 
 
@@ -92,6 +92,6 @@ def test_standard_deviations_are_those_of_the_steps(rng):
 )
 def test_values_out_of_range_are_named(wrong, said):
     with pytest.raises(SonarError, match=f"odometry: {said}; allowed"):
-        drifted(straight(1.0, 2), **{"distance": 0.1, "turn": 0.1} | wrong)
+        simulate_odometry(straight(1.0, 2), **{"distance": 0.1, "turn": 0.1} | wrong)
     with pytest.raises(SonarError, match="pose 1"):
-        drifted(np.array([[0.0, 0, 0], [np.nan, 0, 0]]), distance=0.1, turn=0.1)
+        simulate_odometry(np.array([[0.0, 0, 0], [np.nan, 0, 0]]), distance=0.1, turn=0.1)

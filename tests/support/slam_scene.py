@@ -7,7 +7,7 @@ import numpy as np
 from jaxsonar import Ring, Room, simulate
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import wrap_angle
-from jaxsonar.simulation.wheel_odometry import drifted
+from jaxsonar.simulation.wheel_odometry import simulate_odometry
 
 RING = Ring.circular()
 
@@ -37,5 +37,5 @@ def truth():
 
 @cache
 def log(sigma=SIGMA, seed=1):
-    odometry = drifted(truth(), distance=0.04, turn=float(np.radians(2.0)), seed=seed)
+    odometry = simulate_odometry(truth(), distance=0.04, turn=float(np.radians(2.0)), seed=seed)
     return simulate(RING, ROOM, truth(), sigma=sigma, seed=seed).as_log(RING, odometry)

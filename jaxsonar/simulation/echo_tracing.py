@@ -1,0 +1,79 @@
+"""Tracing of all echoes in a room: exact path lengths with the causing reflector, independent of acoustics.
+
+NumPy in double precision, vectorized over groups of sensors (scans), pairs of sensors (paths) and reflectors.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsonar.floor_plans.room import Room
+from jaxsonar.simulation.image_sources import trace_corners, trace_planes, trace_second_order
+from jaxsonar.simulation.point_scatterers import trace_edges, trace_poles
+from jaxsonar.simulation.traced_echoes import TracedEchoes
+from jaxsonar.simulation.tracing_scene import TracingScene
+
+
+def trace_between(
+    room: Room,
+    tx: Float[np.ndarray, "pairs 2"],
+    rx: Float[np.ndarray, "pairs 2"],
+    *,
+    max_range: float = np.inf,
+) -> TracedEchoes:
+    """All echoes from each tx to its rx, for omnidirectional sensors.
+
+    Args:
+        room: the reflectors.
+        tx: (pairs, 2) transmitters, world frame, metres.
+        rx: (pairs, 2) receivers, world frame, metres.
+        max_range: largest half path length, metres.
+
+    Returns:
+        The echoes; ``pair`` is the row of tx and rx.
+    """
+    found = trace_echoes(room, np.stack([tx, rx], axis=1), np.array([[0, 1]]), max_range=max_range)
+    return replace(found, group=np.zeros_like(found.group), pair=found.group)
+
+
+def trace_echoes(
+    room: Room,
+    sensors: Float[np.ndarray, "groups sensors 2"],
+    pairs: Int[np.ndarray, "pairs 2"],
+    *,
+    max_range: float = np.inf,
+    axis: Float[np.ndarray, "groups sensors 2"] | None = None,
+    half_beam: Float[np.ndarray, " sensors"] | None = None,
+) -> TracedEchoes:
+    """All echoes between pairs of sensors, for many poses of one array at once.
+
+    - Plane: image source. The point of incidence lies on the wall, and both sensors are on one side of it.
+    - Second order: image of the image, for every ordered pair of walls. Two orders of equal length are one echo.
+    - Corner: walls that meet at 90 deg (within 1 deg, then taken as exactly 90) act as a point reflection at their
+      vertex c: the length is 2|m - c| with the midpoint m of the sensors. Both sensors lie inside the wedge.
+    - Edge and pole: the length is |s_i - c| + |s_j - c|. At an edge both sensors lie inside its wedge.
+
+    No leg intersects a wall; poles do not occlude. With ``axis`` and ``half_beam`` the sound must leave tx and reach rx
+    within their cones, in its exact directions (no far-field approximation).
+
+    Args:
+        room: the reflectors.
+        sensors: (groups, sensors, 2) positions, world frame, metres; a group is a scan.
+        pairs: (pairs, 2) sensor indices tx, rx, the same for every group.
+        max_range: largest half path length, metres.
+        axis: (groups, sensors, 2) unit vectors of the sensor axes, world frame; requires half_beam.
+        half_beam: (sensors,) half the width of each cone, radians.
+    """
+    scene = TracingScene.of(room, sensors, pairs, max_range, axis, half_beam)
+    junctions = room.junctions
+    found = TracedEchoes.concatenate(
+        [
+            trace_planes(scene),
+            trace_corners(scene, junctions),
+            trace_edges(scene, junctions),
+            trace_poles(scene, room.poles),
+            trace_second_order(scene, junctions.right_angled),
+        ]
+    )
+    return replace(found, first=found.first + scene.origin, last=found.last + scene.origin)
