@@ -1,6 +1,6 @@
-"""Shards worked on by a Dask cluster (extra ``cluster``), each with ``batch_worker.do``; the only file that imports it.
+"""Dask executor (extra ``cluster``): runs shards on a Dask cluster. The only module that imports Dask.
 
-Workers read the inputs, at the paths that they have here, and give tables back; only this process writes.
+Workers read the inputs at the filenames that they have on this machine, and return tables. Only this process writes.
 """
 
 import os
@@ -14,103 +14,106 @@ from importlib import metadata
 from itertools import islice
 from typing import Any
 
-from jaxsonar.batch_jobs.process_pool import cores, gpus
 from jaxsonar.batch_jobs.shards import Shard
-from jaxsonar.batch_jobs.worker import KEPT_MEMORY, ONE_THREAD, Result, do, one_thread
+from jaxsonar.batch_jobs.worker import ShardResult, run_shard
+from jaxsonar.batch_jobs.worker_environment import (
+    available_gpus,
+    early_environment,
+    single_thread_environment,
+    worker_count,
+)
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
 
-CONNECTED = 30
-"""Seconds within which a scheduler answers and has a worker."""
-AHEAD = 2
-"""Shards under way for each thread of the cluster."""
+CONNECT_TIMEOUT = 30
+"""Seconds for a scheduler to answer and to have a worker. Chosen by hand."""
+SHARDS_PER_THREAD = 2
+"""Shards submitted ahead per thread of the cluster, so that no thread waits for the next one. Chosen by hand."""
 
 
 def run_dask(
     job: str, shards: Sequence[Shard], *, workers: int | None, scheduler: str | None
-) -> Iterator[tuple[Shard, Result]]:
-    """Shards and what came of them, as they are done.
+) -> Iterator[tuple[Shard, ShardResult]]:
+    """Run shards on a Dask cluster. Each result is yielded as soon as it is done.
 
-    A cluster of its own is made of processes that load the caller's program again: a script needs the usual
-    ``if __name__ == "__main__":`` around its calls.
+    The processes of a local cluster load the caller's program again: a script needs ``if __name__ == "__main__":``
+    around its calls.
 
     Args:
-        job: from ``batch_worker.job_of``.
-        shards: what is to be done; no more than two for each thread of the cluster are under way.
-        workers: processes of a cluster on this machine; one for each GPU or, without one, each core, if None.
-        scheduler: address of a cluster that is there; None: one is made on this machine, for this run.
+        job: from ``worker.job_spec``.
+        shards: the shards; at most two per thread of the cluster are submitted at a time.
+        workers: number of processes of a local cluster; None: one per GPU, or one per core if there is no GPU.
+        scheduler: address of a running cluster; None: start a local cluster for this run.
 
     Raises:
-        SonarError: the extra is missing, the cluster does not answer, has no worker, or other versions than we have.
+        SonarError: a missing extra, or a cluster that does not answer, has no worker, or has other versions than here.
     """
-    dask, distributed = _dask()
+    dask, distributed = _import_dask()
     if scheduler is not None:
         _check_address(distributed, scheduler)
     with ExitStack() as stack:
         stack.enter_context(dask.config.set({"distributed.worker.multiprocessing-method": "spawn"}))
-        devices: list[str] = []
+        gpus: list[str] = []
         cluster = scheduler
         if scheduler is None:
-            devices = gpus()
-            # A shard whose worker dies is tried once more, as the local engine does it.
+            gpus = available_gpus()
+            # A shard whose worker dies is tried once more, as by the local executor.
             stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": 1}))
-            # What a process must know as it starts goes through our own environment, which Dask leaves changed.
-            early = {key: os.environ.get(key, value) for key, value in (KEPT_MEMORY | ONE_THREAD).items()}
-            del early["XLA_FLAGS"]  # they need only be there before JAX is
+            # Dask sets these variables in this process and does not restore them.
+            early = early_environment()
             stack.enter_context(dask.config.set({"distributed.nanny.pre-spawn-environ": early}))
-            stack.enter_context(_left_as_it_was(early))
-            count = min(workers or len(devices) or cores(), len(shards))
-            with _deaf_to_ctrl_c():
-                cluster = _local(distributed, count)
+            stack.enter_context(_restored_environment(early))
+            with _ignoring_ctrl_c():
+                cluster = _local_cluster(distributed, worker_count(workers, gpus, len(shards)))
             stack.enter_context(cluster)
         try:
-            client = stack.enter_context(distributed.Client(cluster, timeout=CONNECTED, set_as_default=False))
-            client.wait_for_workers(1, timeout=CONNECTED)
+            client = stack.enter_context(distributed.Client(cluster, timeout=CONNECT_TIMEOUT, set_as_default=False))
+            client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
         except (OSError, ValueError, TypeError, TimeoutError) as failure:
             where = "the local cluster" if scheduler is None else f"--scheduler {shown(scheduler)}"
             raise SonarError(f"{where}: {reason(failure)}; needed is a running Dask cluster with workers") from None
         _check_versions(client)
-        yield from _results(distributed, client, job, shards, devices)
+        yield from _results(distributed, client, job, shards, gpus)
 
 
 def _results(
-    distributed: Any, client: Any, job: str, shards: Sequence[Shard], devices: list[str]
-) -> Iterator[tuple[Shard, Result]]:
-    left, run = iter(shards), secrets.token_hex(8)  # others may work on logs of the same names
+    distributed: Any, client: Any, job: str, shards: Sequence[Shard], gpus: list[str]
+) -> Iterator[tuple[Shard, ShardResult]]:
+    remaining, run = iter(shards), secrets.token_hex(8)  # another run may use the same names of shards
 
-    def sent(shard: Shard) -> Any:
-        return client.submit(_do, job, shard, devices, key=f"jaxsonar-{run}-{shard.key}", pure=False)
+    def submit(shard: Shard) -> Any:
+        return client.submit(_run_shard, job, shard, gpus, key=f"jaxsonar-{run}-{shard.key}", pure=False)
 
-    room = AHEAD * max(1, sum(client.nthreads().values()))
-    under_way = {sent(shard): shard for shard in islice(left, room)}
-    done = distributed.as_completed(under_way, loop=client.loop)
-    for future in done:
-        shard = under_way.pop(future)
+    limit = SHARDS_PER_THREAD * max(1, sum(client.nthreads().values()))
+    submitted = {submit(shard): shard for shard in islice(remaining, limit)}
+    completed = distributed.as_completed(submitted, loop=client.loop)
+    for future in completed:
+        shard = submitted.pop(future)
         failure = future.exception()
-        yield shard, future.result() if failure is None else Result(failure=_why(shard, failure))
+        yield shard, future.result() if failure is None else ShardResult(failure=_failure_text(shard, failure))
         future.release()
-        for following in islice(left, 1):
-            under_way[another := sent(following)] = following
-            done.add(another)
+        for following in islice(remaining, 1):
+            submitted[another := submit(following)] = following
+            completed.add(another)
 
 
-def _do(job: str, shard: Shard, devices: list[str]) -> Result:
-    """``do``, on the GPU of this worker."""
-    if devices and "jax" not in sys.modules:
+def _run_shard(job: str, shard: Shard, gpus: list[str]) -> ShardResult:
+    """``run_shard`` on the GPU of this worker."""
+    if gpus and "jax" not in sys.modules:
         from distributed import get_worker
 
-        os.environ["CUDA_VISIBLE_DEVICES"] = devices[int(get_worker().name) % len(devices)]
-    return do(job, shard)
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[int(get_worker().name) % len(gpus)]
+    return run_shard(job, shard)
 
 
-def _why(shard: Shard, failure: BaseException) -> str:
+def _failure_text(shard: Shard, failure: BaseException) -> str:
     if type(failure).__name__ == "KilledWorker":
-        return f"{shown(shard.source)}: the workers that worked on it died"
+        return f"{shown(shard.source)}: its worker processes died"
     return f"{shown(shard.source)}: {type(failure).__name__}: {reason(Exception(str(failure)))}"
 
 
-def _local(distributed: Any, workers: int) -> Any:
-    """A cluster on this machine that nobody else can reach."""
+def _local_cluster(distributed: Any, workers: int) -> Any:
+    """A cluster on this machine, not reachable from other machines."""
     return distributed.LocalCluster(
         n_workers=workers,
         threads_per_worker=1,
@@ -119,22 +122,22 @@ def _local(distributed: Any, workers: int) -> Any:
         dashboard_address=None,
         memory_limit=0,
         silence_logs=50,
-        env=one_thread(),
+        env=single_thread_environment(),
     )
 
 
 def _check_address(distributed: Any, scheduler: str) -> None:
-    """Before a client is made: one that cannot be is not given up for a minute."""
+    """Check an address first; a client with an invalid one would retry for a minute."""
     try:
         distributed.comm.registry.get_backend(distributed.comm.parse_address(scheduler)[0])
     except ValueError as failure:
-        allowed = "an address as a Dask scheduler gives it, tcp://HOST:PORT"
+        allowed = "an address of a Dask scheduler, tcp://HOST:PORT"
         raise SonarError(f"--scheduler {shown(scheduler)}: {reason(failure)}; allowed is {allowed}") from None
 
 
 @contextmanager
-def _left_as_it_was(keys: Iterable[str]) -> Iterator[None]:
-    """Our own environment, in some of its variables, is in the end what it was."""
+def _restored_environment(keys: Iterable[str]) -> Iterator[None]:
+    """Restore these variables of the environment of this process at the end."""
     before = {key: os.environ.get(key) for key in keys}
     try:
         yield
@@ -146,8 +149,8 @@ def _left_as_it_was(keys: Iterable[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _deaf_to_ctrl_c() -> Iterator[None]:
-    """Processes that are started meanwhile leave Ctrl-C to us; they would each tell of it at length."""
+def _ignoring_ctrl_c() -> Iterator[None]:
+    """Processes started in this context ignore Ctrl-C; this process handles it without their tracebacks."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -167,19 +170,23 @@ def _check_versions(client: Any) -> None:
     try:
         for address, there in client.run(_versions).items():
             if there != here:
-                raise SonarError(f"worker {address} has {there}; allowed is what is here, {here}")
+                raise SonarError(f"worker {address} has {there}; allowed are the versions of this machine, {here}")
     except SonarError:
         raise
-    except Exception as failure:  # it has no jaxsonar, say
+    except Exception as failure:  # for example, jaxsonar is not installed on the worker
         raise SonarError(f"a worker of the cluster: {reason(failure)}; needed is {here} on each") from None
 
 
 def check_dask() -> None:
-    """Raise a SonarError if the extra is missing."""
-    _dask()
+    """Check that Dask is installed.
+
+    Raises:
+        SonarError: the extra is missing.
+    """
+    _import_dask()
 
 
-def _dask() -> tuple[Any, Any]:
+def _import_dask() -> tuple[Any, Any]:
     try:
         import dask
         import distributed

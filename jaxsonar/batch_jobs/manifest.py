@@ -1,8 +1,8 @@
-"""What a batch has done: the folder of its results and the manifest in it, which outlives any end of the process.
+"""The output folder of a batch and its manifest, the crash-safe record of what is done.
 
-``manifest.jsonl`` is a JSON object a line: the run, the inputs, the shards. While a batch runs, lines are added at the
-end, and a line stands there only once the files that it tells of are whole; at its end the lines are put in the order
-of the inputs, so that they do not show who was done when.
+``manifest.jsonl`` has one JSON object per line: the run, the inputs, the shards. Lines are appended during a batch.
+The line of a shard is appended after its files are complete. At the end the lines are sorted by input, so that the
+manifest does not depend on the order in which the shards were done.
 """
 
 import fcntl
@@ -16,159 +16,164 @@ from typing import IO, Any
 
 from jaxsonar.batch_jobs.parquet_tables import TABLES
 from jaxsonar.batch_jobs.shards import Shard
-from jaxsonar.batch_jobs.worker import Result
+from jaxsonar.batch_jobs.worker import ShardResult
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder, reason, shown
 from jaxsonar.hardware.errors import SonarError
 
-NAME = "manifest.jsonl"
-COPIES = ".copies"
-"""Folder in the results for copies of inputs while a batch runs."""
+MANIFEST_NAME = "manifest.jsonl"
+STAGING_NAME = ".copies"
+"""Temporary folder, in the output folder, for staged copies of inputs."""
 
-Line = dict[str, Any]
+Record = dict[str, Any]
+"""A line of the manifest."""
 
 
 class Manifest:
-    """The state of one folder of results; made by ``opened``."""
+    """The manifest of one output folder; created by ``open_manifest``."""
 
-    def __init__(self, folder: Path, run: Line, lines: Iterable[Line]):
+    def __init__(self, folder: Path, run: Record, records: Iterable[Record]):
         self.folder, self.run = folder, run
-        self.inputs: dict[str, Line] = {}
-        """By name of the log."""
-        self.shards: dict[str, Line] = {}
-        """By key."""
-        for line in lines:
-            self._know(line)
+        self.inputs: dict[str, Record] = {}
+        """Records of inputs, by name of the log."""
+        self.shards: dict[str, Record] = {}
+        """Records of shards, by key."""
+        for record in records:
+            self._store(record)
         self._file: IO[bytes] | None = None
 
-    def take(self, source: str, line: Line) -> None:
-        """Note an input.
+    def add_input(self, source: str, record: Record) -> None:
+        """Record an input.
 
         Args:
-            source: its name.
-            line: its fingerprint, and the number of its scans and shards or, where it was set aside, the reason.
+            source: name of the log.
+            record: its fingerprint, and the numbers of its scans and shards, or the reason why it was set aside.
 
         Raises:
-            SonarError: it is not what it was when its first shard was done.
+            SonarError: the log has changed since its first shard was done.
         """
         before = self.inputs.get(source)
-        if before is not None and "reason" not in before and before["sha256"] != line.get("sha256"):
+        if before is not None and "reason" not in before and before["sha256"] != record.get("sha256"):
             allowed = "the log as it was, or another folder for -o"
             raise SonarError(f"{shown(source)}: changed since {shown(self.folder)} was begun; allowed is {allowed}")
-        line = {"input": source, **line}
-        if line != before:
-            self._add(line)
+        record = {"input": source, **record}
+        if record != before:
+            self._append(record)
 
-    def check_all_came(self, sources: Iterable[str]) -> None:
-        """Complain about inputs of before that are not there any more.
+    def check_inputs(self, sources: Iterable[str]) -> None:
+        """Check that all inputs of earlier runs are inputs of this run.
 
         Raises:
-            SonarError: there are results of a log that was not given.
+            SonarError: there are results of a log that is not an input.
         """
-        not_given = set(self.inputs) - set(sources)
-        for source in [source for source in not_given if "reason" in self.inputs[source]]:
-            del self.inputs[source]  # nothing came of it
-        if gone := sorted(not_given & set(self.inputs)):
-            others = f" and {len(gone) - 1} more" if len(gone) > 1 else ""
+        missing = set(self.inputs) - set(sources)
+        for source in [source for source in missing if "reason" in self.inputs[source]]:
+            del self.inputs[source]  # it has no results
+        if missing := sorted(missing & set(self.inputs)):
+            others = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
             raise SonarError(
-                f"{shown(self.folder)} has results of {shown(gone[0])}{others}, which did not come; "
+                f"{shown(self.folder)} has results of {shown(missing[0])}{others}, which did not come; "
                 "allowed are the logs of before, with new ones or not, or another folder"
             )
 
     def is_done(self, shard: Shard) -> bool:
-        """Whether all files of a shard are there and hold what they held."""
-        line = self.shards.get(shard.key)
-        if line is None or line["state"] != "done":
+        """Whether all files of a shard exist with their recorded content."""
+        record = self.shards.get(shard.key)
+        if record is None or record["state"] != "done":
             return False
         try:
-            return all(_sha256(self._table(name, shard.key).read_bytes()) == line["sha256"][name] for name in TABLES)
+            return all(
+                _sha256(self._table_file(name, shard.key).read_bytes()) == record["sha256"][name] for name in TABLES
+            )
         except OSError:
             return False
 
-    def add(self, shard: Shard, came: Result) -> Line:
-        """Write the tables of a shard, whole, and then note it. Returns the line."""
+    def add_shard(self, shard: Shard, result: ShardResult) -> Record:
+        """Write the tables of a shard, then record it. Returns the record."""
         scans = {"source": shard.source, "first_row": shard.part.first, "scans": shard.part.scans}
-        if came.failure:
-            line = {"shard": shard.key, "state": "set aside", **scans, "reason": came.failure}
+        if result.failure:
+            record = {"shard": shard.key, "state": "set aside", **scans, "reason": result.failure}
         else:
-            for name, data in came.tables.items():
-                with atomic_write(self._table(name, shard.key), binary=True) as file:
+            for name, data in result.tables.items():
+                with atomic_write(self._table_file(name, shard.key), binary=True) as file:
                     file.write(data)
-            bad = {"bad_scans": came.bad, "reasons": came.reasons} if came.bad else {}
-            digests = {name: _sha256(data) for name, data in came.tables.items()}
-            line = {"shard": shard.key, "state": "done", **scans, **came.counts, **bad, "sha256": digests}
-        self._add(line)
-        return line
+            bad = {"bad_scans": result.bad_scans, "reasons": result.reasons} if result.bad_scans else {}
+            digests = {name: _sha256(data) for name, data in result.tables.items()}
+            record = {"shard": shard.key, "state": "done", **scans, **result.counts, **bad, "sha256": digests}
+        self._append(record)
+        return record
 
     def finish(self, shards: Iterable[Shard]) -> None:
-        """Put the lines in the order of the inputs; those of shards that a log no longer has are left out."""
+        """Sort the records by input. Records of shards that no longer exist are dropped."""
         if self._file is not None:
             self._file.close()
             self._file = None
-        lines = [self.run, *(self.inputs[source] for source in sorted(self.inputs))]
-        lines += [self.shards[shard.key] for shard in shards if shard.key in self.shards]
-        with atomic_write(self.folder / NAME, binary=True) as file:
-            file.writelines(map(_text, lines))
+        records = [self.run, *(self.inputs[source] for source in sorted(self.inputs))]
+        records += [self.shards[shard.key] for shard in shards if shard.key in self.shards]
+        with atomic_write(self.folder / MANIFEST_NAME, binary=True) as file:
+            file.writelines(map(_encode, records))
 
-    def _table(self, name: str, key: str) -> Path:
+    def _table_file(self, name: str, key: str) -> Path:
         return self.folder / name / f"{key}.parquet"
 
-    def _know(self, line: Line) -> None:
-        if "input" in line:
-            self.inputs[line["input"]] = line
-        elif "shard" in line:
-            self.shards[line["shard"]] = line
+    def _store(self, record: Record) -> None:
+        if "input" in record:
+            self.inputs[record["input"]] = record
+        elif "shard" in record:
+            self.shards[record["shard"]] = record
 
-    def _add(self, line: Line) -> None:
+    def _append(self, record: Record) -> None:
         if self._file is None:
-            self._file = open(self.folder / NAME, "ab")  # noqa: SIM115  closed by finish() and opened()
-        self._know(line)
-        self._file.write(_text(line))
+            self._file = open(self.folder / MANIFEST_NAME, "ab")  # noqa: SIM115  closed by finish() and close()
+        self._store(record)
+        self._file.write(_encode(record))
         self._file.flush()
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file as it is."""
+        """Close the file without sorting it."""
         if self._file is not None:
             self._file.close()
             self._file = None
 
 
 @contextmanager
-def opened(folder: str | os.PathLike[str], run: Line) -> Iterator[Manifest]:
-    """The manifest of a folder of results, for this process alone.
+def open_manifest(folder: str | os.PathLike[str], run: Record) -> Iterator[Manifest]:
+    """Open the manifest of an output folder, exclusively for this process.
 
     Args:
-        folder: made if it is not there.
-        run: what is being done, a line of JSON; another one than before is refused.
+        folder: output folder; created if it does not exist.
+        run: parameters of the batch. A folder that was started with other parameters is refused.
 
     Raises:
-        SonarError: the folder cannot be written to, holds something else, or another process is at work in it.
+        SonarError: a folder that cannot be written to, holds something else, or is in use by another process.
     """
     folder = Path(folder)
     make_folder(folder)
-    with _alone(folder):
-        lines = _lines(folder)
-        if not lines and any((folder / name).exists() and any((folder / name).iterdir()) for name in TABLES):
-            raise SonarError(f"{shown(folder)}: tables without a {NAME} lie there; allowed is a new folder for -o")
-        if not any("shard" in line for line in lines):
-            lines = []  # begun, but nothing came of it: there is nothing to go on with
-        if lines:
-            _check_same(folder, lines[0], run)
+    with _locked(folder):
+        records = _read_records(folder)
+        if not records and any((folder / name).exists() and any((folder / name).iterdir()) for name in TABLES):
+            raise SonarError(
+                f"{shown(folder)}: tables without a {MANIFEST_NAME} lie there; allowed is a new folder for -o"
+            )
+        if not any("shard" in record for record in records):
+            records = []  # started without any result: nothing to resume
+        if records:
+            _check_same_run(folder, records[0], run)
         for name in TABLES:
             make_folder(folder / name)
-            for left in (folder / name).glob(".*.tmp"):  # of a process that was killed
-                left.unlink()
-        with atomic_write(folder / NAME, binary=True) as file:  # without a last line that is not whole
-            file.writelines(map(_text, lines or [run]))
-        manifest = Manifest(folder, run, lines)
+            for temporary in (folder / name).glob(".*.tmp"):  # left by a killed process
+                temporary.unlink()
+        with atomic_write(folder / MANIFEST_NAME, binary=True) as file:  # drops an incomplete last line
+            file.writelines(map(_encode, records or [run]))
+        manifest = Manifest(folder, run, records)
         try:
             yield manifest
         finally:
             manifest.close()
-            _remove(folder / COPIES)
+            _remove(folder / STAGING_NAME)
 
 
-def _check_same(folder: Path, before: Line, run: Line) -> None:
+def _check_same_run(folder: Path, before: Record, run: Record) -> None:
     for key, value in run.items():
         other = before.get(key)
         if other != value:
@@ -177,40 +182,44 @@ def _check_same(folder: Path, before: Line, run: Line) -> None:
                 value, other = value.get(key), other.get(key)
             came, was = (shown(json.dumps(one), 60) for one in (value, other))
             what = "another ring" if key == "ring" else f"{key} {came}, before {was},"
-            allowed = "to go on as it was begun, or another folder for -o"
+            allowed = "the ring and the settings of the first run, or another folder for -o"
             raise SonarError(f"{shown(folder)}: {what} came; allowed is {allowed}")
 
 
-def _lines(folder: Path) -> list[Line]:
-    """What a manifest says; a last line that is not whole says nothing."""
+def _read_records(folder: Path) -> list[Record]:
+    """The records of a manifest; an incomplete last line is dropped."""
     try:
-        text = (folder / NAME).read_bytes()
+        text = (folder / MANIFEST_NAME).read_bytes()
     except FileNotFoundError:
         return []
     except OSError as failure:
-        raise SonarError(f"{shown(folder / NAME)}: {reason(failure)}; needed is the manifest of a batch") from None
-    whole = text[: text.rfind(b"\n") + 1].splitlines()
+        raise SonarError(
+            f"{shown(folder / MANIFEST_NAME)}: {reason(failure)}; needed is the manifest of a batch"
+        ) from None
+    lines = text[: text.rfind(b"\n") + 1].splitlines()
     try:
-        lines = [json.loads(line) for line in whole]
-        good = all(isinstance(line, dict) for line in lines) and (not lines or "batch" in lines[0])
+        records = [json.loads(line) for line in lines]
+        valid = all(isinstance(record, dict) for record in records) and (not records or "batch" in records[0])
     except ValueError:
-        good, lines = False, []
-    if not good or (text and not lines):
-        raise SonarError(f"{shown(folder / NAME)}: this is no manifest of a batch; allowed is another folder for -o")
-    return lines
+        valid, records = False, []
+    if not valid or (text and not records):
+        raise SonarError(
+            f"{shown(folder / MANIFEST_NAME)}: this is no manifest of a batch; allowed is another folder for -o"
+        )
+    return records
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold the folder for this process; the system lets go of it however the process ends."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock the folder for this process. The system releases the lock when the process ends."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise SonarError(f"{shown(folder)}: another batch is at work there; allowed is one at a time") from None
+            raise SonarError(f"{shown(folder)}: another batch is running there; allowed is one at a time") from None
         except OSError:
-            pass  # a file system without locks
+            pass  # the file system has no locks
         yield
     finally:
         os.close(handle)
@@ -223,8 +232,8 @@ def _remove(folder: Path) -> None:
         folder.rmdir()
 
 
-def _text(line: Line) -> bytes:
-    return json.dumps(line, ensure_ascii=False).encode() + b"\n"
+def _encode(record: Record) -> bytes:
+    return json.dumps(record, ensure_ascii=False).encode() + b"\n"
 
 
 def _sha256(data: bytes) -> str:

@@ -1,4 +1,4 @@
-"""Shards worked on by processes of this machine, each with ``batch_worker.do``."""
+"""Local executor: runs shards in worker processes of this machine."""
 
 import os
 import subprocess
@@ -6,125 +6,119 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from importlib.util import find_spec
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from socket import socketpair
 
 from jaxsonar.batch_jobs.shards import Shard
-from jaxsonar.batch_jobs.worker import KEPT_MEMORY, Result, one_thread
+from jaxsonar.batch_jobs.worker import ShardResult
+from jaxsonar.batch_jobs.worker_environment import available_gpus, worker_count, worker_environment
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
 
-STARTED_BY = "import sys; from jaxsonar.batch_worker import serve; serve(int(sys.argv[1]))"
-LOST = "the process that worked on it died twice; a shard that needs more memory than there is dies like this"
+WORKER_CODE = "import sys; from jaxsonar.batch_jobs.worker import worker_loop; worker_loop(int(sys.argv[1]))"
+"""Program of a worker process; its argument is the file descriptor of the socket."""
+WORKER_DIED = "its worker process died twice; a possible cause is a shard that needs more memory than there is"
+"""Reason of a shard that is set aside because its workers died."""
 
 
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def run_local(job: str, shards: Sequence[Shard], *, workers: int | None) -> Iterator[tuple[Shard, ShardResult]]:
+    """Run shards on this machine. Each result is yielded as soon as it is done.
 
-
-def gpus() -> list[str]:
-    """GPUs that JAX would use here, as CUDA_VISIBLE_DEVICES calls them; found without starting JAX."""
-    platforms = os.environ.get("JAX_PLATFORMS", "")
-    if not any(find_spec(f"jax_cuda{version}_plugin") for version in (12, 13)) or platforms.startswith("cpu"):
-        return []
-    if (visible := os.environ.get("CUDA_VISIBLE_DEVICES")) is not None:
-        return [name for name in visible.split(",") if name.strip()]
-    return [str(k) for k in range(len(list(Path("/proc/driver/nvidia/gpus").glob("*"))))]
-
-
-def run_local(job: str, shards: Sequence[Shard], *, workers: int | None) -> Iterator[tuple[Shard, Result]]:
-    """Shards and what came of them, as they are done, by processes of this machine.
-
-    Each is a fresh interpreter that loads nothing of the caller's program. One that dies is replaced, and its shard
-    tried once more.
+    Each worker is a new interpreter that does not load the caller's program. A worker that dies is replaced, and its
+    shard is tried once more.
 
     Args:
-        job: from ``batch_worker.job_of``.
-        shards: what is to be done; no more than one for each worker is under way.
-        workers: processes; one for each GPU or, without one, each core, if None.
+        job: from ``worker.job_spec``.
+        shards: the shards; a worker has at most one at a time.
+        workers: number of processes; None: one per GPU, or one per core if there is no GPU.
+
+    Raises:
+        SonarError: a worker ended before its first shard.
     """
-    devices = gpus()
-    count = min(workers or len(devices) or cores(), len(shards))
-    waiting, tried = deque(shards), set[str]()
-    pool: list[_Worker] = []
+    gpus = available_gpus()
+    count = worker_count(workers, gpus, len(shards))
+    pending, retried = deque(shards), set[str]()
+    pool: list[_WorkerProcess] = []
     try:
-        crowded = bool(devices) and count > len(devices)
-        pool += [_Worker(job, devices[k % len(devices)] if devices else None, crowded) for k in range(count)]
+        gpu_is_shared = bool(gpus) and count > len(gpus)
+        pool += [_WorkerProcess(job, gpus[k % len(gpus)] if gpus else None, gpu_is_shared) for k in range(count)]
         while True:
             for worker in pool:
-                if worker.ready and worker.shard is None and waiting:
-                    worker.take(waiting.popleft())
-            busy = [worker for worker in pool if worker.shard is not None or (waiting and not worker.ready)]
+                if worker.ready and worker.shard is None and pending:
+                    worker.start(pending.popleft())
+            busy = [worker for worker in pool if worker.shard is not None or (pending and not worker.ready)]
             if not busy:
                 return
-            for link in wait([worker.link for worker in busy]):
-                k = next(k for k, worker in enumerate(pool) if worker.link is link)
+            for connection in wait([worker.connection for worker in busy]):
+                k = next(k for k, worker in enumerate(pool) if worker.connection is connection)
                 worker, shard = pool[k], pool[k].shard
                 try:
-                    came = worker.result()
+                    result = worker.receive()
                 except (EOFError, OSError):
                     if not worker.ready:
-                        raise SonarError("a worker process ended before its first shard; see above for why") from None
+                        raise SonarError("a worker process ended before its first shard; its output is above") from None
                     worker.stop()
-                    pool[k] = _Worker(job, worker.device, worker.crowded)
-                    if shard is not None and shard.key in tried:
-                        yield shard, Result(failure=f"{shown(shard.source)}: {LOST}")
+                    pool[k] = _WorkerProcess(job, worker.gpu, worker.gpu_is_shared)
+                    if shard is not None and shard.key in retried:
+                        yield shard, ShardResult(failure=f"{shown(shard.source)}: {WORKER_DIED}")
                     elif shard is not None:
-                        tried.add(shard.key)
-                        waiting.appendleft(shard)
+                        retried.add(shard.key)
+                        pending.appendleft(shard)
                 else:
-                    if shard is not None and came is not None:
-                        yield shard, came
+                    if shard is not None and result is not None:
+                        yield shard, result
     finally:
         for worker in pool:
             worker.stop()
 
 
-class _Worker:
-    """A process that works on one shard at a time."""
+class _WorkerProcess:
+    """A worker process that runs one shard at a time."""
 
-    def __init__(self, job: str, device: str | None, crowded: bool):
-        self.device, self.crowded = device, crowded
+    def __init__(self, job: str, gpu: str | None, gpu_is_shared: bool):
+        self.gpu, self.gpu_is_shared = gpu, gpu_is_shared
         self.shard: Shard | None = None
         self.ready = False
         ours, theirs = socketpair()
-        path = os.pathsep.join(entry for entry in sys.path if entry)
-        environment = KEPT_MEMORY | os.environ | one_thread() | {"PYTHONPATH": path}
-        if device is not None:
-            environment["CUDA_VISIBLE_DEVICES"] = device
-        if crowded:  # several share a GPU: none may take most of its memory at once
+        module_path = os.pathsep.join(entry for entry in sys.path if entry)
+        environment = worker_environment() | {"PYTHONPATH": module_path}
+        if gpu is not None:
+            environment["CUDA_VISIBLE_DEVICES"] = gpu
+        if gpu_is_shared:  # JAX would allocate most of the memory of the GPU
             environment["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
-        command = [sys.executable, "-P", "-c", STARTED_BY, str(theirs.fileno())]
         self.process = subprocess.Popen(
-            command,
+            [sys.executable, "-P", "-c", WORKER_CODE, str(theirs.fileno())],
             pass_fds=[theirs.fileno()],
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for us
+            start_new_session=True,  # Ctrl-C is handled by this process
         )
         theirs.close()
-        self.link = Connection(ours.detach())
-        self.link.send(job)
+        self.connection = Connection(ours.detach())
+        self.connection.send(job)
 
-    def take(self, shard: Shard) -> None:
+    def start(self, shard: Shard) -> None:
+        """Send a shard to the process."""
         self.shard = shard
-        with suppress(OSError):  # it has died: that shows when its result is waited for
-            self.link.send(shard)
+        with suppress(OSError):  # if the process died, receive() reports it
+            self.connection.send(shard)
 
-    def result(self) -> Result | None:
-        """What came of its shard; None for its first word. EOFError or OSError if it has died."""
-        came = self.link.recv()
+    def receive(self) -> ShardResult | None:
+        """Receive the result of the shard; None for the first message, "ready".
+
+        Raises:
+            EOFError, OSError: the process died.
+        """
+        message = self.connection.recv()
         if not self.ready:
             self.ready = True
             return None
         self.shard = None
-        return came
+        return message
 
     def stop(self) -> None:
-        self.link.close()
+        """End the process."""
+        self.connection.close()
         self.process.kill()
         self.process.wait()

@@ -1,6 +1,7 @@
-"""Any number of logs to tables of lines: shard by shard, in bounded memory, and on from where a run was ended."""
+"""The batch: logs to Parquet tables, shard by shard, in bounded memory. An interrupted batch can be resumed."""
 
 import hashlib
+import json
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -8,11 +9,11 @@ from importlib import metadata
 from pathlib import Path
 
 from jaxsonar.batch_jobs.inputs import Input, find_inputs, fingerprint
-from jaxsonar.batch_jobs.manifest import COPIES, NAME, Manifest, opened
+from jaxsonar.batch_jobs.manifest import MANIFEST_NAME, STAGING_NAME, Manifest, open_manifest
 from jaxsonar.batch_jobs.parquet_staging import check_extras
 from jaxsonar.batch_jobs.parquet_tables import check_parquet
-from jaxsonar.batch_jobs.shards import SHARD_SCANS, Shard, shards_of
-from jaxsonar.batch_jobs.worker import Result, job_of
+from jaxsonar.batch_jobs.shards import SHARD_SCANS, Shard, split_input
+from jaxsonar.batch_jobs.worker import ShardResult, job_spec
 from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
@@ -20,36 +21,37 @@ from jaxsonar.kernels import HoughSettings
 from jaxsonar.sensors.ring import Ring
 
 ENGINES = ("local", "dask")
+"""Executors."""
 
 
 @dataclass(frozen=True)
 class BatchReport:
-    """What a batch came to, this run and those before it."""
+    """Summary of the results in a folder, of this run and earlier ones."""
 
     scans: int
-    """In the tables."""
+    """Scans in the tables."""
     lines: int
-    """In the tables."""
+    """Lines in the tables."""
     shards: int
-    """Done."""
-    before: int
-    """Of them, those that an earlier run had done."""
+    """Shards in the tables."""
+    resumed: int
+    """Shards in the tables that an earlier run had finished."""
     left_out: int
-    """Echoes of pairs of sensors that the ring does not listen to."""
+    """Echoes left out: their sensor pairs are not echo paths of the ring."""
     set_aside: tuple[str, ...]
-    """Logs, shards and scans that could not be used, and why: one text each; of many bad scans in a shard the first."""
+    """Reasons of all logs, shards and scans that could not be used; of a shard with many bad scans, the first ones."""
     bad_scans: int
-    """Single scans that were set aside."""
+    """Scans that were set aside."""
     bad_shards: int
-    """Whole shards that were."""
+    """Whole shards that were set aside."""
     bad_logs: int
-    """Whole logs that were."""
+    """Whole logs that were set aside."""
     manifest: Path
-    """The file that says all of it."""
+    """The manifest file."""
 
     @property
-    def aside(self) -> str:
-        """How much was set aside, in words; empty if nothing was."""
+    def set_aside_summary(self) -> str:
+        """Numbers of logs, shards and scans that were set aside, as text; empty if there are none."""
         counts = {"log": self.bad_logs, "shard": self.bad_shards, "scan": self.bad_scans}
         return ", ".join(f"{count} {what}{'s' * (count > 1)}" for what, count in counts.items() if count)
 
@@ -69,64 +71,64 @@ def batch(
     on_planned: Callable[[int], None] | None = None,
     on_done: Callable[[int], None] | None = None,
 ) -> BatchReport:
-    """Lines, corners and edges of every scan of any number of logs, as Parquet.
+    """Detect lines, corners and edges in every scan of any number of logs, and write them as Parquet.
 
-    The folder then holds ``scans/``, ``lines/`` and ``points/``, each a Parquet data set of one file a shard, and
-    ``manifest.jsonl``. The same call goes on where a run was ended, however it was. Results do not depend on engine,
-    workers or interruptions.
+    The output folder holds the data sets ``scans/``, ``lines/`` and ``points/``, one file per shard, and
+    ``manifest.jsonl``. The same call resumes an interrupted batch. Results do not depend on executor, workers or
+    interruptions.
 
     Args:
-        inputs: logs (.csv, .parquet, .mcap, .bag, .db3), and folders whose logs are meant.
+        inputs: logs (.csv, .parquet, .mcap, .bag, .db3), and folders of logs.
         ring: the sensors.
         output: folder of the results.
         method: "ml" or "hough", as in ``local_models``.
-        sigma: standard deviation of the ranges, metres, for ml; estimated for each scan if left out.
-        settings: accumulator and low pass, and for hough threshold and least echoes; the paper's if left out.
-        engine: "local": processes of this machine; "dask": a Dask cluster (extra ``cluster``), which in a script needs
-            ``if __name__ == "__main__":`` around the call.
-        scheduler: address of a Dask cluster that is there; one on this machine if left out.
-        workers: processes on this machine; one for each GPU or, without one, each core, if left out.
-        shard_scans: scans that are done at once, and stand in one file.
-        on_planned: told once how many scans there are to do.
-        on_done: told how many of them are done, after every shard.
+        sigma: standard deviation of the ranges, metres, for ml; estimated for each scan by default.
+        settings: accumulator and low pass, for hough also threshold and minimum echoes; the paper's by default.
+        engine: "local": processes of this machine; "dask": a Dask cluster (extra ``cluster``). A script that uses
+            "dask" needs ``if __name__ == "__main__":`` around the call.
+        scheduler: address of a running Dask cluster; a local cluster by default.
+        workers: processes on this machine; by default one per GPU, or one per core if there is no GPU.
+        shard_scans: scans per shard.
+        on_planned: called once with the number of scans to process.
+        on_done: called after every shard with the number of scans processed so far.
 
     Raises:
-        SonarError: a wrong call, another ring or other settings than the folder was begun with, or a log that has
+        SonarError: an invalid call, a folder that was started with another ring or other settings, or a log that has
             changed since.
     """
-    _check(engine, scheduler, workers, shard_scans)
+    # 1. Check the call before any work.
+    _check_executor(engine, scheduler, workers, shard_scans)
     check_method(method)
     check_sigma(sigma)
     check_parquet()
     settings = hough_settings(ring, settings)
-    job = job_of(ring, method=method, settings=settings, sigma=sigma)
+    # 2. Find the logs.
     logs = find_inputs(inputs)
     check_extras(logs)
-    if engine == "dask":
-        from jaxsonar.batch_jobs.dask_cluster import check_dask
-
-        check_dask()
-    with opened(output, _run(job, method, sigma, settings, shard_scans)) as manifest:
-        manifest.check_all_came(log.source for log in logs)
-        # Which scans there are, and in which shards: a matter of the inputs alone.
-        shards = [shard for log in logs for shard in _planned(log, manifest, ring, shard_scans)]
-        to_do = [shard for shard in shards if not manifest.is_done(shard)]
+    job = job_spec(ring, method=method, settings=settings, sigma=sigma)
+    # 3. Open the manifest: it knows what an earlier run has finished.
+    with open_manifest(output, _run_record(job, method, sigma, settings, shard_scans)) as manifest:
+        manifest.check_inputs(log.source for log in logs)
+        # 4. Split the logs into shards; this depends on the logs alone.
+        shards = [shard for log in logs for shard in _plan(log, manifest, ring, shard_scans)]
+        pending = [shard for shard in shards if not manifest.is_done(shard)]
         if on_planned is not None:
-            on_planned(sum(shard.part.scans for shard in to_do))
-        # Shards come back in any order; each is written whole, then noted.
+            on_planned(sum(shard.part.scans for shard in pending))
+        # 5. Run the shards in any order. Write the tables of each completely, then record it.
         done = 0
-        for shard, came in _results(job, to_do, engine, scheduler, workers):
-            manifest.add(shard, came)
+        for shard, result in _run_shards(job, pending, engine, scheduler, workers):
+            manifest.add_shard(shard, result)
             done += shard.part.scans
             if on_done is not None:
                 on_done(done)
+        # 6. Sort the manifest and summarize it.
         manifest.finish(shards)
-        return _report(manifest, before=len(shards) - len(to_do))
+        return _report(manifest, resumed=len(shards) - len(pending))
 
 
-def _results(
+def _run_shards(
     job: str, shards: list[Shard], engine: str, scheduler: str | None, workers: int | None
-) -> Iterator[tuple[Shard, Result]]:
+) -> Iterator[tuple[Shard, ShardResult]]:
     if not shards:
         return iter(())
     if engine == "dask":
@@ -138,52 +140,51 @@ def _results(
     return run_local(job, shards, workers=workers)
 
 
-def _planned(log: Input, manifest: Manifest, ring: Ring, scans: int) -> list[Shard]:
-    """The shards of a log, none if it cannot be read; the manifest knows of it then."""
-    line: dict[str, int | str] = {}
+def _plan(log: Input, manifest: Manifest, ring: Ring, scans: int) -> list[Shard]:
+    """Split a log into shards and record it in the manifest. An unreadable log has no shards."""
+    record: dict[str, int | str] = {}
     try:
-        line |= fingerprint(log)
-        shards = shards_of(log, copies=manifest.folder / COPIES, sensors=ring.count, scans=scans)
+        record |= fingerprint(log)
+        shards = split_input(log, staging=manifest.folder / STAGING_NAME, sensors=ring.count, scans=scans)
     except SonarError as error:
-        manifest.take(log.source, line | {"reason": str(error)})
+        manifest.add_input(log.source, record | {"reason": str(error)})
         return []
-    line |= {"scans": sum(shard.part.scans for shard in shards), "shards": len(shards)}
-    manifest.take(log.source, line)
+    record |= {"scans": sum(shard.part.scans for shard in shards), "shards": len(shards)}
+    manifest.add_input(log.source, record)
     return shards
 
 
-def _run(job: str, method: str, sigma: float | None, settings: HoughSettings, scans: int) -> dict[str, object]:
-    """The first line of a manifest: whatever results depend on, but for the inputs."""
-    import json
-
-    told = json.loads(job)
-    ring = hashlib.sha256(json.dumps(told["ring"], sort_keys=True).encode()).hexdigest()
+def _run_record(job: str, method: str, sigma: float | None, settings: HoughSettings, scans: int) -> dict[str, object]:
+    """The first line of the manifest: everything that the results depend on, except the inputs."""
+    spec = json.loads(job)
+    ring_digest = hashlib.sha256(json.dumps(spec["ring"], sort_keys=True).encode()).hexdigest()
     versions = {name: metadata.version(name) for name in ("jaxsonar", "jax")}
-    said = {"name": told["ring"]["name"], "sha256": ring}
-    choices = {"method": method, "sigma": sigma, "settings": told["settings"], "shard_scans": scans}
-    return {"batch": 1, **versions, "ring": said, **choices}
+    ring = {"name": spec["ring"]["name"], "sha256": ring_digest}
+    parameters = {"method": method, "sigma": sigma, "settings": spec["settings"], "shard_scans": scans}
+    return {"batch": 1, **versions, "ring": ring, **parameters}
 
 
-def _report(manifest: Manifest, *, before: int) -> BatchReport:
-    done = [line for line in manifest.shards.values() if line["state"] == "done"]
-    aside = [line["reason"] for line in (*manifest.inputs.values(), *manifest.shards.values()) if "reason" in line]
-    aside += [reason for line in done for reason in line.get("reasons", ())]
-    bad = sum(line.get("bad_scans", 0) for line in done)
+def _report(manifest: Manifest, *, resumed: int) -> BatchReport:
+    done = [record for record in manifest.shards.values() if record["state"] == "done"]
+    inputs = manifest.inputs.values()
+    reasons = [record["reason"] for record in (*inputs, *manifest.shards.values()) if "reason" in record]
+    reasons += [reason for record in done for reason in record.get("reasons", ())]
+    bad_scans = sum(record.get("bad_scans", 0) for record in done)
     return BatchReport(
-        scans=sum(line["scans"] for line in done) - bad,
-        lines=sum(line["lines"] for line in done),
+        scans=sum(record["scans"] for record in done) - bad_scans,
+        lines=sum(record["lines"] for record in done),
         shards=len(done),
-        before=before,
-        left_out=sum(line["left_out"] for line in done),
-        set_aside=tuple(aside),
-        bad_scans=bad,
+        resumed=resumed,
+        left_out=sum(record["left_out"] for record in done),
+        set_aside=tuple(reasons),
+        bad_scans=bad_scans,
         bad_shards=len(manifest.shards) - len(done),
-        bad_logs=sum("reason" in line for line in manifest.inputs.values()),
-        manifest=manifest.folder / NAME,
+        bad_logs=sum("reason" in record for record in inputs),
+        manifest=manifest.folder / MANIFEST_NAME,
     )
 
 
-def _check(engine: str, scheduler: str | None, workers: int | None, scans: int) -> None:
+def _check_executor(engine: str, scheduler: str | None, workers: int | None, scans: int) -> None:
     if engine not in ENGINES:
         raise SonarError(f"engine '{shown(engine)}' came; allowed is {' or '.join(ENGINES)}")
     if scheduler is not None and engine != "dask":

@@ -1,4 +1,4 @@
-"""What a batch reads: its inputs, and the shards that they are cut into, by the inputs alone."""
+"""Splits inputs into shards. The split depends on the inputs alone."""
 
 import os
 from dataclasses import dataclass
@@ -10,62 +10,64 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.log_chunks import Part, csv_parts, parquet_parts
 
 SHARD_SCANS = 2048
-"""Scans of one shard: some seconds of work, so that little is lost with a process, and few enough files."""
-LARGEST_GROUP = 32 * SHARD_SCANS
-"""Rows of a Parquet row group; of larger ones a copy in small groups is made, or every shard would read all of it."""
+"""Scans per shard: some seconds of work, so that a lost process costs little, and not too many files."""
+MAX_ROW_GROUP = 32 * SHARD_SCANS
+"""Maximum number of rows in a Parquet row group. A log with larger ones is staged in small row groups; otherwise every
+shard would read all of a group."""
 
 
 @dataclass(frozen=True)
 class Shard:
-    """A run of whole scans of one log: one task, one file in each table."""
+    """Consecutive scans of one log: one task, and one file per table."""
 
     key: str
     """Name of its files, without suffix."""
     source: str
     """Name of the log."""
-    path: str
-    """File to read: the log, or a copy of it as Parquet."""
-    kind: str
+    filename: str
+    """File to read: the log, or its staged copy."""
+    format: str
     """csv or parquet."""
     size: int
-    """Bytes of that file, and the time of its last change in ns: how it was when it was cut into shards."""
-    changed: int
+    """Size of that file when the shard was planned, bytes."""
+    modified_ns: int
+    """Modification time of that file when the shard was planned, nanoseconds."""
     part: Part
-    """Which of its scans."""
+    """The scans in that file."""
 
 
-def shards_of(one: Input, *, copies: Path, sensors: int, scans: int = SHARD_SCANS) -> list[Shard]:
-    """An input in shards, without holding it.
+def split_input(log: Input, *, staging: Path, sensors: int, scans: int = SHARD_SCANS) -> list[Shard]:
+    """Split an input into shards, in bounded memory.
 
     Args:
-        one: the input.
-        copies: folder for a copy of what cannot be read in parts; it is made if it is needed.
-        sensors: of the ring, for what devices recorded.
-        scans: of a shard.
+        log: the input.
+        staging: folder for a Parquet copy of formats that cannot be read in parts; created if needed.
+        sensors: number of sensors of the ring, for raw recordings.
+        scans: scans per shard.
 
     Raises:
-        SonarError: it cannot be read, or is no log.
+        SonarError: the input cannot be read, or is not a log.
     """
-    path, kind = one.path, one.kind
-    if kind not in ("csv", "parquet") or (kind == "parquet" and _largest_group(one) > LARGEST_GROUP):
-        from jaxsonar.batch_jobs.parquet_staging import copy
+    filename, format_ = log.filename, log.format
+    if format_ not in ("csv", "parquet") or (format_ == "parquet" and _largest_row_group(log) > MAX_ROW_GROUP):
+        from jaxsonar.batch_jobs.parquet_staging import stage_as_parquet
 
-        path, kind = os.fspath(copies / f"{one.key}.parquet"), "parquet"
-        copies.mkdir(exist_ok=True)
-        copy(one, path, sensors=sensors, rows=scans)
+        filename, format_ = os.fspath(staging / f"{log.key}.parquet"), "parquet"
+        staging.mkdir(exist_ok=True)
+        stage_as_parquet(log, filename, sensors=sensors, rows=scans)
     try:
-        seen = os.stat(path)
+        status = os.stat(filename)
     except OSError as failure:
-        raise SonarError(f"{shown(one.source)}: {reason(failure)}; needed is a readable log") from None
-    parts = (csv_parts if kind == "csv" else parquet_parts)(path, name=one.source, scans=scans)
+        raise SonarError(f"{shown(log.source)}: {reason(failure)}; needed is a readable log") from None
+    parts = (csv_parts if format_ == "csv" else parquet_parts)(filename, name=log.source, scans=scans)
     return [
-        Shard(f"{one.key}-{k:06d}", one.source, path, kind, seen.st_size, seen.st_mtime_ns, part)
+        Shard(f"{log.key}-{k:06d}", log.source, filename, format_, status.st_size, status.st_mtime_ns, part)
         for k, part in enumerate(parts)
     ]
 
 
-def _largest_group(one: Input) -> int:
+def _largest_row_group(log: Input) -> int:
     from jaxsonar.scans.parquet_log import open_parquet
 
-    file = open_parquet(one.path, name=one.source).metadata
+    file = open_parquet(log.filename, name=log.source).metadata
     return max((file.row_group(k).num_rows for k in range(file.num_row_groups)), default=0)

@@ -64,9 +64,11 @@ def run(options: argparse.Namespace) -> int:
         )
     if report.left_out:
         print_left_out(ring.name, report.left_out)
-    shards = count(report.shards, "shard") + (f", {report.before} of them before" if report.before else "")
+    shards = count(report.shards, "shard") + (f", {report.resumed} of them by an earlier run" if report.resumed else "")
     print_status(f"{report.scans} scans, {report.lines} lines, {shards}: {shown(options.output)}")
     if report.set_aside:
-        print_status(f"set aside: {report.aside}; {shown(report.manifest)} says why; the first: {report.set_aside[0]}")
+        print_status(
+            f"set aside: {report.set_aside_summary}; {shown(report.manifest)} says why; the first: {report.set_aside[0]}"
+        )
         return 1
     return 0

@@ -13,7 +13,7 @@ import pytest
 
 from jaxsonar import Log, load_log, load_ring
 from jaxsonar.batch_jobs.inputs import find_inputs
-from jaxsonar.batch_jobs.shards import shards_of
+from jaxsonar.batch_jobs.shards import split_input
 from jaxsonar.cli import app as cli
 from jaxsonar.fileio.compilation_cache import CACHE_VARIABLE, use_compilation_cache
 from jaxsonar.scans.rosbag_log import bag_scans
@@ -116,10 +116,10 @@ sys.exit(main({arguments}))
 
 
 def parts_of(path, tmp_path):
-    shards = shards_of(*find_inputs([path]), copies=tmp_path / "copies", sensors=RING.count, scans=4)
-    assert {one.kind for one in shards} == {"parquet"}
-    assert sum(one.part.scans for one in shards) == len(load_log(shards[0].path))
-    return load_log(shards[0].path)
+    shards = split_input(*find_inputs([path]), staging=tmp_path / "copies", sensors=RING.count, scans=4)
+    assert {one.format for one in shards} == {"parquet"}
+    assert sum(one.part.scans for one in shards) == len(load_log(shards[0].filename))
+    return load_log(shards[0].filename)
 
 
 def test_a_raw_record_is_the_log_that_was_sent(tmp_path):

@@ -1,0 +1,96 @@
+"""Reads the scans of a shard. Scans that cannot be read or used are left out and reported."""
+
+import os
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxsonar.batch_jobs.shards import Shard
+from jaxsonar.fileio.atomic_files import reason, shown
+from jaxsonar.hardware.errors import SonarError
+from jaxsonar.scans.log_chunks import csv_reader, parquet_reader
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.ring import Ring
+
+
+def read_shard(shard: Shard, ring: Ring) -> tuple[Log, Int[np.ndarray, " scans"], dict[int, str]]:
+    """Read the usable scans of a shard.
+
+    Args:
+        shard: the scans to read.
+        ring: the sensors; echoes of other sensor numbers make a scan unusable.
+
+    Returns:
+        The usable scans, their rows in the shard, and for each unusable row the reason.
+
+    Raises:
+        SonarError: the file is missing, or has changed since the shard was planned.
+    """
+    try:
+        status = os.stat(shard.filename)
+    except OSError as failure:
+        raise SonarError(f"{shown(shard.source)}: {reason(failure)}; needed is a readable log") from None
+    if (status.st_size, status.st_mtime_ns) != (shard.size, shard.modified_ns):
+        raise SonarError(f"{shown(shard.source)}: changed during the batch; needed is a log that does not change")
+    reader = csv_reader if shard.format == "csv" else parquet_reader
+    read = reader(shard.filename, shard.part, name=shard.source)
+
+    runs, reasons = _readable_runs(read, shard.part.scans)
+    logs, rows = [], [np.zeros(0, np.int64)]
+    for first_row, log in runs:
+        unusable = _unusable_scans(shard, ring, first_row, log)
+        usable = np.setdiff1d(np.arange(len(log)), np.array(list(unusable), np.int64))
+        reasons |= {first_row + k: why for k, why in unusable.items()}
+        logs.append(log._part(usable) if unusable else log)
+        rows.append(first_row + usable)
+    return _concatenate(logs), np.concatenate(rows), reasons
+
+
+def _readable_runs(read: Callable[[int, int], Log], scans: int) -> tuple[list[tuple[int, Log]], dict[int, str]]:
+    """Find the readable runs of scans by bisection.
+
+    Returns:
+        First row and scans of each run, and for each unreadable scan the reason.
+    """
+    runs, reasons = [], {}
+    pending = [(0, scans)]
+    while pending:
+        begin, end = pending.pop()
+        try:
+            runs.append((begin, read(begin, end)))
+        except SonarError as error:
+            if end - begin == 1:
+                reasons[begin] = str(error)
+            else:
+                middle = (begin + end) // 2
+                pending += [(middle, end), (begin, middle)]
+    return runs, reasons
+
+
+def _unusable_scans(shard: Shard, ring: Ring, first_row: int, log: Log) -> dict[int, str]:
+    """Readable scans that cannot be used, by row in ``log``: unknown sensors, or repeated scan numbers."""
+    name, scan = shown(shard.source), log.echo_scan
+    unknown = np.flatnonzero(np.maximum(log.tx, log.rx) >= ring.count)
+    _, first = np.unique(scan[unknown], return_index=True)
+    reasons = {}
+    for echo in unknown[first].tolist():
+        sensors = (
+            f"tx {log.tx[echo]}, rx {log.rx[echo]}; allowed are 0 to {ring.count - 1}, the sensors of {ring.name!r}"
+        )
+        reasons[int(scan[echo])] = f"{name}: scan {log.scan[scan[echo]]}: echo of sensors {sensors}"
+    for row in shard.part.repeated:
+        if first_row <= row < first_row + len(log):
+            number = log.scan[row - first_row]
+            reasons[row - first_row] = f"{name}: scan {number} came again; allowed is each scan number once"
+    return reasons
+
+
+def _concatenate(logs: list[Log]) -> Log:
+    if len(logs) == 1:
+        return logs[0]
+    names = ("scan", "stamp", "pose", "tx", "rx", "range", "amplitude")
+    empty = Log.from_scans([])
+    columns = {name: np.concatenate([getattr(log, name) for log in (empty, *logs)]) for name in names}
+    echoes = np.concatenate([np.zeros(1, np.int64), *(np.diff(log.start) for log in logs)])
+    return Log(start=np.cumsum(echoes), **columns)
