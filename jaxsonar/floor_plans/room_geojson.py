@@ -1,4 +1,4 @@
-"""Rooms as GeoJSON, world frame, metres: lines and polygons are walls, points of kind pole are poles."""
+"""Rooms as GeoJSON, world frame, metres: lines and polygons are walls, points of kind "pole" are poles."""
 
 import os
 from typing import Any
@@ -7,23 +7,24 @@ import numpy as np
 
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.fileio.geojson import feature, lines_of, positions, read_features, write_features
-from jaxsonar.floor_plans.room import TOUCH, Room
+from jaxsonar.floor_plans.junctions import TOUCH
+from jaxsonar.floor_plans.room import Room
 from jaxsonar.hardware.errors import SonarError
 
 
-def load_room(path: str | os.PathLike[str]) -> Room:
-    """Read a room from a GeoJSON FeatureCollection in world metres.
+def load_room(filename: str | os.PathLike[str]) -> Room:
+    """Read a room from a GeoJSON FeatureCollection, world frame, metres.
 
-    LineString and MultiLineString pieces and the rings of Polygon and MultiPolygon are walls, each with its feature's
-    property ``name``; a Point with property ``kind`` "pole" is a pole. Points of kind "corner" and "edge", which maps
-    contain, are skipped: walls imply them.
+    The pieces of LineString and MultiLineString and the rings of Polygon and MultiPolygon are walls, named by the
+    property ``name`` of their feature. A Point with the property ``kind`` "pole" is a pole. Points of kind "corner" and
+    "edge", which maps contain, are skipped, because walls imply them.
 
     Raises:
-        SonarError: the file cannot be read, or a feature is none of these; one line names file, feature and cause.
+        SonarError: the file cannot be read, or a feature is of another type; the message names file, feature and cause.
     """
-    place = shown(path)
+    place = shown(filename)
     walls, names, poles = [], [], []
-    for name, pieces, points in read_features(path, _feature, what="a room"):
+    for name, pieces, points in read_features(filename, _feature, what="a room"):
         walls += pieces
         names += [name] * len(pieces)
         poles += points
@@ -35,10 +36,11 @@ def load_room(path: str | os.PathLike[str]) -> Room:
         raise SonarError(f"{place}: {error}") from None
 
 
-def save_room(room: Room, path: str | os.PathLike[str]) -> None:
-    """Write a room as GeoJSON in world metres: a LineString a wall, a Point of kind "pole" a pole; ``-`` is stdout.
+def save_room(room: Room, filename: str | os.PathLike[str]) -> None:
+    """Write a room as GeoJSON, world frame, metres: one LineString per wall, one Point of kind "pole" per pole.
 
-    The file appears complete or not at all. Coordinates are written in full: what is loaded again is the same room.
+    Coordinates are written with all digits, so that ``load_room`` restores the same room. An existing file is replaced
+    only after the new one is complete; ``-`` is standard output.
 
     Raises:
         SonarError: the file cannot be written.
@@ -46,7 +48,7 @@ def save_room(room: Room, path: str | os.PathLike[str]) -> None:
     walls = zip(room.walls.tolist(), room.wall_names, strict=True)
     features = [feature("LineString", wall, kind="wall", **({"name": name} if name else {})) for wall, name in walls]
     features += [feature("Point", pole, kind="pole") for pole in room.poles.tolist()]
-    write_features(features, path)
+    write_features(features, filename)
 
 
 def _feature(properties: dict[str, Any], form: str, coordinates: Any) -> tuple[str, list[np.ndarray], list[np.ndarray]]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.floor_plans.room import Junctions
+from jaxsonar.floor_plans.junctions import Junctions
 from jaxsonar.geometry.segments import cross
 from jaxsonar.simulation.traced_echoes import EchoKind, TracedEchoes
 from jaxsonar.simulation.tracing_scene import TOLERANCE, TracingScene, row_slices
