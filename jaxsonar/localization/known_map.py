@@ -7,10 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxsonar import kernels
+from jaxsonar.estimation.landmark_map import map_landmarks
+from jaxsonar.geometry.landmarks import concatenate_landmarks, landmarks_from_points
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
 from jaxsonar.localization.settings import SETTINGS
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.registration.features import Features
+from jaxsonar.registration.features import Features, landmark_features
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,23 +27,14 @@ class KnownMap:
     @classmethod
     def of(cls, world: GlobalMap) -> "KnownMap":
         """Landmarks of a map; a map without points, such as a floor plan, gets corners where its walls meet."""
-        middle, half = world.segments.mean(axis=1), world.length / 2
-        wall_covariance = _wall_covariances(world, middle)
-        points = world.points
-        point_covariance = np.where(
-            np.isfinite(world.point_cov), world.point_cov, np.eye(2) * SETTINGS.default_map_sd[0] ** 2
-        )
-        kinds = [kernels.CORNER if kind == "corner" else kernels.EDGE for kind in world.point_kinds]
-        if not kinds:
-            points, point_covariance = _wall_corners(world, middle, wall_covariance)
-            kinds = [kernels.CORNER] * len(points)
-        zeros = np.zeros((len(kinds), 2))
-        landmarks = kernels.Landmarks(
-            kind=np.array([kernels.PLANE] * len(world) + kinds, dtype=np.int32),
-            parameters=np.concatenate([np.stack([np.zeros(len(world)), world.theta], axis=-1), zeros]),
-            anchor=np.concatenate([middle, points]),
-            extent=np.concatenate([half[:, None] * [-1.0, 1.0], zeros]),
-        )
+        wall_covariance = _wall_covariances(world)
+        default = np.eye(2) * SETTINGS.default_map_sd[0] ** 2
+        point_covariance = np.where(np.isfinite(world.point_cov), world.point_cov, default)
+        landmarks = map_landmarks(world)
+        if not world.point_kinds:
+            corners, point_covariance = _wall_corners(world, wall_covariance)
+            kind = np.full(len(corners), kernels.CORNER)
+            landmarks = concatenate_landmarks([landmarks, landmarks_from_points(kind, corners)])
         return cls(landmarks, np.concatenate([wall_covariance, point_covariance]))
 
     @property
@@ -69,37 +62,35 @@ class KnownMap:
         in_reach = distance < max_range + uncertainty
         rows = np.flatnonzero(in_reach & (~wall | (beyond < SETTINGS.wall_extension + uncertainty)))
         rows = rows[np.argsort(distance[rows], kind="stable")][: SETTINGS.max_landmarks]
-        facing = np.where(wall, wrap_angle(theta + np.pi * ((across < 0) & wall)), 0.0)[rows]
         joint = np.zeros((3 + 2 * len(rows), 3 + 2 * len(rows)))
         joint[:3, :3] = covariance
         for k, row in enumerate(rows):
             joint[3 + 2 * k : 5 + 2 * k, 3 + 2 * k : 5 + 2 * k] = self.covariance[row]
-        parameters = np.stack([np.zeros(len(rows)), facing], axis=-1)
+        # The other side of a wall: the normal and the distance along it are reversed.
+        parameters = np.asarray(self.landmarks.parameters)[rows]
+        reversed_ = np.stack([-parameters[:, 0], wrap_angle(parameters[:, 1] + np.pi)], axis=-1)
+        parameters = np.where((wall & (across < 0))[rows, None], reversed_, parameters)
         return kernels.Belief(pose, self.landmarks.take(rows).with_parameters(parameters), joint)
 
     @cached_property
     def features(self) -> Features:
         """Walls, each from both of its sides, and points."""
-        wall, kind = self.is_wall, np.asarray(self.landmarks.kind)
-        anchor, theta = np.asarray(self.landmarks.anchor), np.asarray(self.landmarks.parameters)[wall, 1]
-        count = 2 * int(wall.sum())
-        return Features(
-            reference=np.tile(anchor[wall], (2, 1)),
-            theta=np.concatenate([theta, wrap_angle(theta + np.pi)]),
-            offset=np.zeros(count),
-            covariance=np.tile(self.covariance[wall], (2, 1, 1)),
-            extent=np.tile(np.asarray(self.landmarks.extent)[wall], (2, 1)),
-            weight=np.ones(count),
-            scans=np.full(count, SETTINGS.wall_scans),
-            point=anchor[~wall],
-            is_corner=kind[~wall] == kernels.CORNER,
-            point_sd=np.sqrt(np.trace(self.covariance[~wall], axis1=1, axis2=2) / 2),
+        scans = np.full(len(self.covariance), SETTINGS.wall_scans)
+        one = landmark_features(self.landmarks, self.covariance, scans)
+        return one._replace(
+            reference=np.tile(one.reference, (2, 1)),
+            theta=np.concatenate([one.theta, wrap_angle(one.theta + np.pi)]),
+            offset=np.concatenate([one.offset, -one.offset]),
+            covariance=np.tile(one.covariance, (2, 1, 1)),
+            extent=np.concatenate([one.extent, -one.extent[:, ::-1]]),
+            weight=np.tile(one.weight, 2),
+            scans=np.tile(one.scans, 2),
         )
 
 
-def _wall_covariances(world: GlobalMap, middle: Float[np.ndarray, "walls 2"]) -> Float[np.ndarray, "walls 2 2"]:
+def _wall_covariances(world: GlobalMap) -> Float[np.ndarray, "walls 2 2"]:
     """Covariances of (distance at the middle, theta): that distance is better known than that from the origin."""
-    arm = (middle * tangent_of(world.theta)).sum(axis=-1)
+    arm = (world.segments.mean(axis=1) * tangent_of(world.theta)).sum(axis=-1)
     (default_across, default_turn), (min_across, min_turn) = SETTINGS.default_map_sd, SETTINGS.min_map_sd
     turn = np.where(np.isfinite(world.sigma_theta), world.sigma_theta, default_turn)
     across = np.where(np.isfinite(world.sigma_rho), world.sigma_rho**2 - (arm * turn) ** 2, default_across**2)
@@ -112,9 +103,10 @@ def _wall_covariances(world: GlobalMap, middle: Float[np.ndarray, "walls 2"]) ->
 
 
 def _wall_corners(
-    world: GlobalMap, middle: Float[np.ndarray, "walls 2"], wall_covariance: Float[np.ndarray, "walls 2 2"]
+    world: GlobalMap, wall_covariance: Float[np.ndarray, "walls 2 2"]
 ) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 2"]]:
     """Points where walls meet at right angles, and their covariances."""
+    middle = world.segments.mean(axis=1)
     gap = np.linalg.norm(world.segments[:, None, :, None] - world.segments[None, :, None], axis=-1).min(axis=(2, 3))
     right_angle = np.abs(np.cos(world.theta[:, None] - world.theta)) < np.sin(SETTINGS.corner_angle)
     points, covariances = [], []

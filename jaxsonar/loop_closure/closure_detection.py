@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar import kernels
+from jaxsonar.geometry.landmarks import landmark_positions
 from jaxsonar.geometry.se2 import perpendicular, subtract_poses, tangent_of, unit, wrap_angle
 from jaxsonar.loop_closure.perceptual_aliasing import (
     AlternativeHypotheses,
@@ -149,13 +150,11 @@ def _is_redundant(earlier: Submap, pairs: Pairs) -> bool:
 
     One jamb of a door looks like the other one; their distance does not.
     """
-    row = pairs.earlier
-    wall = row[earlier.kind[row] == kernels.PLANE]
-    point = row[earlier.kind[row] != kernels.PLANE]
-    position = earlier.anchor[point] + earlier.parameters[point]
-    theta = earlier.parameters[wall, 1]
-    foot = earlier.anchor[wall] + earlier.parameters[wall, :1] * unit(theta)
-    longest = theta[np.diff(earlier.ends[wall], axis=-1)[:, 0].argmax()] if len(wall) else 0.0
+    paired = earlier.landmarks.take(pairs.earlier)
+    wall = paired.kind == kernels.PLANE
+    positions = landmark_positions(paired)
+    position, foot, theta = positions[~wall], positions[wall], np.asarray(paired.parameters)[wall, 1]
+    longest = theta[np.diff(paired.extent[wall], axis=-1)[:, 0].argmax()] if wall.any() else 0.0
     for axis in (unit(float(longest)), tangent_of(float(longest))):
         facing = np.abs(unit(theta) @ axis) > np.cos(SETTINGS.facing_angle)
         levels = np.concatenate([position @ axis, foot[facing] @ axis])
@@ -277,11 +276,11 @@ def _corridor_alignment(
     reach: float,
 ) -> _AlignedPair | None:
     """Alignment by the walls alone that are parallel to most of the paired walls."""
-    wall = np.flatnonzero(earlier.kind[best.pairs.earlier] == kernels.PLANE)
+    paired = earlier.landmarks.take(best.pairs.earlier)
+    wall = np.flatnonzero(paired.kind == kernels.PLANE)
     if len(wall) < 2:
         return None
-    row = best.pairs.earlier[wall]
-    theta, length = earlier.parameters[row, 1], np.diff(earlier.ends[row], axis=-1)[:, 0]
+    theta, length = paired.parameters[wall, 1], np.diff(paired.extent[wall], axis=-1)[:, 0]
     parallel = np.abs(np.sin(theta[:, None] - theta)) < np.sin(SETTINGS.corridor_angle)
     kept = wall[parallel[(parallel @ length).argmax()]]
     pairs = Pairs(best.pairs.earlier[kept], best.pairs.newest[kept])

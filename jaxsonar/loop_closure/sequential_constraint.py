@@ -21,7 +21,7 @@ def odometry_factor(submap: Submap, number: int) -> BetweenFactor:
         submap: the submap.
         number: its node in the pose graph.
     """
-    return BetweenFactor(number, number + 1, submap.exit, np.linalg.inv(submap.covariance[:3, :3]))
+    return BetweenFactor(number, number + 1, submap.exit_pose, np.linalg.inv(submap.covariance[:3, :3]))
 
 
 def sequential_factor(previous: Submap, following: Submap, number: int = 0) -> BetweenFactor:
@@ -43,7 +43,7 @@ def sequential_factor(previous: Submap, following: Submap, number: int = 0) -> B
     if not (len(previous) and len(following)):
         return alone
     # 1. An update from every pose at which reflectors agree, with the pairs found there.
-    prior = PosePrior(previous.exit, previous.covariance[:3, :3])
+    prior = PosePrior(previous.exit_pose, previous.covariance[:3, :3])
     updates = [_update_from(previous, following, pose) for pose in pose_candidates(previous, following, prior)]
     updates = [one for one in updates if one is not None]
     if not updates:
@@ -92,7 +92,7 @@ def _kalman_update(
     unknown = np.concatenate([np.arange(3), (3 + 2 * pairs.earlier[:, None] + np.arange(2)).ravel()])
     known = previous.covariance[np.ix_(unknown, unknown)]
     mine = following.joint_covariance(pairs.newest)
-    pose, change = previous.exit, np.zeros(len(unknown))
+    pose, change = previous.exit_pose, np.zeros(len(unknown))
     chi2, share, cov = 0.0, np.zeros(count), known
     for step in range(SETTINGS.sequential_steps):
         found = pair_residuals(previous, following, pairs.earlier, pairs.newest, pose)
@@ -106,7 +106,7 @@ def _kalman_update(
             weighted = np.linalg.solve(innovation_cov, innovation)
             chi2, share = float(innovation @ weighted), (innovation * weighted).reshape(-1, 2).sum(-1)
         change = -gain @ innovation
-        pose = previous.exit + change[:3]
+        pose = previous.exit_pose + change[:3]
         cov = known - gain @ design @ known
     cov = cov[:3, :3]
     return wrap_pose(pose), (cov + cov.T) / 2, chi2, share

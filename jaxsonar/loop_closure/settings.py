@@ -134,6 +134,10 @@ class LoopClosureSettings:
     """The same for corners, as a fraction."""
     edge_factor: float = 0.3
     """The same for edges, whose echoes are weak, as a fraction."""
+    crossing_margin: float = 0.05
+    """A blocked line passes through the wall by this distance, metres."""
+    crossing_border: float = 0.1
+    """A line is not surely blocked within this distance of the ends of the wall, metres."""
     robot_radius: float = 0.1
     """No wall is nearer to the centre of the robot, metres."""
     min_range: float = 0.2

@@ -68,7 +68,7 @@ class SubmapGraph:
         self.views.append(SubmapView.of(submap))
         self.chain.append(odometry_factor(submap, newest))
         # A new node at the end of the chain has no residual: all other poses stay.
-        poses = np.concatenate([self.poses, compose(self.poses[-1], submap.exit)[None]])
+        poses = np.concatenate([self.poses, compose(self.poses[-1], submap.exit_pose)[None]])
         self.graph = PoseGraph(poses, self.chain + self.verifier.factors, converged=self.graph.converged)
         self._pending = (SubmapGraph._add_sequential_factor, SubmapGraph._select_candidates) if newest else ()
         return decisions
@@ -124,7 +124,7 @@ class SubmapGraph:
         if measured is None:
             return
         # 2. Verify it, and solve the graph if a closure was accepted.
-        position = known.anchor[measured.pairs.earlier].mean(axis=0)
+        position = np.asarray(known.landmarks.anchor)[measured.pairs.earlier].mean(axis=0)
         if self.verifier.add(self.graph, ClosureCandidate(earlier, newest, measured, position)):
             self.graph = self.verifier.solve(self.graph.poses, self.chain, newest)
             if sum(one.newest == newest for one in self.verifier.accepted) >= SETTINGS.enough_closures:

@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from scipy.special import chdtri
 
 from jaxsonar import kernels
-from jaxsonar.geometry.se2 import perpendicular, rotate, tangent_of, unit, wrap_angle, wrap_pose
+from jaxsonar.geometry.landmarks import transform_parameters, wall_segments
+from jaxsonar.geometry.se2 import tangent_of, transform_points, wrap_angle, wrap_pose
 from jaxsonar.loop_closure.settings import SETTINGS
 from jaxsonar.loop_closure.submap import Submap
 from jaxsonar.registration.settings import FEATURE_SETTINGS
@@ -85,30 +86,11 @@ def pair_residuals(
         pose: earlier_from_newest.
     """
     rows, others = np.broadcast_arrays(rows, others)
-    heading = np.asarray(pose[2])
-    mine, known = newest.parameters[others], earlier.parameters[rows]
-    anchor = rotate(newest.anchor[others], heading)
-    offset = anchor + pose[:2] - earlier.anchor[rows]
-    theta = mine[..., 1] + pose[2]
-    normal, tangent = unit(theta), tangent_of(theta)
-    along = (tangent * offset).sum(-1)
-    wall_residual = np.stack(
-        [mine[..., 0] + (normal * offset).sum(-1) - known[..., 0], wrap_angle(theta - known[..., 1])], axis=-1
-    )
-    arm = anchor + rotate(mine, heading)
-    point_residual = arm + pose[:2] - earlier.anchor[rows] - known
-    wall = (earlier.kind[rows] == kernels.PLANE)[..., None]
-    by_pose = np.zeros((*rows.shape, 2, 3))
-    by_pose[..., 0, :2] = np.where(wall, normal, [1.0, 0.0])
-    by_pose[..., 1, :2] = np.where(wall, 0.0, [0.0, 1.0])
-    wall_turn = np.stack([along + (normal * perpendicular(anchor)).sum(-1), np.ones(rows.shape)], axis=-1)
-    by_pose[..., 2] = np.where(wall, wall_turn, perpendicular(arm))
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    wall_jacobian = np.zeros((*rows.shape, 2, 2))
-    wall_jacobian[..., 0, 0] = wall_jacobian[..., 1, 1] = 1.0
-    wall_jacobian[..., 0, 1] = along
-    by_newest = np.where(wall[..., None], wall_jacobian, np.array([[c, -s], [s, c]]))
-    return PairResiduals(np.where(wall, wall_residual, point_residual), by_pose, by_newest)
+    known = earlier.landmarks.take(rows)
+    found = transform_parameters(pose, newest.landmarks.take(others), np.asarray(known.anchor))
+    residual = found.parameters - known.parameters
+    residual[..., 1] = np.where(known.kind == kernels.PLANE, wrap_angle(residual[..., 1]), residual[..., 1])
+    return PairResiduals(residual, found.by_transform, found.by_parameters)
 
 
 def log_likelihood_gains(
@@ -116,11 +98,11 @@ def log_likelihood_gains(
 ) -> Float[np.ndarray, " pairs"]:
     """Log-likelihood ratio of each pair against chance, nats, if its residual were zero."""
     found = pair_residuals(earlier, newest, pairs.earlier, pairs.newest, pose)
-    mine = newest.reflector_covariances[pairs.newest]
-    cov = found.by_newest @ mine @ found.by_newest.swapaxes(1, 2) + earlier.reflector_covariances[pairs.earlier]
+    mine = newest.landmark_covariances[pairs.newest]
+    cov = found.by_newest @ mine @ found.by_newest.swapaxes(1, 2) + earlier.landmark_covariances[pairs.earlier]
     wall = np.log(2 * FEATURE_SETTINGS.wall_offset_range) - np.log(2 * np.pi * cov[:, 0, 0]) / 2
     point = np.log(FEATURE_SETTINGS.point_area / (2 * np.pi)) - np.linalg.slogdet(cov)[1] / 2
-    is_wall = newest.kind[pairs.newest] == kernels.PLANE
+    is_wall = newest.landmarks.kind[pairs.newest] == kernels.PLANE
     return np.minimum(np.where(is_wall, wall, FEATURE_SETTINGS.point_weight * point), SETTINGS.max_pair_gain)
 
 
@@ -139,11 +121,11 @@ def nearest_pairs(
         return Pairs(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     rows, others = np.arange(len(earlier))[:, None], np.arange(len(newest))
     found = pair_residuals(earlier, newest, rows, others, pose)
-    cov = found.by_newest @ newest.reflector_covariances @ found.by_newest.swapaxes(-1, -2)
-    cov = cov + earlier.reflector_covariances[:, None]
+    cov = found.by_newest @ newest.landmark_covariances @ found.by_newest.swapaxes(-1, -2)
+    cov = cov + earlier.landmark_covariances[:, None]
     cov = cov + found.by_pose @ pose_covariance @ found.by_pose.swapaxes(-1, -2)
     distance = (found.residual * np.linalg.solve(cov, found.residual[..., None])[..., 0]).sum(-1)
-    distance[earlier.kind[:, None] != newest.kind] = np.inf
+    distance[earlier.landmarks.kind[:, None] != newest.landmarks.kind] = np.inf
     distance[_wall_gaps(earlier, newest, pose) > SETTINGS.max_wall_gap] = np.inf
     best, back = distance.argmin(axis=0), distance.argmin(axis=1)
     mutual = (back[best] == others) & (distance[best, others] < SETTINGS.pair_gate)
@@ -152,15 +134,14 @@ def nearest_pairs(
 
 def _wall_gaps(earlier: Submap, newest: Submap, pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "earlier newest"]:
     """Gaps between the observed parts of walls, along them, metres; 0 where they overlap, and for points."""
-    theta = newest.parameters[:, 1]
-    foot = newest.anchor + newest.parameters[:, :1] * unit(theta)
-    ends = foot[:, None] + newest.ends[..., None] * tangent_of(theta)[:, None]
-    ends = rotate(ends, np.asarray(pose[2])) + pose[:2]
-    offset = ends.reshape(1, -1, 2) - earlier.anchor[:, None]
-    along = np.einsum("etk,ek->et", offset, tangent_of(earlier.parameters[:, 1]))
+    known, mine = earlier.landmarks, newest.landmarks
+    theta = np.asarray(known.parameters)[:, 1]
+    ends = transform_points(pose, wall_segments(mine))
+    offset = ends.reshape(1, -1, 2) - known.anchor[:, None]
+    along = np.einsum("etk,ek->et", offset, tangent_of(theta))
     along = along.reshape(len(earlier), -1, 2)
-    gap = np.maximum(along.min(-1) - earlier.ends[:, 1:], earlier.ends[:, :1] - along.max(-1))
-    walls = (earlier.kind[:, None] == kernels.PLANE) & (newest.kind == kernels.PLANE)
+    gap = np.maximum(along.min(-1) - known.extent[:, 1:], known.extent[:, :1] - along.max(-1))
+    walls = (known.kind[:, None] == kernels.PLANE) & (mine.kind == kernels.PLANE)
     return np.where(walls, np.maximum(gap, 0.0), 0.0)
 
 
@@ -202,9 +183,9 @@ def fit_pose(earlier: Submap, newest: Submap, pairs: Pairs, pose: Float[np.ndarr
 
 def _free_direction(earlier: Submap, newest: Submap, pairs: Pairs) -> Float[np.ndarray, "2"] | None:
     """Direction along walls that are all parallel; None if a point or another wall determines it."""
-    if not (newest.kind[pairs.newest] == kernels.PLANE).all():
+    if not (newest.landmarks.kind[pairs.newest] == kernels.PLANE).all():
         return None
-    theta = earlier.parameters[pairs.earlier, 1]
+    theta = earlier.landmarks.parameters[pairs.earlier, 1]
     if (np.abs(np.sin(theta[:, None] - theta)) > np.sin(SETTINGS.parallel_angle)).any():
         return None
     double = np.exp(2j * theta).sum()

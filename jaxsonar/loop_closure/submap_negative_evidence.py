@@ -11,8 +11,6 @@ from jaxsonar.loop_closure.settings import SETTINGS
 from jaxsonar.loop_closure.submap_view import SubmapNeighborhood, SubmapView
 from jaxsonar.registration.features import crosses_walls
 
-_CROSSING_MARGIN, _CROSSING_BORDER = 0.05, 0.1  # m; a line must pass through a wall clearly
-
 
 def submap_negative_evidence(
     earlier: SubmapView,
@@ -162,7 +160,7 @@ def _crosses(
         walls.features,
         start,
         end,
-        start_margin=_CROSSING_MARGIN,
-        end_margin=_CROSSING_MARGIN + tolerance,
-        border=_CROSSING_BORDER + tolerance,
+        start_margin=SETTINGS.crossing_margin,
+        end_margin=SETTINGS.crossing_margin + tolerance,
+        border=SETTINGS.crossing_border + tolerance,
     )

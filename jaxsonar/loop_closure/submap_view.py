@@ -59,8 +59,8 @@ class SubmapView(NamedTuple):
         end = start + 0.9 * away
         start = start - SETTINGS.robot_radius * away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
         factor = np.where(features.is_corner, SETTINGS.corner_factor, SETTINGS.edge_factor)
-        certain = submap.scans >= SETTINGS.min_scans
-        wall = submap.kind == kernels.PLANE
+        certain = submap.scan_counts >= SETTINGS.min_scans
+        wall = submap.landmarks.kind == kernels.PLANE
         return cls(submap.walls, features, certain[wall], factor * certain[~wall], viewpoint, start, end)
 
 

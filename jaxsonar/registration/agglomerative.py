@@ -22,8 +22,6 @@ from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
-_DEFAULT_SIGMA = 0.003  # m; where no local model has an estimate
-
 
 def register_by_ranges(
     ring: Ring,
@@ -47,7 +45,7 @@ def register_by_ranges(
         covariances refer.
     """
     noise = [model.sigma for model in models if model.sigma > 0]
-    sigma = sigma or (float(np.median(noise)) if noise else _DEFAULT_SIGMA)
+    sigma = sigma or (float(np.median(noise)) if noise else SETTINGS.default_sigma)
     observations = ScanObservations.of(ring, log, models, sigma)
     # 1. Every scan is a cluster.
     clusters = [single_scan(observations, scan) for scan in range(len(models))]

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxsonar import kernels
 from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.geometry.se2 import inverse, tangent_of, transform_points, unit, wrap_angle
 from jaxsonar.geometry.segments import point_to_segments
@@ -124,9 +125,8 @@ class Features(NamedTuple):
 
 def no_features() -> Features:
     """An empty map."""
-    return Features(
-        *(np.zeros(shape) for shape in ((0, 2), 0, 0, (0, 2, 2), (0, 2), 0, 0, (0, 2))), np.zeros(0, bool), np.zeros(0)
-    )
+    walls, none = np.zeros((0, 2)), np.zeros(0)
+    return Features(walls, none, none, np.zeros((0, 2, 2)), walls, none, none, walls, np.zeros(0, dtype=bool), none)
 
 
 def scan_features(model: LocalModel, *, noise_scale: float = 1.0) -> Features:
@@ -173,6 +173,34 @@ def _is_wall_crossing(point: Float[np.ndarray, "2"], model: LocalModel) -> bool:
     rho = np.array([line.rho for line in model.lines], dtype=np.float64)
     near = theta[np.abs(unit(theta) @ point - rho) < SETTINGS.position_tolerance]
     return bool((np.abs(np.sin(near[:, None] - near)) > SETTINGS.crossing_sine).any())
+
+
+def landmark_features(
+    landmarks: kernels.Landmarks,
+    covariance: Float[np.ndarray, "landmarks 2 2"],
+    scan_counts: Float[np.ndarray, " landmarks"] | Int[np.ndarray, " landmarks"],
+) -> Features:
+    """Landmarks as features in the same frame.
+
+    Args:
+        landmarks: walls, corners and edges, without unused rows.
+        covariance: of the parameters of each landmark.
+        scan_counts: number of scans that observed each landmark.
+    """
+    wall, corner = np.asarray(landmarks.kind) == kernels.PLANE, np.asarray(landmarks.kind) == kernels.CORNER
+    parameters, anchor = np.asarray(landmarks.parameters), np.asarray(landmarks.anchor)
+    return Features(
+        reference=anchor[wall],
+        theta=parameters[wall, 1],
+        offset=parameters[wall, 0],
+        covariance=covariance[wall],
+        extent=np.asarray(landmarks.extent)[wall],
+        weight=np.ones(int(wall.sum())),
+        scans=scan_counts[wall].astype(np.float64),
+        point=anchor[~wall] + parameters[~wall],
+        is_corner=corner[~wall],
+        point_sd=np.sqrt(np.trace(covariance[~wall], axis1=1, axis2=2) / 2),
+    )
 
 
 def map_as_scan(known: Features, world_from_robot: Float[np.ndarray, "3"]) -> Features:

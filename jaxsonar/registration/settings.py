@@ -101,6 +101,8 @@ class RangeRegistrationSettings:
     All values were chosen by hand on the office without odometry (range noise 5 mm, seeds 0 to 5).
     """
 
+    default_sigma: float = 0.003
+    """Standard deviation of the ranges if no local model has an estimate, metres."""
     decided_probability: float = 0.8
     """Probability of the kind "plane" for a line of a local model."""
     min_kind_probability: float = 0.02

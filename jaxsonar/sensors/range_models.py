@@ -19,22 +19,22 @@ class PredictedRange(NamedTuple):
 
     range: Float[np.ndarray, "..."]
     """Half the length of the sound's path, metres."""
-    by_landmark: Float[np.ndarray, "... 2"]
+    d_range_d_reflector: Float[np.ndarray, "... 2"]
     """Derivative by the two parameters of the reflector."""
-    by_midpoint: Float[np.ndarray, "... 2"]
+    d_range_d_midpoint: Float[np.ndarray, "... 2"]
     """Derivative by the midpoint between transmitter and receiver."""
-    by_half_baseline: Float[np.ndarray, "... 2"]
+    d_range_d_half_baseline: Float[np.ndarray, "... 2"]
     """Derivative by half the vector from transmitter to receiver."""
 
     @property
     def departure(self) -> Float[np.ndarray, "... 2"]:
         """Unit vectors along which the sound leaves the transmitters."""
-        return self.by_half_baseline - self.by_midpoint
+        return self.d_range_d_half_baseline - self.d_range_d_midpoint
 
     @property
     def arrival(self) -> Float[np.ndarray, "... 2"]:
         """Unit vectors from the receivers to where the sound comes from."""
-        return -self.by_half_baseline - self.by_midpoint
+        return -self.d_range_d_half_baseline - self.d_range_d_midpoint
 
 
 def plane_range(

@@ -1,4 +1,4 @@
-"""Where the robot is in a known map: found from nothing or from a rough pose, and not where places look alike."""
+"""Localization in a known map: with and without a start pose, and no pose where places look alike."""
 
 from dataclasses import replace
 from functools import cache
@@ -17,7 +17,7 @@ SIGMA = 0.001
 
 
 def world_of(walls, known=1e-4):
-    """Walls as a map that is known so well, metres and radians."""
+    """A map of walls with the given standard deviations (metres and radians)."""
     along = walls[:, 1] - walls[:, 0]
     theta = np.arctan2(along[:, 1], along[:, 0]) - np.pi / 2
     rho = (walls[:, 0] * np.stack([np.cos(theta), np.sin(theta)], -1)).sum(-1)
@@ -38,15 +38,15 @@ def log(seed=1):
     return heard.as_log(RING, office().poses)
 
 
-def off(found: Localized, truth):
+def errors_of(found: Localized, truth):
     apart = found.poses - truth
     return np.column_stack([apart[:, :2], wrap_angle(apart[:, 2])])
 
 
-def assert_there(found, truth):
-    """As near as the covariance says, and near."""
+def assert_correct(found, truth):
+    """The errors are small and consistent with the covariances."""
     assert found.is_certain, found.reason
-    apart = off(found, truth)
+    apart = errors_of(found, truth)
     assert np.hypot(apart[:, 0], apart[:, 1]).max() < 0.02
     assert np.abs(apart[:, 2]).max() < np.radians(1.5)
     squared = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(found.covariance), apart)
@@ -60,28 +60,28 @@ def world():
 
 
 @pytest.mark.slow
-def test_found_from_nothing_wherever_the_map_lies(world):
-    """Odometry begins somewhere else, and the map is turned: poses turn with it."""
+def test_global_localization_does_not_depend_on_the_frames(world):
+    """The frame of the odometry is arbitrary, and the poses rotate with the map."""
     some = log()[:10]
     odometry = compose(np.array([5.0, -3.0, 1.0]), office().poses[:10])
     found = localize(RING, world, replace(some, pose=odometry), sigma=SIGMA)
-    assert_there(found, office().poses[:10])
+    assert_correct(found, office().poses[:10])
     turn = np.array([-4.0, 7.0, 2.5])
     moved = localize(RING, world_of(transform_points(turn, office().room.walls)), some, sigma=SIGMA)
-    assert_there(moved, compose(turn, office().poses[:10]))
+    assert_correct(moved, compose(turn, office().poses[:10]))
     np.testing.assert_allclose(compose(inverse(turn), moved.poses), found.poses, atol=2e-3)
 
 
-def test_one_scan_and_a_rough_pose(world):
+def test_one_scan_and_a_start_pose(world):
     for row, wrong in ((5, (0.2, -0.1, 0.1)), (8, (-0.15, 0.2, -0.15))):
         truth = office().poses[row : row + 1]
         found = localize(RING, world, log()[row : row + 1], start=(truth[0] + wrong).tolist(), sigma=SIGMA)
-        assert_there(found, truth)
+        assert_correct(found, truth)
 
 
 @pytest.mark.slow
-def test_rooms_that_look_alike_from_both_ends():
-    """A rectangle is itself after half a turn: two places, and nothing is guessed."""
+def test_a_rectangle_is_ambiguous():
+    """A rectangle is symmetric under half a turn: there are two poses, and none is returned."""
     walls = np.array([[[0, 0], [3, 0]], [[3, 0], [3, 2]], [[3, 2], [0, 2]], [[0, 2], [0, 0]]], dtype=float)
     poses = np.array([[0.8 + 0.12 * k, 0.7 + 0.03 * k, 0.2 + 0.05 * k] for k in range(5)])
     given = simulate(RING, Room(walls), poses, sigma=SIGMA, seed=2).as_log(RING, poses)
@@ -95,20 +95,20 @@ def test_rooms_that_look_alike_from_both_ends():
         np.testing.assert_allclose(place.pose[:2], truth[:2], atol=0.01)
         assert abs(wrap_angle(float(place.pose[2] - truth[2]))) < np.radians(1)
     assert all(f"{place.pose[0]:.2f}, {place.pose[1]:.2f} m" in found.reason for place in found.hypotheses[:2])
-    # A rough pose says which.
-    assert_there(localize(RING, world_of(walls), given, start=[0.9, 0.6, 0.1], sigma=SIGMA), poses)
+    # A start pose resolves the ambiguity.
+    assert_correct(localize(RING, world_of(walls), given, start=[0.9, 0.6, 0.1], sigma=SIGMA), poses)
 
 
-def test_corners_of_a_floor_plan_are_heard_too(world):
-    """Walls alone leave a scan's corner echoes unexplained; where walls meet at right angles there is one."""
+def test_corners_of_a_floor_plan_explain_echoes(world):
+    """A floor plan has no points: corners are added where its walls meet at right angles."""
     truth = office().poses[8:9]
     found = localize(RING, world, log()[8:9], start=(truth[0] + [0.2, -0.1, 0.1]).tolist(), sigma=SIGMA)
-    assert_there(found, truth)
+    assert_correct(found, truth)
     assert found.hypotheses[0].explained > 0.6
 
 
 @pytest.mark.slow
-def test_another_place_is_not_in_the_map(world):
+def test_a_place_outside_the_map_is_not_found(world):
     walls = np.array([[[0, 0], [1.3, 0.2]], [[1.3, 0.2], [1.9, 1.4]], [[1.9, 1.4], [0.2, 1.7]], [[0.2, 1.7], [0, 0]]])
     poses = np.array([[0.8, 0.8, 0.1 * k] for k in range(4)])
     given = simulate(RING, Room(walls), poses, sigma=SIGMA, seed=2).as_log(RING, poses)
@@ -117,7 +117,7 @@ def test_another_place_is_not_in_the_map(world):
     assert "no place" in found.reason or "ambiguous" in found.reason
 
 
-def test_bad_calls(world):
+def test_invalid_arguments_are_errors(world):
     nothing = world_of(np.zeros((0, 2, 2)))
     none = np.zeros(0, int)
     with pytest.raises(SonarError, match="no scan"):

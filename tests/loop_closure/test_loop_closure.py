@@ -1,4 +1,4 @@
-"""Closures between submaps of floor plans: right where there is only one answer, none where there are two."""
+"""Closures between submaps of floor plans: correct where the pose is unique, none where it is ambiguous."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -9,7 +9,7 @@ from support.submaps import along, building, ring, room, submap, submaps
 
 from jaxsonar import kernels
 from jaxsonar.estimation.pose_graph import BetweenFactor, solve_pose_graph
-from jaxsonar.geometry.se2 import compose, relative, wrap_angle
+from jaxsonar.geometry.se2 import compose, relative, subtract_poses, wrap_angle
 from jaxsonar.loop_closure.closure_candidate import ACCEPTED, ClosureCandidate
 from jaxsonar.loop_closure.closure_detection import detect_closure
 from jaxsonar.loop_closure.sequential_constraint import sequential_factor
@@ -25,7 +25,7 @@ DOORS = building(20, [(x, 0.45, 0.15) for x in np.arange(1.5, 19, 2.0)])
 
 
 def two(outline, first, second, seed, sigma):
-    """Two submaps, the true earlier_from_newest, and a prior drawn around it."""
+    """Two submaps, the true earlier_from_newest, and the mean and covariance of a prior drawn around it."""
     rng = np.random.default_rng(seed)
     earlier, newest = (submap(outline, path, path[-1], rng) for path in (first, second))
     true = relative(first[0], second[0])
@@ -34,16 +34,13 @@ def two(outline, first, second, seed, sigma):
 
 
 def off_by(found, true):
-    """Error of a relative pose in the directions that it determines, and its squared Mahalanobis length."""
-    error = np.append(
-        found.earlier_from_newest[:2] - true[:2], wrap_angle(float(found.earlier_from_newest[2] - true[2]))
-    )
-    error = found.basis.T @ error
+    """Error of a relative pose in its determined directions, and the squared Mahalanobis distance."""
+    error = found.basis.T @ subtract_poses(found.earlier_from_newest, true)
     return error, float(error @ (found.basis.T @ found.information @ found.basis) @ error)
 
 
 @pytest.mark.slow
-def test_closures_of_a_room_are_right_and_honest():
+def test_closures_in_a_room_are_correct_and_consistent():
     surprise, rank = [], 0
     for seed in range(9):
         earlier, newest, true, prior, cov = two(NICHE, FIRST, SECOND, seed, (0.1, 0.3, 0.7)[seed % 3])
@@ -54,11 +51,11 @@ def test_closures_of_a_room_are_right_and_honest():
             surprise.append(chi2)
             rank += len(error)
             assert chi2 < 16 * len(error)
-    assert len(surprise) >= 7  # nearly all are found
+    assert len(surprise) >= 7
     assert 0.5 < sum(surprise) / rank < 1.8
 
 
-def test_a_room_found_again_after_little_drift_needs_no_confirmation():
+def test_after_little_drift_a_closure_needs_no_confirmation():
     sure = 0
     for seed in range(5):
         earlier, newest, _, prior, cov = two(NICHE, FIRST, SECOND, seed, 0.1)
@@ -69,7 +66,7 @@ def test_a_room_found_again_after_little_drift_needs_no_confirmation():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 2.0])
-def test_a_room_like_another_one_is_not_taken_for_it(sigma):
+def test_a_similar_room_is_not_accepted(sigma):
     first = along((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
     for seed in range(3):
         earlier, newest, _, prior, cov = two(TWINS, first, first + np.array([4.6, 0, 0]), seed, sigma)
@@ -77,7 +74,7 @@ def test_a_room_like_another_one_is_not_taken_for_it(sigma):
         assert found is None or found.log_odds < SETTINGS.acceptance_odds - 2
 
 
-def test_not_even_where_drift_has_laid_one_on_the_other():
+def test_a_similar_room_is_not_accepted_where_drift_moves_it_onto_the_known_one():
     first = along((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
     for seed in range(4):
         earlier, newest, _, _, cov = two(TWINS, first, first + np.array([4.6, 0, 0]), seed, 2.0)
@@ -85,15 +82,15 @@ def test_not_even_where_drift_has_laid_one_on_the_other():
         assert found is None or found.log_odds < SETTINGS.acceptance_odds - 2
 
 
-def test_a_rectangle_is_not_turned_half_around():
+def test_a_rectangle_is_not_rotated_by_half_a_turn():
     outline, half = room(4.0, 3.2), np.array([4.0, 3.2, np.pi])
-    there = compose(half, SECOND)  # the same path from the other side
+    there = compose(half, SECOND)  # the same trajectory, rotated by half a turn about the centre of the room
     for seed in range(3):
         earlier, newest, true, prior, cov = two(outline, FIRST, SECOND, seed, 0.3)
         found = detect_closure(newest, earlier, prior, cov)
         if found is not None:
             assert np.abs(off_by(found, true)[0]).max() < 0.1
-        # With every heading possible there are two answers, hence none.
+        # If every heading is possible, the pose is ambiguous.
         found = detect_closure(newest, earlier, compose(true, np.array([0.0, 0.0, 1.5])), np.diag([1.0, 1.0, 9.0]))
         assert found is None or found.log_odds < SETTINGS.acceptance_odds
         earlier, newest, true, prior, cov = two(outline, FIRST, there, seed, 0.3)
@@ -101,7 +98,7 @@ def test_a_rectangle_is_not_turned_half_around():
         assert found is None or np.abs(off_by(found, true)[0]).max() < 0.1
 
 
-def test_doors_that_repeat_are_not_counted_wrongly():
+def test_repeating_doors_are_not_accepted_wrongly():
     for seed in range(4):
         shift = 2.0 * (seed % 3 - 1)
         second = along((9.2 + shift, 0.8), (5.9 + shift, 0.8))
@@ -110,7 +107,7 @@ def test_doors_that_repeat_are_not_counted_wrongly():
         assert found is None or found.free is not None or found.log_odds < SETTINGS.acceptance_odds
 
 
-def test_parallel_walls_leave_the_way_along_them_open():
+def test_parallel_walls_leave_the_direction_along_them_undetermined():
     outline = building(20, [])
     for seed in range(4):
         first, second = along((6.0, 0.9), (9.0, 0.9)), along((9.4, 0.8), (6.9, 0.8))
@@ -124,7 +121,7 @@ def test_parallel_walls_leave_the_way_along_them_open():
         assert np.abs(found.information @ free).max() < 1e-6 * np.abs(found.information).max()
         assert np.linalg.matrix_rank(found.information, tol=1.0) == 2
         assert off_by(found, true)[1] < 32
-        # In a graph it leaves the variance along the corridor as it was.
+        # In a pose graph it does not change the variance along the corridor.
         chain = [BetweenFactor(0, 1, prior, np.linalg.inv(cov))]
         graph = solve_pose_graph(
             np.stack([np.zeros(3), prior]), [*chain, BetweenFactor(0, 1, found.earlier_from_newest, found.information)]
@@ -133,24 +130,26 @@ def test_parallel_walls_leave_the_way_along_them_open():
         assert free @ after @ free > 0.9 * (free @ cov @ free)
 
 
-def test_the_misfit_and_its_derivatives(rng):
+def test_pair_residuals_and_their_derivatives(rng):
     earlier, newest, true, _, _ = two(NICHE, FIRST, SECOND, 3, 0.1)
     pairs = nearest_pairs(earlier, newest, true, np.diag([1e-4, 1e-4, 1e-5]))
     assert len(pairs) > 5
     pose = true + np.array([0.05, -0.03, 0.02])
     seen = pair_residuals(earlier, newest, pairs.earlier, pairs.newest, pose)
-    # Independently: walls and points moved as points on them.
+    # Independent computation: transform a point on each reflector.
     for k, (a, b) in enumerate(zip(*pairs, strict=True)):
-        if earlier.kind[a] != kernels.PLANE:
-            place = compose(pose, np.append(newest.anchor[b] + newest.parameters[b], 0.0))[:2]
-            np.testing.assert_allclose(seen.residual[k], place - earlier.anchor[a] - earlier.parameters[a])
+        if earlier.landmarks.kind[a] != kernels.PLANE:
+            place = compose(pose, np.append(newest.landmarks.anchor[b] + newest.landmarks.parameters[b], 0.0))[:2]
+            np.testing.assert_allclose(
+                seen.residual[k], place - earlier.landmarks.anchor[a] - earlier.landmarks.parameters[a]
+            )
             continue
-        level, theta = newest.parameters[b]
-        foot = newest.anchor[b] + level * np.array([np.cos(theta), np.sin(theta)])
+        level, theta = newest.landmarks.parameters[b]
+        foot = newest.landmarks.anchor[b] + level * np.array([np.cos(theta), np.sin(theta)])
         moved = compose(pose, np.append(foot, theta))
         normal = np.array([np.cos(moved[2]), np.sin(moved[2])])
-        expected = [normal @ (moved[:2] - earlier.anchor[a]) - earlier.parameters[a, 0]]
-        expected.append(float(wrap_angle(float(moved[2] - earlier.parameters[a, 1]))))
+        expected = [normal @ (moved[:2] - earlier.landmarks.anchor[a]) - earlier.landmarks.parameters[a, 0]]
+        expected.append(float(wrap_angle(float(moved[2] - earlier.landmarks.parameters[a, 1]))))
         np.testing.assert_allclose(seen.residual[k], expected, atol=1e-12)
     for k in range(3):
         step = np.zeros(3)
@@ -161,7 +160,12 @@ def test_the_misfit_and_its_derivatives(rng):
         step = np.zeros(2)
         step[k] = 1e-6
         sides = [
-            pair_residuals(earlier, replace(newest, parameters=newest.parameters + sign * step), *pairs, pose).residual
+            pair_residuals(
+                earlier,
+                replace(newest, landmarks=newest.landmarks.with_parameters(newest.landmarks.parameters + sign * step)),
+                *pairs,
+                pose,
+            ).residual
             for sign in (1, -1)
         ]
         np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, seen.by_newest[..., k], atol=1e-6)
@@ -172,7 +176,7 @@ def test_the_fit_is_the_least_squares_solution():
     pairs = nearest_pairs(earlier, newest, true, np.diag([1e-4, 1e-4, 1e-5]))
     fit = fit_pose(earlier, newest, pairs, true)
     for step in 1e-3 * np.concatenate([np.eye(3), -np.eye(3)]):
-        # A quadratic form around the minimum with the information as its curvature: chi2 at other poses, by hand.
+        # Around the minimum chi2 is a quadratic form with the information matrix; here it is computed directly.
         seen = pair_residuals(earlier, newest, *pairs, fit.pose + step)
         rows = (3 + 2 * pairs.earlier[:, None] + np.arange(2)).ravel()
         others = (3 + 2 * pairs.newest[:, None] + np.arange(2)).ravel()
@@ -185,7 +189,7 @@ def test_the_fit_is_the_least_squares_solution():
         assert off @ np.linalg.solve(cov, off) == pytest.approx(expected, abs=0.02 * expected)
 
 
-def test_shared_walls_make_the_chain_better_and_honest():
+def test_sequential_factors_are_more_accurate_and_consistent():
     total, joint, before, better, count = 0.0, 0.0, 0.0, 0, 20
     for seed in range(count):
         rng = np.random.default_rng(seed)
@@ -196,33 +200,30 @@ def test_shared_walls_make_the_chain_better_and_honest():
         off[2] = wrap_angle(off[2])
         total += off @ link.information @ off
         joint += float(np.abs(off[:2]).sum())
-        before += float(np.abs((made[0].exit - expected)[:2]).sum())
+        before += float(np.abs((made[0].exit_pose - expected)[:2]).sum())
         better += np.linalg.det(link.information) > 2 * np.linalg.det(np.linalg.inv(made[0].covariance[:3, :3]))
-    assert better >= 0.8 * count  # where doors or corners repeat within the exit's spread it stays as it was
+    assert better >= 0.8 * count  # unchanged where doors or corners repeat within the uncertainty of the exit pose
     assert joint < 0.7 * before
     assert 0.5 < total / (3 * count) < 1.7
 
 
-def test_without_shared_walls_the_chain_is_the_exit():
+def test_without_shared_walls_the_sequential_factor_is_the_odometry_factor():
     rng = np.random.default_rng(0)
     here, there = submap(NICHE, FIRST, FIRST[-1], rng), submap(room(9, 9), along((1.5, 4), (1.5, 6)), FIRST[-1], rng)
     empty = replace(
         there,
-        kind=there.kind[:0],
-        parameters=there.parameters[:0],
-        anchor=there.anchor[:0],
-        ends=there.ends[:0],
-        scans=there.scans[:0],
+        landmarks=there.landmarks.take(np.arange(0)),
+        scan_counts=there.scan_counts[:0],
         covariance=there.covariance[:3, :3],
     )
     link = sequential_factor(here, empty)
-    np.testing.assert_array_equal(link.first_from_second, here.exit)
+    np.testing.assert_array_equal(link.first_from_second, here.exit_pose)
     assert detect_closure(empty, here, np.zeros(3), np.eye(3)) is None
     assert len(nearest_pairs(here, empty, np.zeros(3), np.eye(3))) == 0
 
 
-def around(outline, path, seed, **errors):
-    """A whole way: the graph at its end, and the true poses of the bases."""
+def run_graph(outline, path, seed, **errors):
+    """The graph at the end of a trajectory, and the true poses of the submaps relative to the first."""
     made, true = submaps(outline, path, np.random.default_rng(seed), **errors)
     graph = SubmapGraph()
     for one in made:
@@ -233,11 +234,11 @@ def around(outline, path, seed, **errors):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("slip", [1.0, 4.0])
-def test_a_way_around_a_block_twice_is_closed_rightly(slip):
+def test_closures_around_a_block_are_correct(slip):
     doors = [(0, 1.7, 0.5, 0.2), (0, 3.9, 0.4, 0.2), (1, 3.0, 0.5, 0.2), (2, 2.1, 0.5, 0.2), (3, 4.0, 0.5, 0.2)]
     corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
     path = along(*corners, *corners[:3])
-    graph, true = around(ring(7, 5, doors), path, 2, slip=slip, missed=0.1, spurious=0.5)
+    graph, true = run_graph(ring(7, 5, doors), path, 2, slip=slip, missed=0.1, spurious=0.5)
     assert len(graph.verifier.accepted) >= 3
     for one in graph.verifier.accepted:
         error, chi2 = off_by(one.measurement, relative(true[one.earlier], true[one.newest]))
@@ -249,7 +250,7 @@ def test_a_way_around_a_block_twice_is_closed_rightly(slip):
 
 
 @pytest.mark.slow
-def test_work_done_piece_by_piece_comes_to_the_same():
+def test_pending_work_in_pieces_gives_the_same_graph():
     corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
     made, _ = submaps(ring(7, 5, [(0, 1.7, 0.5, 0.2)]), along(*corners, *corners[:2]), np.random.default_rng(3))
     at_once, slowly = SubmapGraph(), SubmapGraph()
@@ -261,11 +262,11 @@ def test_work_done_piece_by_piece_comes_to_the_same():
         while slowly.has_pending_work:
             before, slowly = slowly, slowly.copy()
             said += slowly.process_next()
-            assert before.has_pending_work  # what was copied is as it was
+            assert before.has_pending_work  # the copy is independent
         assert [vars(one) for one in said] == [vars(one) for one in decisions]
     assert at_once.verifier.accepted
     np.testing.assert_array_equal(at_once.poses, slowly.poses)
-    # What is left is done before the next one comes.
+    # Pending work is done before the next submap is added.
     late = SubmapGraph()
     for one in made:
         late.add(one)
@@ -276,13 +277,13 @@ def test_work_done_piece_by_piece_comes_to_the_same():
 def test_a_wrong_closure_is_withdrawn_and_leaves_no_trace():
     corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
     doors = [(0, 1.7, 0.5, 0.2), (0, 3.9, 0.4, 0.2), (1, 3.0, 0.5, 0.2)]
-    graph, _ = around(ring(7, 5, doors), along(*corners, *corners[:2]), 1)
+    graph, _ = run_graph(ring(7, 5, doors), along(*corners, *corners[:2]), 1)
     known = graph.verifier
     good, before = known.accepted[0], graph.graph
     wrong = good.measurement._replace(
         earlier_from_newest=good.measurement.earlier_from_newest + np.array([1.0, 0.0, 0.0])
     )
-    # As if an early, wide prior had let it in.
+    # It could have been accepted early, with a wide prior.
     known.candidates.append(ClosureCandidate(good.earlier, good.newest, wrong, good.position, ACCEPTED))
     after = known.solve(before.poses, graph.chain, len(graph.submaps) - 1)
     np.testing.assert_allclose(after.poses, before.poses, atol=1e-5)
@@ -292,7 +293,7 @@ def test_a_wrong_closure_is_withdrawn_and_leaves_no_trace():
     assert [one.state for one in known.decisions][-1] == "withdrawn"
 
 
-def test_a_closure_that_the_chain_forbids_is_refused():
+def test_a_closure_that_contradicts_the_chain_is_refused():
     earlier, newest, true, _, cov = two(NICHE, FIRST, SECOND, 0, 0.1)
     found = detect_closure(newest, earlier, true, cov)
     assert found is not None
@@ -305,7 +306,7 @@ def test_a_closure_that_the_chain_forbids_is_refused():
         assert len(known.factors) == (state == ACCEPTED)
 
 
-def test_candidates_are_few_and_near():
+def test_overlap_candidates_are_few_and_near():
     made, true = submaps(building(30, []), along((1, 0.9), (29, 0.9), (1, 0.8)), np.random.default_rng(0))
     links = [BetweenFactor(k, k + 1, relative(a, b), 1e4 * np.eye(3)) for k, (a, b) in enumerate(pairwise(true))]
     graph, newest = solve_pose_graph(true, links), len(made) - 1
@@ -316,7 +317,7 @@ def test_candidates_are_few_and_near():
     assert len(overlap_candidates(graph, made, 1)) == 0
 
 
-def test_leaving_out_a_pair_leaves_the_others():
+def test_without_removes_one_pair():
     pairs = Pairs(np.array([3, 1, 2]), np.array([0, 4, 5])).without(1)
     assert pairs.earlier.tolist() == [3, 2]
     assert pairs.newest.tolist() == [0, 5]

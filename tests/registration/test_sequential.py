@@ -17,7 +17,7 @@ NO_PATHS = np.zeros((0, 2), dtype=int)
 
 
 def visible_line(pose, start, end, reach):
-    """The exact line of a wall in the robot frame, or None where its foot is not on the wall or too far."""
+    """The exact line of a wall in the robot frame, or None if its foot point is outside the wall or out of reach."""
     start, end = (transform_points(inverse(pose), point) for point in (start, end))
     along = (end - start) / np.linalg.norm(end - start)
     foot = start - (start @ along) * along
@@ -80,7 +80,7 @@ def test_the_first_pose_is_that_of_the_odometry():
 
 @pytest.mark.slow
 def test_poses_move_with_the_frame_of_the_odometry():
-    """Odometry moved rigidly moves the poses with it."""
+    """A rigid motion of the odometry moves the poses along."""
     poses = trajectory()
     models = [model_at(pose) for pose in poses]
     moved = np.concatenate(
@@ -107,7 +107,7 @@ def test_scans_without_features_are_left_out_and_do_not_disturb_others():
 
 
 def test_a_bare_corridor_needs_odometry():
-    """Along two parallel walls nothing but odometry tells how far the robot went."""
+    """Two parallel walls do not determine the position along them."""
     corridor = np.array([[-9.0, -1.0], [9.0, -1.0], [9.0, 1.0], [-9.0, 1.0]])
     poses = np.stack([np.linspace(-3, 3, 16), np.zeros(16), np.zeros(16)], axis=-1)
     models = [model_at(pose, corners=corridor) for pose in poses]
@@ -125,7 +125,7 @@ def test_empty_input_gives_no_poses():
 
 @pytest.mark.slow
 def test_a_gap_in_odometry_is_bridged_by_the_walls():
-    """The frame of odometry may jump where it starts anew."""
+    """The frame of odometry may change after a gap."""
     poses = trajectory()
     odometry = poses.copy()
     odometry[12:] += np.array([5.0, 5.0, 0.0])
@@ -150,26 +150,26 @@ def test_progress_reaches_the_end():
 
 @pytest.mark.slow
 def test_two_rooms_are_two_clusters():
-    """Without odometry nothing tells how two rooms lie; no scan is in both, and each is right in itself."""
+    """Without odometry the relative pose of two rooms is unknown; each cluster is correct in itself."""
     poses = trajectory()
     rooms = (CORNERS, OTHER)
-    parts = register_scans([model_at(pose, corners=corners, reach=3.5) for corners in rooms for pose in poses])
-    placed = np.isfinite([part[:, 0] for part in parts])
-    np.testing.assert_array_equal(sorted(placed.tolist()), np.kron(np.eye(2), np.ones(len(poses)))[::-1])
-    for part in parts:
-        assert_same(part[np.isfinite(part[:, 0])], poses, position=1e-3, turn=1e-3)
+    clusters = register_scans([model_at(pose, corners=corners, reach=3.5) for corners in rooms for pose in poses])
+    registered = np.isfinite([poses_of[:, 0] for poses_of in clusters])
+    np.testing.assert_array_equal(sorted(registered.tolist()), np.kron(np.eye(2), np.ones(len(poses)))[::-1])
+    for poses_of in clusters:
+        assert_same(poses_of[np.isfinite(poses_of[:, 0])], poses, position=1e-3, turn=1e-3)
 
 
 @pytest.fixture(scope="module")
 def office():
-    """The way through the office, and what the ring hears on it."""
+    """The trajectory through the office, and the local models along it."""
     office = load_office()
     heard = simulate(office.ring, office.room, office.poses, sigma=0.001, seed=1, stamps=office.stamps)
     return office.poses, list(local_models(office.ring, heard.as_log(office.ring, office.poses)))
 
 
 def drifting(poses, share, rng):
-    """Odometry whose steps and turns are wrong by a share of the way and of the turn."""
+    """Odometry with errors proportional to the distance and the rotation of each step."""
     motion = relative(poses[:-1], poses[1:])
     size = np.linalg.norm(motion[:, :2], axis=1, keepdims=True), np.abs(motion[:, 2:])
     motion += share * rng.normal(size=motion.shape) * np.concatenate([size[0], size[0], size[0] + size[1]], axis=1)
@@ -180,7 +180,7 @@ def drifting(poses, share, rng):
 
 
 def assert_aligned(found, poses, *, position, turn):
-    """The same after the rigid motion of least squares."""
+    """The poses agree after rigid alignment by least squares."""
     centred, expected = (xy - xy.mean(axis=0) for xy in (found[:, :2], poses[:, :2]))
     # Kabsch in the complex plane.
     angle = np.angle((np.conj(centred @ [1, 1j]) * (expected @ [1, 1j])).sum())
@@ -199,16 +199,16 @@ def test_the_office_with_odometry(office, rng):
 
 @pytest.mark.slow
 def test_the_office_without_odometry(office):
-    """Some scans stay open, but none is wrong. With less of a margin more are placed, and may be wrong."""
+    """Some scans are left out, but none is wrong. With a smaller margin more scans are registered."""
     poses, models = office
-    parts = register_scans(models)
-    placed = np.isfinite([part[:, 0] for part in parts])
-    assert (placed.sum(axis=0) <= 1).all()
-    large = [part for part, those in zip(parts, placed, strict=True) if those.sum() > 2]
+    clusters = register_scans(models)
+    registered = np.isfinite([found[:, 0] for found in clusters])
+    assert (registered.sum(axis=0) <= 1).all()
+    large = [found for found, those in zip(clusters, registered, strict=True) if those.sum() > 2]
     assert large
-    for part in large:
-        those = np.isfinite(part[:, 0])
-        assert_aligned(part[those], poses[those], position=0.1, turn=np.radians(5))
-    bold = np.isfinite([part[:, 0] for part in register_scans(models, margin=0.5)])
-    assert (bold.sum(axis=0) <= 1).all()
-    assert bold.sum() > placed.sum()
+    for found in large:
+        those = np.isfinite(found[:, 0])
+        assert_aligned(found[those], poses[those], position=0.1, turn=np.radians(5))
+    with_small_margin = np.isfinite([found[:, 0] for found in register_scans(models, margin=0.5)])
+    assert (with_small_margin.sum(axis=0) <= 1).all()
+    assert with_small_margin.sum() > registered.sum()

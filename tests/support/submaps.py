@@ -5,7 +5,8 @@ from itertools import pairwise
 import numpy as np
 
 from jaxsonar import kernels
-from jaxsonar.geometry.se2 import inverse, relative, wrap_angle
+from jaxsonar.geometry.landmarks import transform_landmarks
+from jaxsonar.geometry.se2 import inverse, relative
 from jaxsonar.loop_closure.submap import Submap
 
 REACH = 1.7  # m
@@ -132,15 +133,13 @@ def submap(outline, world_from_robot, world_from_next, rng, *, row=0, slip=1.0, 
         parameters.append([0.0, theta] if wall else [0.0, 0.0])
         ends.append([-half, half] if wall else [0.0, 0.0])
     # Into the frame of the first pose.
-    kind, parameters = np.array(kind), np.array(parameters).reshape(-1, 2)
-    anchor, ends = np.array(anchor).reshape(-1, 2), np.array(ends, dtype=float).reshape(-1, 2)
-    back = inverse(base)
-    c, s = np.cos(back[2]), np.sin(back[2])
-    turn = np.array([[c, -s], [s, c]])
-    anchor = anchor @ turn.T + back[:2]
-    wall = kind == kernels.PLANE
-    parameters[wall, 1] = wrap_angle(parameters[wall, 1] + back[2])
-    parameters[~wall] = parameters[~wall] @ turn.T
+    landmarks = kernels.Landmarks(
+        np.array(kind, np.int32),
+        np.array(parameters).reshape(-1, 2),
+        np.array(anchor).reshape(-1, 2),
+        np.array(ends, dtype=float).reshape(-1, 2),
+    )
+    landmarks = transform_landmarks(inverse(base), landmarks)
     poses, exit_pose = (
         relative(np.broadcast_to(base, world_from_robot.shape), world_from_robot),
         relative(base, world_from_next),
@@ -150,9 +149,8 @@ def submap(outline, world_from_robot, world_from_next, rng, *, row=0, slip=1.0, 
     pose_cov = np.tile(1e-4 * np.eye(3), (len(poses), 1, 1))
     error = np.linalg.cholesky(cov) @ rng.normal(size=len(cov))
     moved = exit_pose + error[:3]
-    return Submap(
-        kind, parameters + error[3:].reshape(-1, 2), anchor, ends, np.array(scans), moved, cov, rows, poses, pose_cov
-    )
+    landmarks = landmarks.with_parameters(landmarks.parameters + error[3:].reshape(-1, 2))
+    return Submap(landmarks, np.array(scans), moved, cov, rows, poses, pose_cov)
 
 
 def submaps(outline, path, rng, *, scans=22, **errors):
