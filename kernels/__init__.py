@@ -10,13 +10,11 @@ from .beam_pattern import off_axis_angles as off_axis_angles
 from .bundle_adjustment import EchoFactors as EchoFactors
 from .bundle_adjustment import Jacobians as Jacobians
 from .bundle_adjustment import LeastSquaresProblem as LeastSquaresProblem
-from .bundle_adjustment import LeastSquaresSolution as LeastSquaresSolution
 from .bundle_adjustment import Unknowns as Unknowns
-from .bundle_adjustment import adjust as adjust
 from .bundle_adjustment import apply_parameters as apply_parameters
 from .bundle_adjustment import cost as cost
 from .bundle_adjustment import linearize as linearize
-from .bundle_adjustment import pose_covariances as pose_covariances
+from .bundle_adjustment import odometry_residuals as odometry_residuals
 from .bundle_adjustment import residuals as residuals
 from .data_association import Association as Association
 from .data_association import CandidateReflections as CandidateReflections
@@ -51,10 +49,10 @@ from .isorange_arcs import arc_point as arc_point
 from .isorange_arcs import tangent_rho as tangent_rho
 from .iterated_ekf import Belief as Belief
 from .iterated_ekf import EkfUpdate as EkfUpdate
-from .iterated_ekf import RangePrediction as RangePrediction
+from .iterated_ekf import ExpectedRanges as ExpectedRanges
 from .iterated_ekf import ekf_update as ekf_update
 from .iterated_ekf import expected_ranges as expected_ranges
-from .iterated_ekf import predict_ranges as predict_ranges
+from .iterated_ekf import expected_ranges_with_variance as expected_ranges_with_variance
 from .landmarks import Landmarks as Landmarks
 from .landmarks import Reflection as Reflection
 from .landmarks import landmark_in_robot_frame as landmark_in_robot_frame

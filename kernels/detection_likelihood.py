@@ -62,7 +62,7 @@ def refine(
     def step(x: Float[Array, "2"], _: None):
         echo, visible = jax.vmap(predict, in_axes=(None, -1), out_axes=-1)(x, scan.echo_paths)
         detection = scene.detection_probability * visible
-        residual, (a, b) = scan.ranges - echo.range, echo.d_range_d_reflector
+        residual, (a, b) = scan.ranges - echo.range, echo.d_range_d_landmark
         odds = jnp.log(detection / (1 - detection) + 1e-9) + log_normal(residual, scene.sigma) - clutter
         log_ratio = jnp.where(scan.valid, odds, -jnp.inf)
         weight = jax.nn.sigmoid(log_ratio) / scene.sigma**2

@@ -55,7 +55,7 @@ class EkfUpdate(eqx.Module):
     """1 for echoes within the gate, which the update uses; 0 for all others."""
 
 
-class RangePrediction(eqx.Module):
+class ExpectedRanges(eqx.Module):
     """Ranges that paths are expected to measure."""
 
     expected: Float[Array, "landmarks paths"]
@@ -137,9 +137,9 @@ def ekf_update(
 
 
 @jax.jit
-def predict_ranges(belief: Belief, paths: EchoPaths) -> RangePrediction:
+def expected_ranges_with_variance(belief: Belief, paths: EchoPaths) -> ExpectedRanges:
     """Predict the ranges of all landmarks of a belief on paths (paths,) of the robot frame, with their variances."""
-    return RangePrediction(expected_ranges(belief.pose, belief.landmarks, paths), _range_variances(belief, paths))
+    return ExpectedRanges(expected_ranges(belief.pose, belief.landmarks, paths), _range_variances(belief, paths))
 
 
 @jax.jit
@@ -185,7 +185,7 @@ def _range_and_jacobians(
     """Range of ONE landmark on ONE path; its derivatives with respect to the pose and to the landmark's parameters."""
     local = landmark_in_robot_frame(pose, landmark)
     echo = reflector_echo(jnp.asarray(landmark.kind), local, path)
-    a, b = echo.d_range_d_reflector
+    a, b = echo.d_range_d_landmark
     theta = landmark.parameters[1]
     n, t, forward, left = normal(theta), tangent(theta), normal(pose[2]), tangent(pose[2])
     offset = jnp.asarray(landmark.anchor) - pose[:2]

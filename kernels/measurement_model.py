@@ -46,7 +46,7 @@ class PredictedEcho(eqx.Module):
 
     range: Float[Array, "*paths"]
     """Half the path length, metres."""
-    d_range_d_reflector: Float[Array, "*paths 2"]
+    d_range_d_landmark: Float[Array, "*paths 2"]
     """Derivatives of the range with respect to the reflector's two parameters; 0 for second order."""
     departure: Float[Array, "*paths 2"]
     """Unit vector along which the sound leaves the transmitter."""
@@ -182,7 +182,7 @@ def plane_echo(line: Float[Array, "2"], path: EchoPaths) -> PredictedEcho:
     distance, d_line, cosine, sine = image_source(here)
     return PredictedEcho(
         range=distance,
-        d_range_d_reflector=d_line,
+        d_range_d_landmark=d_line,
         departure=cosine * here.normal + sine * here.tangent,
         arrival=cosine * here.normal - sine * here.tangent,
         footpoint=here.along + here.baseline_tangent * here.baseline_normal / here.height,
@@ -265,7 +265,7 @@ class PredictionTable(eqx.Module):
 
     range: Float[Array, "*table"]
     """Half the path length, metres."""
-    d_range_d_reflector: Float[Array, "*table 2"]
+    d_range_d_landmark: Float[Array, "*table 2"]
     """Derivatives of the range with respect to the reflector's two parameters."""
     departure_angle: Float[Array, "*table"]
     """Direction in which the sound leaves, from the axis of the transmitter, radians, counter-clockwise."""
@@ -293,7 +293,7 @@ def predict_all_echoes(
         echo = reflector_echo(kind, reflector, path)
         angle = signed_angle(path.axes[0], echo.departure)
         return PredictionTable(
-            echo.range, echo.d_range_d_reflector, angle, echo.footpoint, visibility(echo, path), echo.exists
+            echo.range, echo.d_range_d_landmark, angle, echo.footpoint, visibility(echo, path), echo.exists
         )
 
     each_path = jax.vmap(one, in_axes=(None, None, 0))

@@ -46,7 +46,7 @@ class ReflectorRange(NamedTuple):
 
     range: Float[Array, ""]
     """Half the path length, metres."""
-    d_range_d_reflector: Float[Array, "2"]
+    d_range_d_landmark: Float[Array, "2"]
     """Derivatives with respect to the two parameters."""
     bearing: Float[Array, "2"]
     """Unit vector from the virtual sensor to the reflector."""
@@ -148,13 +148,13 @@ def plane(line: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:
 def corner(point: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:
     """A right-angled corner (x, y)."""
     echo = corner_echo(point, path)
-    return ReflectorRange(echo.range, echo.d_range_d_reflector, echo.arrival)
+    return ReflectorRange(echo.range, echo.d_range_d_landmark, echo.arrival)
 
 
 def edge(point: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:
     """An edge or a thin pole (x, y)."""
     echo = edge_echo(point, path)
-    return ReflectorRange(echo.range, echo.d_range_d_reflector, length_and_direction(point - path.midpoint)[1])
+    return ReflectorRange(echo.range, echo.d_range_d_landmark, length_and_direction(point - path.midpoint)[1])
 
 
 def start_of_point(

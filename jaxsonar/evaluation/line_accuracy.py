@@ -154,7 +154,7 @@ def line_bound(
         rx: receivers of the echoes, metres.
         sigma: independent noise of each range, metres.
     """
-    jacobian = plane_range(line, (tx + rx) / 2, (rx - tx) / 2).d_range_d_reflector
+    jacobian = plane_range(line, (tx + rx) / 2, (rx - tx) / 2).d_range_d_landmark
     information = jacobian.T @ jacobian
     if np.linalg.matrix_rank(information) < 2:
         return np.full(2, np.inf)

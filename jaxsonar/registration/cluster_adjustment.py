@@ -12,9 +12,10 @@ from jaxtyping import Float, Int
 
 from jaxsonar.geometry.se2 import perpendicular, rotate, tangent_of, unit, wrap_angle
 from jaxsonar.registration.echo_clusters import ScanObservations
+from jaxsonar.registration.reflector_fit import fit_reflectors
 from jaxsonar.registration.scan_cluster import ScanCluster
 from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS
-from jaxsonar.sensors.range_models import KINDS, RANGE_OF_KIND, predict_ranges
+from jaxsonar.sensors.range_models import predict_ranges
 
 
 def single_scan(observations: ScanObservations, scan: int | np.integer) -> ScanCluster:
@@ -91,8 +92,8 @@ def adjust_poses(
         turn = (predicted.d_range_d_midpoint * perpendicular(arm)).sum(-1)
         turn = turn + (predicted.d_range_d_half_baseline * perpendicular(base)).sum(-1)
         jacobian[every, 3 * column + 2] = root[:, 0] * turn
-        d_range_d_reflector = (root * predicted.d_range_d_reflector).T
-        jacobian[every, pose_size + 2 * row], jacobian[every, pose_size + 2 * row + 1] = d_range_d_reflector
+        d_range_d_landmark = (root * predicted.d_range_d_landmark).T
+        jacobian[every, pose_size + 2 * row], jacobian[every, pose_size + 2 * row + 1] = d_range_d_landmark
         information = jacobian.T @ jacobian + np.diag(prior)
         change = np.linalg.solve(information, jacobian.T @ (weight * residual))
         change = np.clip(change, -SETTINGS.max_step, SETTINGS.max_step)
@@ -164,43 +165,29 @@ def _observed_intervals(
 
 def _select_kinds(observations: ScanObservations, cluster: ScanCluster, steps: int) -> ScanCluster:
     """Fit each reflector as every kind, with the poses held, and select the kind with the largest evidence."""
-    echoes, count = observations.clustered, len(cluster.kind)
+    echoes = observations.clustered
     mine = np.flatnonzero(cluster.reflector[echoes.cluster] >= 0)
     _, midpoint, base = _transducers(
         cluster.poses, echoes.scan[mine], echoes.midpoint[mine], echoes.half_baseline[mine]
     )
-    row, measured = cluster.reflector[echoes.cluster[mine]], echoes.range[mine]
-    member = np.zeros((count, len(mine)))
+    row, gate = cluster.reflector[echoes.cluster[mine]], SETTINGS.gate
+    fit = fit_reflectors(
+        cluster.parameters_by_kind,
+        row,
+        echoes.range[mine],
+        midpoint,
+        base,
+        sigma=observations.sigma,
+        steps=steps,
+        scales=(3 * gate, gate),
+    )
+    member = np.zeros((len(cluster.kind), len(mine)))
     member[row, np.arange(len(mine))] = 1.0
-    parameters, scale, information = cluster.parameters_by_kind, 3 * SETTINGS.gate, np.zeros((count, 3, 2, 2))
-
-    def residuals() -> tuple[Float[np.ndarray, "3 echoes"], Float[np.ndarray, "3 echoes 2"]]:
-        """Residuals as every kind, and derivatives of the ranges by the parameters, in sigma."""
-        each = [RANGE_OF_KIND[kind](parameters[row, kind], midpoint, base) for kind in KINDS]
-        residual = (measured - np.stack([one.range for one in each])) / observations.sigma
-        return residual, np.stack([one.d_range_d_reflector for one in each]) / observations.sigma
-
-    for _ in range(steps):
-        residual, slope = residuals()
-        weight = 1 / np.square(1 + np.square(residual / scale))
-        scale = max(scale / 2, SETTINGS.gate)
-        # Normal equations of all reflectors at once: sums over the echoes of each.
-        first, second = slope[..., 0], slope[..., 1]
-        products = first * first, first * second, second * second, residual * first, residual * second
-        sums = np.einsum("re,pke->prk", member, weight * np.stack(products), optimize=True)
-        aa, ab, bb = sums[0] + 10.0, sums[1], sums[2] + 10.0
-        information = np.stack([np.stack([aa, ab], axis=-1), np.stack([ab, bb], axis=-1)], axis=-2)
-        step = np.stack([bb * sums[3] - ab * sums[4], aa * sums[4] - ab * sums[3]], axis=-1)
-        limit = SETTINGS.max_step / 2
-        parameters = parameters + np.clip(step / (aa * bb - ab * ab)[..., None], -limit, limit)
-    parameters = parameters.copy()
-    parameters[:, 0, 1] = wrap_angle(parameters[:, 0, 1])
-    residual, _ = residuals()
-    cost = member @ np.minimum(np.square(residual), SETTINGS.gate**2).T
-    evidence = -cost / 2 - np.linalg.slogdet(information)[1] / 2
+    cost = member @ np.minimum(np.square(fit.residual), gate**2).T
+    evidence = -cost / 2 - np.linalg.slogdet(fit.information)[1] / 2
     evidence -= np.log([SETTINGS.plane_range, SETTINGS.point_area, SETTINGS.point_area])
     own = np.flatnonzero(cluster.reflector >= 0)
     log_prior = SETTINGS.kind_prior_weight * observations.clusters.log_prior[own]
     np.add.at(evidence, cluster.reflector[own], log_prior)
     kind = evidence.argmax(axis=1).astype(np.int32)
-    return replace(cluster, parameters_by_kind=parameters, kind_evidence=evidence, kind=kind)
+    return replace(cluster, parameters_by_kind=fit.parameters, kind_evidence=evidence, kind=kind)

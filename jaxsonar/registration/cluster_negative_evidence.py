@@ -55,7 +55,7 @@ def unassigned_evidence(observations: ScanObservations, cluster: ScanCluster) ->
     possible = view.in_front & (view.off_axis < SETTINGS.outer_cone) & ~(cluster.is_wall[:, None] & beside)
     predicted = view.prediction
     spread = np.einsum(
-        "rei,rij,rej->re", predicted.d_range_d_reflector, cluster.covariance, predicted.d_range_d_reflector
+        "rei,rij,rej->re", predicted.d_range_d_landmark, cluster.covariance, predicted.d_range_d_landmark
     )
     variance = observations.sigma**2 + np.minimum(spread, SETTINGS.max_range_sd**2)
     squared = np.square(echoes.range[mine] - predicted.range)

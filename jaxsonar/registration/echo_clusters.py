@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from jaxsonar import kernels
 from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.geometry.se2 import unit
+from jaxsonar.registration.reflector_fit import fit_reflectors
 from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS
 from jaxsonar.scans.flat_echoes import corrected_echoes
 from jaxsonar.scans.scan_log import Log
@@ -176,38 +177,26 @@ def _inliers(
     if not len(path):
         return nothing
     midpoint, base = paths.midpoint[path], paths.half_baseline[path]
-    start = {kind: one.plane if kind == kernels.PLANE else one.point for kind in KINDS}
-    off = np.min(
-        [np.abs(RANGE_OF_KIND[k](at[None], midpoint, base).range - measured) for k, at in start.items()], axis=0
-    )
+    start = np.stack([one.plane, one.point, one.point])
+    predicted = [RANGE_OF_KIND[kind](start[None, kind], midpoint, base).range for kind in KINDS]
+    off = np.abs(np.stack(predicted) - measured).min(axis=0)
     order = np.argsort(off, kind="stable")
     mine = order[np.unique(path[order], return_index=True)[1]]
     mine = mine[off[mine] < 6 * sigma + 0.02]
     if len(mine) < 2:
         return nothing
-    fits = [_fit_residuals(k, at, measured[mine], midpoint[mine], base[mine], sigma) for k, at in start.items()]
-    best = min(fits, key=lambda off: float(np.square(np.minimum(off, SETTINGS.cluster_gate)).sum()))
+    fit = fit_reflectors(
+        start[None],
+        np.zeros(len(mine), dtype=np.int64),
+        measured[mine],
+        midpoint[mine],
+        base[mine],
+        sigma=sigma,
+        steps=SETTINGS.cluster_steps,
+        scales=SETTINGS.cluster_scales,
+    )
+    cost = np.square(np.minimum(np.abs(fit.residual), SETTINGS.cluster_gate)).sum(axis=1)
+    best = np.abs(fit.residual[cost.argmin()])
     good = best < SETTINGS.cluster_gate
     probability = chi2.sf(np.square(best[good]).sum(), max(int(good.sum()) - 2, 1))
     return mine[good] if good.sum() >= 2 and probability >= SETTINGS.cluster_significance else nothing
-
-
-def _fit_residuals(
-    kind: int,
-    parameters: Float[np.ndarray, "2"],
-    measured: Float[np.ndarray, " echoes"],
-    midpoint: Float[np.ndarray, "echoes 2"],
-    half_baseline: Float[np.ndarray, "echoes 2"],
-    sigma: float,
-) -> Float[np.ndarray, " echoes"]:
-    """Absolute residuals, in sigma, of a robust fit of one reflector (Geman-McClure, graduated non-convexity)."""
-    parameters, scale = parameters.copy(), 8 * sigma
-    for _ in range(SETTINGS.cluster_steps):
-        predicted = RANGE_OF_KIND[kind](parameters[None], midpoint, half_baseline)
-        residual = measured - predicted.range
-        weight = 1 / np.square(1 + np.square(residual / scale))
-        scale = max(scale / 2, 3 * sigma)
-        slope = predicted.d_range_d_reflector
-        information = slope.T @ (weight[:, None] * slope) + 1e-4 * np.eye(2)
-        parameters += np.clip(np.linalg.solve(information, slope.T @ (weight * residual)), -0.1, 0.1)
-    return np.abs(measured - RANGE_OF_KIND[kind](parameters[None], midpoint, half_baseline).range) / sigma

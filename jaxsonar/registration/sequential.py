@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float
 from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.geometry.se2 import compose, inverse, subtract_poses, wrap_pose
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.registration.features import Features, fuse_scan, map_as_scan, no_features, scan_features
+from jaxsonar.registration.feature_map import fuse_scan, map_as_scan
+from jaxsonar.registration.features import Features, no_features, scan_features
 from jaxsonar.registration.motion_prior import MotionModel, MotionPrior
 from jaxsonar.registration.pose_hypotheses import pose_hypotheses
 from jaxsonar.registration.pose_likelihood import pose_log_likelihood, refine_poses

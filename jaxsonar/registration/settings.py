@@ -113,6 +113,12 @@ class RangeRegistrationSettings:
     """A cluster is rejected if its chi-square is less probable than this."""
     cluster_steps: int = 6
     """Gauss-Newton steps of the fit of one cluster."""
+    cluster_scales: tuple[float, float] = (8.0, 3.0)
+    """First and last scale of the robust weights of that fit, in sigma."""
+    fit_damping: float = 10.0
+    """Information added to both parameters of a reflector in its fit, in units of sigma."""
+    fit_max_step: float = 0.1
+    """Largest change of a parameter in one step of that fit, metres or radians."""
     echoes_per_path: int = 4
     """Number of echoes that are kept of each path, the nearest first."""
 

@@ -19,7 +19,7 @@ class PredictedRange(NamedTuple):
 
     range: Float[np.ndarray, "..."]
     """Half the length of the sound's path, metres."""
-    d_range_d_reflector: Float[np.ndarray, "... 2"]
+    d_range_d_landmark: Float[np.ndarray, "... 2"]
     """Derivative by the two parameters of the reflector."""
     d_range_d_midpoint: Float[np.ndarray, "... 2"]
     """Derivative by the midpoint between transmitter and receiver."""

@@ -23,7 +23,7 @@ def test_range_models_agree_with_the_kernels(kind, rng):
         exact = jax.vmap(KERNEL_OF_KIND[kind], in_axes=(None, 0))(jax.numpy.asarray(parameters), paths)
     found = range_of(parameters[None], paths.midpoint, paths.half_baseline)
     np.testing.assert_allclose(found.range, exact.range, rtol=1e-12)
-    np.testing.assert_allclose(found.d_range_d_reflector, exact.d_range_d_reflector, atol=1e-12)
+    np.testing.assert_allclose(found.d_range_d_landmark, exact.d_range_d_landmark, atol=1e-12)
     np.testing.assert_allclose(found.departure, exact.departure, atol=1e-12)
     np.testing.assert_allclose(found.arrival, exact.arrival, atol=1e-12)
     step = 1e-6 * rng.normal(size=(2, 2))
