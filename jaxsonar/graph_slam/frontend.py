@@ -253,18 +253,14 @@ def close_submap(state: SubmapState) -> Submap:
     if state.track_lost:
         position_sd, heading_sd = SETTINGS.track_loss_sd
         covariance[:3, :3] += np.diag(np.square([position_sd, position_sd, heading_sd]))
-    landmarks = state.belief.landmarks.take(kept)
     return Submap(
-        kind=landmarks.kind,
-        parameters=landmarks.parameters,
-        anchor=landmarks.anchor,
-        ends=landmarks.extent,
-        scans=state.scan_counts[kept],
-        exit=state.pose,
+        landmarks=state.belief.landmarks.take(kept),
+        scan_counts=state.scan_counts[kept],
+        exit_pose=state.pose,
         covariance=covariance,
         rows=np.array(state.rows, dtype=np.int64),
         poses=np.array(state.poses).reshape(-1, 3),
-        pose_cov=np.array(state.covariances).reshape(-1, 3, 3),
+        pose_covariances=np.array(state.covariances).reshape(-1, 3, 3),
     )
 
 

@@ -19,7 +19,7 @@ from jaxsonar.registration.sequential import register_scans
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.smoothing.covisibility import Traversals
-from jaxsonar.smoothing.smoother import BLUR
+from jaxsonar.smoothing.settings import SETTINGS as SMOOTHING_SETTINGS
 
 Progress = Callable[[str, int, int], None]
 """Called with the current task, the number of finished scans, and the number of scans; (0, 0) where it is unknown."""
@@ -110,7 +110,8 @@ def register(
     if len(log) <= MAX_REGISTERED_BY_RANGES:
         cluster = register_by_ranges(ring, log, models, sigma=sigma, progress=report)[0]
         return InitialPoses(cluster.poses, cluster.pose_covariance)
-    poses = register_scans(models, None, noise_scale=BLUR, progress=report)[0]
+    scale = SMOOTHING_SETTINGS.local_model_noise_scale
+    poses = register_scans(models, None, noise_scale=scale, progress=report)[0]
     return InitialPoses(poses, np.full((len(log), 3, 3), np.nan))
 
 

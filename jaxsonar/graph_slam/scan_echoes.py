@@ -107,7 +107,7 @@ class ScanEchoes:
             by_feature: landmark of each echo by the feature that explains it; -1 for none.
             sigma: standard deviation of the ranges, metres.
         """
-        predicted = kernels.predict_ranges(belief, self.paths)
+        predicted = kernels.expected_ranges_with_variance(belief, self.paths)
         expected, variance = (np.asarray(part)[:, : self.count] for part in (predicted.expected, predicted.variance))
         well_predicted = np.where(variance < (SETTINGS.max_prediction_sd * sigma) ** 2, expected, np.inf)
         distance = np.abs(well_predicted - self.ranges[: self.count])

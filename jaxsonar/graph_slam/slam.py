@@ -18,8 +18,8 @@ from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import check_window
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.smoothing.smoother import Smoothed
-from jaxsonar.smoothing.smoother import smooth as smooth_poses
+from jaxsonar.smoothing.smooth_log import Smoothed
+from jaxsonar.smoothing.smooth_log import smooth as smooth_poses
 
 
 @dataclass(frozen=True)

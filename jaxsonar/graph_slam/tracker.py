@@ -149,7 +149,7 @@ class Tracker:
         """world_from_robot of all scans so far, and their covariances with respect to the first scan."""
         pose, cov = np.full((state.scan_count, 3), np.nan), np.full((state.scan_count, 3, 3), np.nan)
         node_covs = state.graph.covariances()
-        submaps = [(one.rows, one.poses, one.pose_cov) for one in state.graph.submaps]
+        submaps = [(one.rows, one.poses, one.pose_covariances) for one in state.graph.submaps]
         current = state.submap
         submaps.append((np.array(current.rows, np.int64), np.array(current.poses), np.array(current.covariances)))
         for node, (rows, own_poses, own_covs) in enumerate(submaps):

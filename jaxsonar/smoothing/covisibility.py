@@ -1,8 +1,8 @@
-"""Which scans may hear the same reflector: those that are known to each other better than reflectors are apart.
+"""Covisibility: which segments of a trajectory observe the same landmark.
 
-A robot that comes by again, and whose closure does not count, may be decimetres from where it believes to be. What it
-hears there need not come from the wall that is nearest; tied to a wrong one, all poses become sure of what is wrong. So
-a wall that is heard again is another wall, until it is known that it is the same.
+A robot that returns to a place without an accepted loop closure may be decimetres from where its pose says. What it
+observes there need not be the nearest landmark, and a wrong association makes all poses certain of a wrong result. So a
+landmark that is observed again is a new one, unless the relative poses are known well enough.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -15,100 +15,107 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.mapping.global_map import GlobalMap
-
-NEAR = 0.04
-"""Metres; standard deviation of where a reflector is heard, up to which it is told from its neighbors."""
-_CARRIED = 0.5  # m; stretches that follow one another are one way, but where the robot was carried
+from jaxsonar.smoothing.settings import SETTINGS
 
 
 @dataclass(frozen=True, eq=False)
-class Passages:
-    """Stretches of a path, and how well they are known as seen from each other."""
+class Traversals:
+    """Consecutive segments of a trajectory, and how well they are known relative to each other."""
 
-    part: Int[np.ndarray, " scans"]
-    """Which stretch each scan is of; they follow one another."""
-    poses: Float[np.ndarray, "parts 3"]
-    """world_from_part: where each begins."""
-    covariance: Float[np.ndarray, "parts parts 3 3"]
-    """Of the second one's pose in the frame of the first one, of errors added to it: metres and radians."""
+    segment_id: Int[np.ndarray, " scans"]
+    """Segment of each scan, ascending."""
+    poses: Float[np.ndarray, "segments 3"]
+    """world_from_segment: pose at which each begins."""
+    covariance: Float[np.ndarray, "segments segments 3 3"]
+    """Covariance of first_from_second for every pair of segments, metres and radians."""
 
-    def parted(self, world: GlobalMap, rows: dict[int, int]) -> GlobalMap:
-        """The map with a reflector for every group of stretches that are known to each other.
+    def split_landmarks(self, world: GlobalMap, rows: dict[int, int]) -> GlobalMap:
+        """Split every landmark of a map into one for each group of mutually well known segments.
 
         Args:
             world: the map.
-            rows: of the scans by their numbers.
+            rows: row of each scan number in the log.
         """
         walls, points = [], []
-        for number, seen in enumerate((*world.scans, *world.point_scans)):
-            wall = number < len(world)
-            row = number if wall else number - len(world)
-            parts = self._parts(seen, rows)
-            tied = self._known(world, number, parts)[parts]
-            group = connected_components(csr_array(tied | tied.T), directed=False)[1] if len(parts) else np.zeros(0)
-            of_scan = np.array([self.part[rows[scan]] for scan in seen], dtype=np.int64)
+        for number, scans in enumerate((*world.scans, *world.point_scans)):
+            is_wall = number < len(world)
+            row = number if is_wall else number - len(world)
+            segments = self._segments_of(scans, rows)
+            covisible = self._covisible(world, number, segments)[segments]
+            graph = csr_array(covisible | covisible.T)
+            group = connected_components(graph, directed=False)[1] if len(segments) else np.zeros(0)
+            segment_of_scan = np.array([self.segment_id[rows[scan]] for scan in scans], dtype=np.int64)
             for k in range(int(group.max(initial=0)) + 1):
-                own = np.isin(of_scan, parts[group == k])
-                (walls if wall else points).append((row, tuple(np.asarray(seen)[own].tolist())))
-        return taken(world, walls, points)
+                in_group = np.isin(segment_of_scan, segments[group == k])
+                (walls if is_wall else points).append((row, tuple(np.asarray(scans)[in_group].tolist())))
+        return select_landmarks(world, walls, points)
 
-    def heard_by(self, world: GlobalMap, rows: dict[int, int]) -> Bool[np.ndarray, "parts reflectors"]:
-        """Which stretches may hear each wall and point of such a map."""
-        seen = (*world.scans, *world.point_scans)
-        out = np.ones((len(self.poses), len(seen)), dtype=bool)
-        for number, scans in enumerate(seen):
-            parts = self._parts(scans, rows)
-            if len(parts):
-                out[:, number] = self._known(world, number, parts).any(axis=1)
-        return out
+    def visibility_mask(self, world: GlobalMap, rows: dict[int, int]) -> Bool[np.ndarray, "segments landmarks"]:
+        """Which segments may observe each wall and point of a map that ``split_landmarks`` returned."""
+        all_scans = (*world.scans, *world.point_scans)
+        mask = np.ones((len(self.poses), len(all_scans)), dtype=bool)
+        for number, scans in enumerate(all_scans):
+            segments = self._segments_of(scans, rows)
+            if len(segments):
+                mask[:, number] = self._covisible(world, number, segments).any(axis=1)
+        return mask
 
     @cached_property
-    def _from_world(self) -> Float[np.ndarray, "parts 2 2"]:
-        """Turns directions in the world into those that each stretch has."""
+    def _segment_from_world(self) -> Float[np.ndarray, "segments 2 2"]:
+        """Rotation matrices."""
         c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
         return np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
 
-    def _parts(self, scans: tuple[int, ...], rows: dict[int, int]) -> Int[np.ndarray, " some"]:
-        return np.unique(self.part[[rows[scan] for scan in scans]]) if scans else np.zeros(0, dtype=np.int64)
+    def _segments_of(self, scans: tuple[int, ...], rows: dict[int, int]) -> Int[np.ndarray, " some"]:
+        return np.unique(self.segment_id[[rows[scan] for scan in scans]]) if scans else np.zeros(0, dtype=np.int64)
 
-    def _known(self, world: GlobalMap, number: int, seen: Int[np.ndarray, " some"]) -> Bool[np.ndarray, "parts some"]:
-        """Whether a reflector that some stretches saw is heard from every stretch where it is expected.
+    def _covisible(
+        self, world: GlobalMap, number: int, observers: Int[np.ndarray, " some"]
+    ) -> Bool[np.ndarray, "segments some"]:
+        """Whether each segment knows well enough where a landmark is that the observers have seen.
 
-        Along a wall nothing need be known.
+        The position along a wall need not be known.
         """
-        from_world = self._from_world
+        segment_from_world = self._segment_from_world
         if number < len(world):
             first, last = world.segments[number]
-            share = ((self.poses[:, :2] - first) @ (last - first)) / max(float(((last - first) ** 2).sum()), 1e-12)
-            place = first + np.clip(share, 0, 1)[:, None] * (last - first)
+            length_squared = max(float(((last - first) ** 2).sum()), 1e-12)
+            fraction = ((self.poses[:, :2] - first) @ (last - first)) / length_squared
+            position = first + np.clip(fraction, 0, 1)[:, None] * (last - first)
             axes = unit(np.array([world.theta[number]]))
         else:
-            place, axes = world.points[[number - len(world)] * len(self.poses)], np.eye(2)
-        lever = np.einsum("pij,pqj->pqi", from_world, place[:, None] - self.poses[seen, :2])
-        variance = np.zeros((len(self.poses), len(seen)))
+            position, axes = world.points[[number - len(world)] * len(self.poses)], np.eye(2)
+        arm = np.einsum("pij,pqj->pqi", segment_from_world, position[:, None] - self.poses[observers, :2])
+        variance = np.zeros((len(self.poses), len(observers)))
         for axis in axes:
-            n = np.broadcast_to((from_world @ axis)[:, None], lever.shape)
-            turn = n[..., 1] * lever[..., 0] - n[..., 0] * lever[..., 1]
-            slope = np.concatenate([n, turn[..., None]], axis=-1)
-            variance += np.einsum("pqi,pqij,pqj->pq", slope, self.covariance[:, seen], slope)
-        after = np.abs(np.arange(len(self.poses))[:, None] - seen) <= 1
-        return variance < np.where(after, _CARRIED, NEAR) ** 2
+            n = np.broadcast_to((segment_from_world @ axis)[:, None], arm.shape)
+            by_heading = n[..., 1] * arm[..., 0] - n[..., 0] * arm[..., 1]
+            jacobian = np.concatenate([n, by_heading[..., None]], axis=-1)
+            variance += np.einsum("pqi,pqij,pqj->pq", jacobian, self.covariance[:, observers], jacobian)
+        consecutive = np.abs(np.arange(len(self.poses))[:, None] - observers) <= 1
+        return variance < np.where(consecutive, SETTINGS.max_consecutive_sd, SETTINGS.max_covisible_sd) ** 2
 
 
-def taken(
+def select_landmarks(
     world: GlobalMap, walls: list[tuple[int, tuple[int, ...]]], points: list[tuple[int, tuple[int, ...]]]
 ) -> GlobalMap:
-    """A map of these rows of another one, seen by these scans."""
-    wall, point = (np.array([row for row, _ in chosen], dtype=np.int64) for chosen in (walls, points))
-    chosen = {}
+    """A map of selected rows of another one.
+
+    Args:
+        world: the other map.
+        walls: row of each wall, and the scans that observed it; a row may be selected more than once.
+        points: the same of points.
+    """
+    wall, point = (np.array([row for row, _ in selected], dtype=np.int64) for selected in (walls, points))
+    columns = {}
     for field in fields(world):
         value, of_points = getattr(world, field.name), field.name.startswith("point")
         if isinstance(value, np.ndarray):
-            chosen[field.name] = value[point if of_points else wall]
+            columns[field.name] = value[point if of_points else wall]
     return replace(
         world,
-        **chosen,
-        scans=tuple(seen for _, seen in walls),
+        **columns,
+        scans=tuple(scans for _, scans in walls),
         point_kinds=tuple(world.point_kinds[row] for row in point),
-        point_scans=tuple(seen for _, seen in points),
+        point_scans=tuple(scans for _, scans in points),
     )

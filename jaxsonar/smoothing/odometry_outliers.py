@@ -1,8 +1,8 @@
-"""Where a path is broken: steps between scans that say something else than the odometry does, farther than it slips.
+"""Odometry outliers: steps between scans whose estimate contradicts the odometry, and points split at them.
 
-In a corridor a handful of echoes of corners and edges hold a scan along the walls. Two of them a few centimetres apart,
-as a door has them, are soon taken for one: the path bends until they are, and all scans are sure of it. So where a step
-is broken, what is heard beyond it is another point; that costs no more than one step of odometry.
+In a corridor, a few echoes of corners and edges determine a scan's position along the walls. Two points some
+centimetres apart, such as the jambs of a door, may be merged into one: the trajectory bends until they coincide, and
+all scans are certain of it. So beyond an outlier a point is a new one; this costs no more than one step of odometry.
 """
 
 from dataclasses import dataclass
@@ -11,77 +11,73 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import norm
 
-from jaxsonar.geometry.se2 import relative, wrap_angle
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.smoothing.covisibility import taken
-
-RARE = 0.3
-"""Mean number of steps of a run that are taken for broken by chance."""
-_TOGETHER = 2  # a scan that is out of line breaks the steps on both sides of it, each by less
-_BESIDE = 40  # scans; farther on the robot comes by again: what is the same then is not for odometry to say
+from jaxsonar.smoothing.covisibility import select_landmarks
+from jaxsonar.smoothing.settings import SETTINGS
 
 
-def broken_steps(
-    poses: Float[np.ndarray, "scans 3"], odometry: Float[np.ndarray, "steps 3"], linked: Float[np.ndarray, "steps 3"]
-) -> Int[np.ndarray, " some"]:
-    """Steps, by themselves or two together, whose odometry slips farther than chance would have it.
+def find_odometry_outliers(
+    residual: Float[np.ndarray, "steps 3"], information: Float[np.ndarray, "steps 3"]
+) -> Int[np.ndarray, " outliers"]:
+    """Steps whose odometry residual, alone or summed over consecutive steps, is too large for chance.
 
     Args:
-        poses: world_from_robot.
-        odometry: each next pose in the frame of the one before, as measured.
-        linked: inverse variances of it; 0 where there is none.
+        residual: odometry residuals, metres and radians, in the frame where each step begins.
+        information: inverse variances of the odometry; 0 where there is none.
     """
-    known = linked.min(axis=-1, initial=np.inf) > 0
-    slip = relative(poses[:-1], poses[1:]) - odometry
-    slip[:, 2] = wrap_angle(slip[:, 2])
-    variance = np.divide(1.0, linked, out=np.ones_like(linked), where=linked > 0)
-    bound = norm.isf(RARE / max(2 * _TOGETHER * slip.size, 1))
-    broken = np.zeros(len(slip), dtype=bool)
-    for count in range(1, _TOGETHER + 1):
-        first = np.arange(len(slip) - count + 1)
+    measured = information.min(axis=-1, initial=np.inf) > 0
+    variance = np.divide(1.0, information, out=np.ones_like(information), where=information > 0)
+    most = SETTINGS.outlier_steps
+    bound = norm.isf(SETTINGS.expected_false_outliers / max(2 * most * residual.size, 1))
+    is_outlier = np.zeros(len(residual), dtype=bool)
+    for count in range(1, most + 1):
+        first = np.arange(len(residual) - count + 1)
         window = first[:, None] + np.arange(count)
-        # Over two steps robots turn little: their slips are added as if they did not.
-        sigmas = np.abs(slip[window].sum(axis=1)) / np.sqrt(variance[window].sum(axis=1))
-        far = (sigmas.max(axis=-1) > bound) & known[window].all(axis=-1)
-        broken[window[far]] = True
-    return np.flatnonzero(broken)
+        # The rotation within two steps is small: their residuals are added as if both had one frame.
+        normalized = np.abs(residual[window].sum(axis=1)) / np.sqrt(variance[window].sum(axis=1))
+        is_large = (normalized.max(axis=-1) > bound) & measured[window].all(axis=-1)
+        is_outlier[window[is_large]] = True
+    return np.flatnonzero(is_outlier)
 
 
 @dataclass(frozen=True, eq=False)
-class Breaks:
-    """Broken steps of a path, and what follows for its map."""
+class OdometryOutliers:
+    """Odometry outliers of a trajectory, and the points that they split."""
 
-    steps: Int[np.ndarray, " some"]
-    """Rows of the scans from which the step to the next one is broken, ascending."""
+    steps: Int[np.ndarray, " outliers"]
+    """Rows of the scans at which the steps begin, ascending."""
     rows: dict[int, int]
-    """Of the scans by their numbers."""
+    """Row of each scan number in the log."""
 
-    def parted(self, world: GlobalMap) -> GlobalMap:
-        """The map with a point on either side of a broken step, where there was one for both."""
+    def split_landmarks(self, world: GlobalMap) -> GlobalMap:
+        """Split every point of a map that is observed on both sides of an outlier."""
         points = []
-        for number, seen in enumerate(world.point_scans):
-            row = np.array([self.rows[scan] for scan in seen], dtype=np.int64)
+        for number, scans in enumerate(world.point_scans):
+            row = np.array([self.rows[scan] for scan in scans], dtype=np.int64)
             order = np.argsort(row, kind="stable")
             part = np.zeros(len(row), dtype=np.int64)
-            part[order[1:]] = np.cumsum(self._between(row[order[:-1]], row[order[1:]]))
+            part[order[1:]] = np.cumsum(self._separates(row[order[:-1]], row[order[1:]]))
             for k in range(int(part.max(initial=0)) + 1):
-                points.append((number, tuple(np.asarray(seen)[part == k].tolist())))
-        return taken(world, list(enumerate(world.scans)), points)
+                points.append((number, tuple(np.asarray(scans)[part == k].tolist())))
+        return select_landmarks(world, list(enumerate(world.scans)), points)
 
-    def heard_by(self, world: GlobalMap, scans: int) -> Bool[np.ndarray, "scans reflectors"]:
-        """Which scans may hear each wall and point of such a map: no point of the other side."""
-        out = np.ones((scans, len(world) + len(world.point_scans)), dtype=bool)
-        every = np.arange(scans)
-        for number, seen in enumerate(world.point_scans):
-            row = np.sort([self.rows[scan] for scan in seen])
+    def visibility_mask(self, world: GlobalMap, scan_count: int) -> Bool[np.ndarray, "scans landmarks"]:
+        """Which scans may observe each wall and point of a map that ``split_landmarks`` returned."""
+        mask = np.ones((scan_count, len(world) + len(world.point_scans)), dtype=bool)
+        every = np.arange(scan_count)
+        for number, scans in enumerate(world.point_scans):
+            row = np.sort([self.rows[scan] for scan in scans])
             if len(row):
                 after = np.clip(np.searchsorted(row, every), 1, max(len(row) - 1, 1))
-                beside = row[np.stack([after - 1, np.minimum(after, len(row) - 1)])]
-                nearest = np.take_along_axis(beside, np.abs(beside - every).argmin(axis=0)[None], axis=0)[0]
-                out[:, len(world) + number] = ~self._between(np.minimum(every, nearest), np.maximum(every, nearest))
-        return out
+                adjacent = row[np.stack([after - 1, np.minimum(after, len(row) - 1)])]
+                nearest = np.take_along_axis(adjacent, np.abs(adjacent - every).argmin(axis=0)[None], axis=0)[0]
+                first, last = np.minimum(every, nearest), np.maximum(every, nearest)
+                mask[:, len(world) + number] = ~self._separates(first, last)
+        return mask
 
-    def _between(self, first: Int[np.ndarray, " pairs"], last: Int[np.ndarray, " pairs"]) -> Bool[np.ndarray, " pairs"]:
-        """Whether a broken step leads from one scan to another one that is not far on."""
+    def _separates(
+        self, first: Int[np.ndarray, " pairs"], last: Int[np.ndarray, " pairs"]
+    ) -> Bool[np.ndarray, " pairs"]:
+        """Whether an outlier lies between two scans that are not far apart."""
         crossed = np.searchsorted(self.steps, last) > np.searchsorted(self.steps, first)
-        return crossed & (last - first <= _BESIDE)
+        return crossed & (last - first <= SETTINGS.outlier_reach)

@@ -1,60 +1,51 @@
-"""A map whose walls, corners and edges are where they settled, with the covariances of the least squares."""
+"""The map of adjusted landmarks, with their covariances."""
 
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxsonar import kernels
-from jaxsonar.estimation.robust_adjustment import LEAST_ECHOES, Settled
-from jaxsonar.geometry.se2 import unit, wrap_angle
+from jaxsonar.estimation.adjustment_state import AdjustmentResult
+from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
+from jaxsonar.geometry.landmarks import landmark_positions, wall_segments
+from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
 from jaxsonar.mapping.global_map import GlobalMap
 
 
-def settled_map(world: GlobalMap, found: Settled, cov: Float[np.ndarray, "reflectors 2 2"]) -> GlobalMap:
-    """The map with the reflectors that it settled to; those that hardly an echo is left of are gone.
+def adjusted_map(world: GlobalMap, found: AdjustmentResult, cov: Float[np.ndarray, "landmarks 2 2"]) -> GlobalMap:
+    """The map with its landmarks where the adjustment put them; landmarks with too few echoes are removed.
 
     Args:
-        world: the map that the reflectors are from (``surroundings``, the only world).
-        found: the end of the settling.
-        cov: of the parameters of each reflector by itself, metres and radians.
+        world: the map from which the landmarks were made, the only one of the adjustment.
+        found: the result of the adjustment.
+        cov: marginal covariance of the parameters of each landmark, metres and radians.
     """
-    scene, walls = found.state.around.scene, len(world)
-    count = walls + len(world.points)
-    parameters, anchor = np.asarray(scene.parameters)[:count], np.asarray(scene.anchor)[:count]
-    echoes = _echoes(found, count)
-    kept = np.flatnonzero(echoes >= LEAST_ECHOES)
-    wall, point = kept[kept < walls], kept[kept >= walls]
-    # (distance of the anchor, theta) -> (rho, theta)
-    theta = parameters[wall, 1]
-    normal, along = unit(theta), unit(theta + np.pi / 2)
-    rho = parameters[wall, 0] + (normal * anchor[wall]).sum(-1)
-    lever = (along * anchor[wall]).sum(-1)
-    turn = cov[wall, 1, 1]
-    variance = cov[wall, 0, 0] + 2 * lever * cov[wall, 0, 1] + lever**2 * turn
-    middle = anchor[wall] + parameters[wall, :1] * normal
-    ends = np.asarray(scene.ends)[wall]
+    wall_count, count = len(world), len(world) + len(world.points)
+    first = np.asarray(found.problem.factors.reflection.first)[found.used]
+    echoes = np.bincount(first, minlength=count)[:count]
+    kept = np.flatnonzero(echoes >= GNC_SETTINGS.min_landmark_echoes)
+    wall, point = kept[kept < wall_count], kept[kept >= wall_count]
+    walls, points = (found.state.landmark_map.landmarks.take(rows) for rows in (wall, point))
+    # From (distance of the anchor, theta) to (rho, theta).
+    theta = walls.parameters[:, 1]
+    rho = walls.parameters[:, 0] + (unit(theta) * walls.anchor).sum(-1)
+    arm = (tangent_of(theta) * walls.anchor).sum(-1)
+    theta_variance = cov[wall, 1, 1]
+    rho_variance = cov[wall, 0, 0] + 2 * arm * cov[wall, 0, 1] + arm**2 * theta_variance
     kinds = {kernels.CORNER: "corner", kernels.EDGE: "edge"}
-    from_points = point - walls
     return replace(
         world,
-        segments=middle[:, None] + ends[..., None] * along[:, None],
+        segments=wall_segments(walls),
         rho=np.abs(rho),
         theta=wrap_angle(np.where(rho < 0, theta + np.pi, theta)),
-        sigma_rho=np.sqrt(variance),
-        sigma_theta=np.sqrt(turn),
+        sigma_rho=np.sqrt(rho_variance),
+        sigma_theta=np.sqrt(theta_variance),
         echoes=echoes[wall],
-        scans=tuple(world.scans[k] for k in wall),
-        points=anchor[point] + parameters[point],
-        point_kinds=tuple(kinds[kind] for kind in np.asarray(scene.kind)[point].tolist()),
+        scans=tuple(world.scans[row] for row in wall),
+        points=landmark_positions(points),
+        point_kinds=tuple(kinds[kind] for kind in points.kind.tolist()),
         point_cov=cov[point],
         point_echoes=echoes[point],
-        point_scans=tuple(world.point_scans[k] for k in from_points),
+        point_scans=tuple(world.point_scans[row - wall_count] for row in point),
     )
-
-
-def _echoes(found: Settled, count: int) -> Int[np.ndarray, " reflectors"]:
-    """That each reflector explains."""
-    reflection = found.problem.heard.reflection
-    first = np.asarray(reflection.first)[found.used]
-    return np.bincount(first, minlength=count)[:count]

@@ -1,15 +1,15 @@
-"""Sparse elimination against the dense inverse, for graphs of all kinds."""
+"""Block Cholesky against dense linear algebra, for graphs of several kinds."""
 
 import numpy as np
 import pytest
 
-from jaxsonar.estimation.block_cholesky import Plan
+from jaxsonar.estimation.block_cholesky import SymbolicFactorization
 
 BLOCKS = 24
 
 
 def pairs_of(name, rng):
-    """Graphs of blocks: a chain, a ring, all with one, a chain with shortcuts, all with all, none."""
+    """Pairs of blocks: a chain, a ring, a star, a chain with shortcuts, all pairs, none."""
     chain = np.stack([np.arange(BLOCKS - 1), np.arange(1, BLOCKS)], axis=1)
     some = rng.integers(0, BLOCKS, (40, 2))
     return {
@@ -24,8 +24,9 @@ def pairs_of(name, rng):
 
 @pytest.fixture(params=["chain", "ring", "star", "random", "all", "none"])
 def equations(request, rng):
-    """A plan, its numbers, and the same as one matrix."""
+    """A symbolic factorisation, the stored entries of a normal matrix, and the same matrix as a dense one."""
     sizes = rng.integers(1, 4, BLOCKS)
+    sizes[5] = 12  # larger than the blocks that LAPACK inverts
     begin = np.append(0, np.cumsum(sizes))
     pairs = pairs_of(request.param, rng)
     whole = np.diag(rng.uniform(1, 2, begin[-1]))
@@ -34,47 +35,49 @@ def equations(request, rng):
         for block in (one, other):
             rows[:, begin[block] : begin[block + 1]] = rng.standard_normal((2, sizes[block]))
         whole += rows.T @ rows
-    plan = Plan(sizes, pairs)
+    structure = SymbolicFactorization(sizes, pairs)
     terms = np.unique(np.concatenate([np.sort(pairs, axis=1), np.tile(np.arange(BLOCKS)[:, None], 2)]), axis=0)
-    values = np.full(plan.stored, np.nan)
-    # In either order of the two blocks it is the same number.
+    values = np.full(structure.nnz, np.nan)
+    # The storage does not depend on the order of the two blocks.
     for one, other in (terms.T, terms.T[::-1]):
-        for a, b, base, di, dk in zip(one, other, *plan.places(one, other), strict=True):
+        for a, b, base, row_stride, column_stride in zip(one, other, *structure.storage(one, other), strict=True):
             for i in range(sizes[a]):
                 for k in range(sizes[b]):
-                    values[base + i * di + k * dk] = whole[begin[a] + i, begin[b] + k]
-    return plan, np.nan_to_num(values), whole, begin
+                    values[base + i * row_stride + k * column_stride] = whole[begin[a] + i, begin[b] + k]
+    return structure, np.nan_to_num(values), whole, begin
 
 
-def test_the_solution_is_that_of_the_whole_matrix(equations, rng):
-    plan, values, whole, _ = equations
+def test_the_solution_equals_that_of_the_dense_matrix(equations, rng):
+    structure, values, whole, _ = equations
     side = rng.standard_normal(len(whole))
-    np.testing.assert_allclose(plan.factor(values).solve(side), np.linalg.solve(whole, side), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        structure.factorize(values).solve(side), np.linalg.solve(whole, side), rtol=0, atol=1e-11
+    )
 
 
-def test_marginals_are_blocks_of_the_inverse(equations):
-    plan, values, whole, begin = equations
+def test_the_marginals_are_the_diagonal_blocks_of_the_inverse(equations):
+    structure, values, whole, begin = equations
     inverse = np.linalg.inv(whole)
-    for k, found in enumerate(plan.factor(values).marginals()):
+    for k, found in enumerate(structure.factorize(values).marginals()):
         own = slice(begin[k], begin[k + 1])
         np.testing.assert_allclose(found, inverse[own, own], rtol=0, atol=1e-12)
         np.testing.assert_array_equal(found, found.T)
 
 
-def test_the_diagonal_stands_where_it_is_said(equations):
-    plan, values, whole, _ = equations
-    np.testing.assert_array_equal(values[plan.diagonal], np.diag(whole))
+def test_the_diagonal_indices_select_the_diagonal(equations):
+    structure, values, whole, _ = equations
+    np.testing.assert_array_equal(values[structure.diagonal], np.diag(whole))
 
 
-def test_room_grows_with_the_length_of_a_chain():
-    def stored(count):
+def test_memory_grows_linearly_with_the_length_of_a_chain():
+    def nnz(count):
         chain = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
-        return Plan(np.full(count, 3), chain).stored
+        return SymbolicFactorization(np.full(count, 3), chain).nnz
 
-    assert stored(800) < 2.1 * stored(400) < 400 * 3 * 3 * 8
+    assert nnz(800) < 2.1 * nnz(400) < 400 * 3 * 3 * 8
 
 
-def test_equations_that_determine_nothing_are_refused():
-    plan = Plan(np.array([2, 1]), np.array([[0, 1]]))
+def test_a_singular_matrix_is_an_error():
+    structure = SymbolicFactorization(np.array([2, 1]), np.array([[0, 1]]))
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        plan.factor(np.zeros(plan.stored))
+        structure.factorize(np.zeros(structure.nnz))

@@ -116,7 +116,9 @@ def test_the_world_may_be_turned_and_moved(rng):
     assert np.abs(difference(there.poses, compose(world, here.poses))).max() < 1e-6
     np.testing.assert_allclose(there.chi2, here.chi2, rtol=1e-4, atol=1e-6)
     np.testing.assert_array_equal(here.poses[0], start[0])
-    np.testing.assert_allclose(here.relative_poses(2, np.array([7]))[1], there.relative_poses(2, np.array([7]))[1], rtol=1e-4)
+    np.testing.assert_allclose(
+        here.relative_poses(2, np.array([7]))[1], there.relative_poses(2, np.array([7]))[1], rtol=1e-4
+    )
 
 
 def test_a_chain_alone_is_composed_and_costs_nothing(rng):
@@ -135,7 +137,9 @@ def test_a_link_withdrawn_is_a_link_never_made(rng):
     never = solve_pose_graph(start, links[:-1])
     withdrawn = solve_pose_graph(solve_pose_graph(start, links).poses, links[:-1])
     assert np.abs(difference(withdrawn.poses, never.poses)).max() < 1e-6
-    np.testing.assert_allclose(withdrawn.joint_covariance(np.arange(9)), never.joint_covariance(np.arange(9)), atol=1e-8)
+    np.testing.assert_allclose(
+        withdrawn.joint_covariance(np.arange(9)), never.joint_covariance(np.arange(9)), atol=1e-8
+    )
 
 
 def test_a_link_that_knows_two_directions_leaves_the_third_alone(rng):
@@ -175,7 +179,7 @@ def test_what_cannot_be_solved_is_said(rng):
     with pytest.raises(SonarError, match="do not determine"):
         solve_pose_graph(start, [*links[:4], flat, *links[5:]])
     with pytest.raises(SonarError, match="not finite"):
-        solve_pose_graph(start, [links[0]._replace(relative=np.full(3, np.nan)), *links[1:]])
+        solve_pose_graph(start, [links[0]._replace(first_from_second=np.full(3, np.nan)), *links[1:]])
     with pytest.raises(SonarError, match="allowed are 0 to 8"):
         solve_pose_graph(start, [*links, BetweenFactor(3, 12, np.zeros(3), np.eye(3))])
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from jaxsonar import Ring, Room, kernels, local_model, simulate
-from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
 from jaxsonar.geometry.se2 import rotation, unit, wrap_angle
 from jaxsonar.graph_slam.frontend import SubmapState, close_submap, start_submap, update
 from jaxsonar.graph_slam.joint_compatibility import FeatureMeasurements, associate_features
@@ -143,7 +142,7 @@ def test_neither_order_nor_padding_matters(case, rng):
     np.testing.assert_allclose(covariance[:11, :11], plain_cov, atol=1e-12)
     np.testing.assert_allclose(np.asarray(padded.residual)[:ECHOES], np.asarray(found.residual)[order], atol=1e-10)
     assert not np.asarray(padded.used)[ECHOES:].any()
-    predicted = kernels.predict_ranges(padded.belief, paths_of(more_path))
+    predicted = kernels.expected_ranges_with_variance(padded.belief, paths_of(more_path))
     assert np.isinf(np.asarray(predicted.expected)[4:]).all()
 
 
@@ -190,18 +189,6 @@ def test_ranges_are_those_that_the_simulator_hears():
     wall = heard.kind == EchoKind.PLANE
     assert wall.sum() > 20
     np.testing.assert_allclose(expected[heard.reflector[wall], heard.path[wall]], heard.range[wall], atol=2e-6)
-
-
-# Motion
-
-
-def slopes(function, at):
-    return np.stack([(function(at + w) - function(at - w)) / 2e-6 for w in 1e-6 * np.eye(len(at))], -1)
-
-
-def test_motion_that_nobody_measured_may_be_any():
-    unknown = step_variance(OdometryNoise(), np.full(3, np.nan))
-    assert (unknown > 50 * step_variance(OdometryNoise(), np.array([0.15, 0.0, 0.1]))).all()
 
 
 # Who is whom
