@@ -1,99 +1,128 @@
-"""How wide the cones of a ring are, and where they look: from which walls were heard at which angle."""
+"""Width and direction of the detection cones, from which walls were heard at which off-axis angle."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize
 
-from jaxsonar.diagnostics.echo_residuals import MARGIN, Look
+from jaxsonar.diagnostics.echo_residuals import ResidualTable
+from jaxsonar.diagnostics.settings import SETTINGS
 
-BIN = np.radians(2.5)
-EDGES = np.arange(-36, 37) * BIN
-CENTRES = (EDGES[1:] + EDGES[:-1]) / 2
+_CONES = SETTINGS.cones
+_EDGES = np.arange(-_CONES.bins // 2, _CONES.bins // 2 + 1) * _CONES.bin_width
+BIN_CENTRES = (_EDGES[1:] + _EDGES[:-1]) / 2
+"""Centres of the bins of off-axis angles, radians."""
 
 
-def cones(
-    look: Look, usable: Bool[np.ndarray, " rows"], heard: Bool[np.ndarray, " rows"], beam: Float[np.ndarray, " sensors"]
+def count_by_angle(
+    table: ResidualTable,
+    usable: Bool[np.ndarray, " rows"],
+    detected: Bool[np.ndarray, " rows"],
+    beam: Float[np.ndarray, " sensors"],
 ) -> tuple[Int[np.ndarray, "sensors bins"], Int[np.ndarray, "sensors bins"]]:
-    """Direct sightings (sensors, bins) by angle off the axis, and those heard; cones are stretched to their mean."""
-    row = np.flatnonzero(usable & (look.tx == look.rx) & (look.beyond <= MARGIN))
-    angle = look.angle[row] * (beam.mean() / beam[look.tx[row]])
-    slot = np.digitize(angle, EDGES) - 1
-    inside = (slot >= 0) & (slot < len(CENTRES))
-    row, slot = row[inside], slot[inside]
-    asked = np.zeros((len(beam), len(CENTRES)), np.int64)
-    answered = np.zeros_like(asked)
-    np.add.at(asked, (look.tx[row], slot), 1)
-    np.add.at(answered, (look.tx[row], slot), heard[row])
-    return asked, answered
+    """Expected and detected direct echoes of each sensor by off-axis angle.
 
+    If the nominal cones differ, angles are scaled to the mean cone.
 
-def curve_share(curve: Float[np.ndarray, " 4"], angle: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    """Share heard at angles off the axis, radians, by a fitted curve (``Health.curve``)."""
-    half, soft, inside, outside = curve
-    return outside + (inside - outside) / (1 + np.exp(np.clip((np.abs(angle) - half) / soft, -50, 50)))
-
-
-def fitted_cone(
-    asked: Int[np.ndarray, " bins"], answered: Int[np.ndarray, " bins"]
-) -> tuple[Float[np.ndarray, " 4"], float]:
-    """Half width, softness, shares inside and outside by maximum likelihood, and the half width's standard deviation.
-
-    NaN where there is not enough: few sightings, or none on one side of the border.
+    Args:
+        table: expected echoes.
+        usable: rows to count.
+        detected: rows whose echo was detected.
+        beam: nominal full width of the cones, radians.
     """
-    nothing = np.full(4, np.nan), float("nan")
-    if asked.sum() < 100 or answered.sum() < 30:
-        return nothing
+    near = table.beyond_end <= SETTINGS.reference.end_margin
+    row = np.flatnonzero(usable & (table.tx == table.rx) & near)
+    angle = table.off_axis[row] * (beam.mean() / beam[table.tx[row]])
+    bin_ = np.digitize(angle, _EDGES) - 1
+    inside = (bin_ >= 0) & (bin_ < len(BIN_CENTRES))
+    row, bin_ = row[inside], bin_[inside]
+    expected_count = np.zeros((len(beam), len(BIN_CENTRES)), np.int64)
+    detected_count = np.zeros_like(expected_count)
+    np.add.at(expected_count, (table.tx[row], bin_), 1)
+    np.add.at(detected_count, (table.tx[row], bin_), detected[row])
+    return expected_count, detected_count
 
-    def loss(x: np.ndarray) -> float:
-        share = np.clip(curve_share(x, CENTRES), 1e-4, 1 - 1e-4)
-        return -float(answered @ np.log(share) + (asked - answered) @ np.log(1 - share))
 
+def detection_probability(
+    curve: Float[np.ndarray, " 4"], angle: Float[np.ndarray, "*any"]
+) -> Float[np.ndarray, "*any"]:
+    """Detection probability at off-axis angles (radians), by a fitted curve (``Health.curve``): a logistic roll-off."""
+    half_width, rolloff_width, inside, outside = curve
+    return outside + (inside - outside) / (1 + np.exp(np.clip((np.abs(angle) - half_width) / rolloff_width, -50, 50)))
+
+
+def fit_cone(
+    expected: Int[np.ndarray, " bins"], detected: Int[np.ndarray, " bins"]
+) -> tuple[Float[np.ndarray, " 4"], float]:
+    """The curve of ``detection_probability`` by maximum likelihood, and the standard deviation of its half width.
+
+    NaN if there are too few echoes, or too few on one side of the border.
+    """
+    unknown = np.full(4, np.nan), float("nan")
+    if expected.sum() < _CONES.min_expected or detected.sum() < _CONES.min_detected:
+        return unknown
+
+    def negative_log_likelihood(x: np.ndarray) -> float:
+        p = np.clip(detection_probability(x, BIN_CENTRES), 1e-4, 1 - 1e-4)
+        return -float(detected @ np.log(p) + (expected - detected) @ np.log(1 - p))
+
+    # Several starting points: the likelihood has local maxima.
     bounds = [(np.radians(2), np.pi / 2), (np.radians(0.6), np.radians(15)), (0.05, 1.0), (0.0, 0.4)]
     starts = [np.array([np.radians(half), np.radians(3), 0.85, 0.03]) for half in (8, 15, 22, 30, 40, 55, 70)]
-    found = min((minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts), key=lambda f: f.fun)
-    best = found.x
-    steps = np.array([1e-3, 1e-3, 1e-3, 1e-3])
-    share = np.clip(curve_share(best, CENTRES), 0.01, 0.99)
-    slope = np.stack([(curve_share(best + d, CENTRES) - curve_share(best - d, CENTRES)) / 2e-3 for d in np.diag(steps)])
-    scatter = ((answered - asked * share) ** 2 / (share * (1 - share) * np.maximum(asked, 1)))[asked > 0]
-    excess = max(1.0, float(scatter.sum()) / max(1, len(scatter) - 4))
-    information = (slope * (asked / (share * (1 - share)))) @ slope.T / excess
-    wide = np.diag([3.6, 130.0, 4.0, 25.0])  # of what is possible at all: 30 deg, 5 deg, 0.5, 0.2
-    error = float(np.sqrt(np.linalg.inv(information + wide)[0, 0]))
-    beyond, within = np.abs(CENTRES) > best[0], np.abs(CENTRES) < best[0]
-    if asked[beyond].sum() < 20 or asked[within].sum() < 20 or error > np.radians(4):
-        return nothing
+    fits = (minimize(negative_log_likelihood, start, method="L-BFGS-B", bounds=bounds) for start in starts)
+    best = min(fits, key=lambda fit: fit.fun).x
+    # Standard deviation from the Fisher information, reduced by the observed scatter.
+    p = np.clip(detection_probability(best, BIN_CENTRES), 0.01, 0.99)
+    steps = np.diag([1e-3, 1e-3, 1e-3, 1e-3])
+    jacobian = np.stack(
+        [
+            (detection_probability(best + step, BIN_CENTRES) - detection_probability(best - step, BIN_CENTRES)) / 2e-3
+            for step in steps
+        ]
+    )
+    scatter = ((detected - expected * p) ** 2 / (p * (1 - p) * np.maximum(expected, 1)))[expected > 0]
+    overdispersion = max(1.0, float(scatter.sum()) / max(1, len(scatter) - 4))
+    information = (jacobian * (expected / (p * (1 - p)))) @ jacobian.T / overdispersion
+    prior = np.diag([3.6, 130.0, 4.0, 25.0])  # standard deviations of 30 deg, 5 deg, 0.5 and 0.2
+    error = float(np.sqrt(np.linalg.inv(information + prior)[0, 0]))
+    outside, inside = np.abs(BIN_CENTRES) > best[0], np.abs(BIN_CENTRES) < best[0]
+    least = _CONES.min_per_side
+    if expected[outside].sum() < least or expected[inside].sum() < least or error > _CONES.max_error:
+        return unknown
     return best, error
 
 
-def each_cone(
-    asked: Int[np.ndarray, "sensors bins"],
-    answered: Int[np.ndarray, "sensors bins"],
+def fit_each_cone(
+    expected: Int[np.ndarray, "sensors bins"],
+    detected: Int[np.ndarray, "sensors bins"],
     curve: Float[np.ndarray, " 4"],
 ) -> tuple[Float[np.ndarray, "sensors 2"], Float[np.ndarray, "sensors 2"]]:
-    """Half width and centre of each sensor's cone with standard deviations, radians: means over their likelihood."""
-    count = len(asked)
+    """Half width and direction of each sensor's cone, with standard deviations, radians.
+
+    Both are means over their posterior on a grid. The roll-off is that of the common curve. NaN where there are too few
+    echoes.
+    """
+    sensors = len(expected)
     if not np.isfinite(curve).all():
-        return np.full((count, 2), np.nan), np.full((count, 2), np.nan)
-    half = np.radians(np.arange(3, 90, 1.0))
-    centre = np.radians(np.arange(-30, 30.5, 0.5))
-    off = np.abs(CENTRES - centre[:, None])[None] - half[:, None, None]
-    shape = 1 / (1 + np.exp(np.clip(off / max(curve[1], BIN / 2), -50, 50)))
-    # A sensor that hears less in all directions is not narrower.
-    pooled = asked @ curve_share(curve, CENTRES)
-    level = np.clip(answered.sum(axis=1) / np.maximum(pooled, 1), 0.2, 1 / curve[2]) * curve[2]
-    widths, centres = [], []
-    for a, b, inside in zip(asked, answered, level, strict=True):
-        share = np.clip(curve[3] + (inside - curve[3]) * shape, 1e-3, 1 - 1e-3)
-        nats = np.log(share) @ b + np.log(1 - share) @ (a - b)
-        odds = np.exp(nats - nats.max())
-        odds /= odds.sum()
-        for values, axis, into in ((half, 1, widths), (centre, 0, centres)):
-            p = odds.sum(axis=axis)
-            mean = float(p @ values)
-            into.append((mean, float(np.sqrt(p @ (values - mean) ** 2))))
-    enough = (asked.sum(axis=1) >= 40) & (answered.sum(axis=1) >= 15)
-    known = [
-        np.where((enough & (x[:, 1] < np.radians(4)))[:, None], x, np.nan) for x in map(np.array, (widths, centres))
-    ]
-    return known[0], known[1]
+        return np.full((sensors, 2), np.nan), np.full((sensors, 2), np.nan)
+    half_width = np.radians(np.arange(3, 90, 1.0))
+    direction = np.radians(np.arange(-30, 30.5, 0.5))
+    outside = np.abs(BIN_CENTRES - direction[:, None])[None] - half_width[:, None, None]
+    rolloff = 1 / (1 + np.exp(np.clip(outside / max(curve[1], _CONES.bin_width / 2), -50, 50)))
+    # A sensor that detects less in all directions does not have a narrower cone: scale its curve.
+    usual = expected @ detection_probability(curve, BIN_CENTRES)
+    level = np.clip(detected.sum(axis=1) / np.maximum(usual, 1), 0.2, 1 / curve[2]) * curve[2]
+    estimates: tuple[list[tuple[float, float]], list[tuple[float, float]]] = ([], [])
+    for n, k, inside in zip(expected, detected, level, strict=True):
+        p = np.clip(curve[3] + (inside - curve[3]) * rolloff, 1e-3, 1 - 1e-3)
+        log_likelihood = np.log(p) @ k + np.log(1 - p) @ (n - k)
+        posterior = np.exp(log_likelihood - log_likelihood.max())
+        posterior /= posterior.sum()
+        for values, axis, estimate in ((half_width, 1, estimates[0]), (direction, 0, estimates[1])):
+            marginal = posterior.sum(axis=axis)
+            mean = float(marginal @ values)
+            estimate.append((mean, float(np.sqrt(marginal @ (values - mean) ** 2))))
+    enough = (expected.sum(axis=1) >= _CONES.min_expected_each) & (detected.sum(axis=1) >= _CONES.min_detected_each)
+    widths, directions = (
+        np.where((enough & (x[:, 1] < _CONES.max_error))[:, None], x, np.nan) for x in map(np.array, estimates)
+    )
+    return widths, directions

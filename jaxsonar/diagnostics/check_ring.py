@@ -1,8 +1,4 @@
-"""The health of a ring, told from a log: which sensors are dead, swapped, off or stuck, and how wide the cones are.
-
-Every scan is explained for itself; poses are not needed. Each sensor is then asked what it reports of walls that other
-echoes tell of. Rings too sparse for walls in one scan are compared with a map instead, if the log has poses.
-"""
+"""The health check of a ring: which sensors are dead, exchanged, off or stuck, and how wide the cones are."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,24 +7,25 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.detection.settings import check_sigma
-from jaxsonar.diagnostics.beam_width import cones, each_cone, fitted_cone
-from jaxsonar.diagnostics.echo_residuals import Look, explained_share, looked
-from jaxsonar.diagnostics.findings import findings_of
+from jaxsonar.diagnostics.beam_width import count_by_angle, fit_cone, fit_each_cone
+from jaxsonar.diagnostics.echo_residuals import ResidualTable, explained_share, predict_and_match
+from jaxsonar.diagnostics.findings import describe_findings
 from jaxsonar.diagnostics.health_report import Health as Health
-from jaxsonar.diagnostics.range_offsets import offsets_of
-from jaxsonar.diagnostics.reference_scene import Scene, evenly, scene_of_map, scene_of_scans, thinned
-from jaxsonar.diagnostics.swapped_sensors import exchanged
+from jaxsonar.diagnostics.range_offsets import OffsetEstimate, estimate_offsets
+from jaxsonar.diagnostics.reference_scene import (
+    ReferenceScene,
+    evenly_spaced,
+    scene_from_map,
+    scene_from_scans,
+    select_scans,
+)
+from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.diagnostics.swapped_sensors import find_exchanged_sensors
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import check_speed_of_sound
-
-MOST_SCANS = 1000
-"""Of longer logs so many scans are explained, evenly spread over it."""
-OTHERS = 3
-"""Echoes that must be left of a wall without those that are judged."""
-_BLANKED = 0.06  # m behind an echo in which another one may go unnoticed
 
 
 def check(
@@ -39,18 +36,18 @@ def check(
     progress: Callable[[int, int], None] | None = None,
     on_left_out: Callable[[int], None] | None = None,
 ) -> Health:
-    """The health of a ring, from what it heard.
+    """Check the health of a ring.
 
     Args:
-        ring: the sensors as they should be.
-        log: scans; poses are used only where single scans carry no walls.
-        sigma: standard deviation of the ranges, metres; estimated if left out.
-        progress: called with (scans done, scans) now and then.
-        on_left_out: told once how many echoes are of pairs (tx, rx) that this ring does not listen to.
+        ring: the ring as it should be.
+        log: scans. Poses are used only if single scans show too few walls.
+        sigma: standard deviation of the ranges, metres; None estimates it.
+        progress: called with (scans done, scans) from time to time.
+        on_left_out: called once with the number of echoes of pairs (tx, rx) that this ring does not listen to.
 
     Raises:
-        SonarError: a log without scans, a sensor number that the ring does not have, a speed of sound that no air has,
-            or a sigma out of range.
+        SonarError: a log without scans, a sensor number that the ring does not have, an impossible speed of sound, or a
+            sigma out of range.
     """
     check_sigma(sigma)
     check_speed_of_sound(ring)
@@ -59,85 +56,80 @@ def check(
     _, left_out = FlatEchoes.from_log(ring, log)
     if left_out and on_left_out is not None:
         on_left_out(left_out)
-    # Walls around the robot, from each scan alone or from a map.
-    part, scene, source, empty = _walls(ring, log, sigma, progress)
-    # What each sensor should have heard of them; again, if sensors turn out to be exchanged.
-    look = before = looked(ring, scene, part)
-    place = exchanged(ring, part, scene, sigma=sigma) if source else np.arange(ring.count)
-    if (place != np.arange(ring.count)).any():
-        renamed = replace(part, tx=place[part.tx], rx=place[part.rx])
-        scene = scene if scene.fixed else scene_of_scans(ring, renamed, sigma, progress)
-        look = looked(ring, scene, renamed)
-    # What each sensor reports too much, on the scale of the noise.
-    known = scene.sigma[scene.solid.any(axis=1)]
-    floor = sigma or (float(np.median(known)) if np.isfinite(known).any() else 1e-4)
-    offsets = offsets_of(look, ring.count, floor)
-    noise = offsets.sigma if np.isfinite(offsets.sigma) else 0.005
-    # Heard or not, at walls that other echoes tell of.
-    correction = np.nan_to_num(offsets.offset)
-    residual = look.residual - (correction[look.tx] + correction[look.rx]) / 2
-    gate = 4 * noise + 0.003
-    usable = look.open & (look.others >= OTHERS) & ~((residual > -_BLANKED) & (residual < -gate))
-    heard = np.abs(residual) < gate
-    expected, told = _sightings(look, usable, heard, ring.count)
-    # Cones.
-    asked, answered = cones(look, usable, heard, np.asarray(ring.beam))
-    curve, error = fitted_cone(asked.sum(axis=0), answered.sum(axis=0))
-    each, centre = each_cone(asked, answered, curve)
-    stretch = np.asarray(ring.beam)[:, None] / np.mean(ring.beam)
-    # Residuals a sensor.
-    tx, rx, left = look.tx[offsets.row], look.rx[offsets.row], offsets.residual
-    own = [left[(tx == k) & (rx == k)] + correction[k] for k in range(ring.count)]
-    any_ = [left[(tx == k) | (rx == k)] for k in range(ring.count)]
-    points = np.array([np.percentile(x, (5, 25, 50, 75, 95)) if len(x) >= 5 else np.full(5, np.nan) for x in own])
-    spread = np.array([[_deviation(x), _deviation(y)] for x, y in zip(own, any_, strict=True)])
-    # Echoes explained, as numbered and as they seem to be.
-    gate = 3 * noise + 0.002
-    fits = [explained_share(before, gate, ring.count), explained_share(look, gate, ring.count)[place]]
-    repeats, pairs = _repeats(log, ring.count)
+    # Find reference walls, from each scan alone or from a map.
+    part, scene, source, empty = _reference_walls(ring, log, sigma, progress)
+    # Match the predicted echoes with the reported ones; again, if sensors are exchanged.
+    table = as_numbered = predict_and_match(ring, scene, part)
+    in_place = np.arange(ring.count)
+    place = find_exchanged_sensors(ring, part, scene, sigma=sigma) if source else in_place
+    if (place != in_place).any():
+        renumbered = replace(part, tx=place[part.tx], rx=place[part.rx])
+        scene = scene if scene.from_map else scene_from_scans(ring, renumbered, sigma, progress)
+        table = predict_and_match(ring, scene, renumbered)
+    # Estimate range offsets and the noise of the ranges.
+    min_noise = sigma or scene.noise(default=SETTINGS.reference.min_sigma)
+    offsets = estimate_offsets(table, ring.count, min_noise)
+    noise = offsets.sigma if np.isfinite(offsets.sigma) else SETTINGS.detection.default_sigma
+    # Count which expected echoes were detected.
+    usable, detected = _detections(table, np.nan_to_num(offsets.offset), noise)
+    expected_count, detected_count = _count_well_inside(table, usable, detected, ring.count)
+    # Measure the cones.
+    beam = np.asarray(ring.beam)
+    expected_by_angle, detected_by_angle = count_by_angle(table, usable, detected, beam)
+    expected_in_all, detected_in_all = expected_by_angle.sum(axis=0), detected_by_angle.sum(axis=0)
+    curve, half_width_error = fit_cone(expected_in_all, detected_in_all)
+    half_width, direction = fit_each_cone(expected_by_angle, detected_by_angle, curve)
+    scale = beam[:, None] / np.mean(ring.beam)  # angles were counted on the scale of the mean cone
+    # Summarize residuals, explained echoes and repeated ranges.
+    quantiles, spread = _residual_statistics(table, offsets, ring.count)
+    gate = SETTINGS.detection.explained_gate * noise + SETTINGS.detection.explained_margin
+    explained = explained_share(as_numbered, gate, ring.count), explained_share(table, gate, ring.count)[place]
+    repeats, pairs = _repeated_ranges(log, ring.count)
     cross = log.tx != log.rx
+    # Report by the sensor numbers of the log.
     health = Health(
         ring=ring,
         scans=len(log),
         used=len(part),
-        walls=int(scene.solid.sum()) if source else 0,
+        walls=int(scene.is_wall.sum()) if source else 0,
         source=source,
         empty=empty,
         left_out=left_out,
         sigma=offsets.sigma if source else float("nan"),
         direct=np.bincount(log.tx[~cross], minlength=ring.count),
         cross=np.bincount(np.append(log.tx[cross], log.rx[cross]), minlength=ring.count),
-        expected=expected[place],
-        heard=told[place],
+        expected=expected_count[place],
+        heard=detected_count[place],
         place=place,
-        fits=np.stack(fits, axis=-1),
+        fits=np.stack(explained, axis=-1),
         offset=offsets.offset[place],
         offset_error=offsets.error[place],
-        median=points[place, 2],
-        quartiles=points[place][:, [0, 1, 3, 4]],
+        median=quantiles[place, 2],
+        quartiles=quantiles[place][:, [0, 1, 3, 4]],
         spread=spread[place],
         repeats=repeats,
-        constant=_most_frequent(log, ring.count),
-        beam=2 * np.array([curve[0], error]),
+        constant=_most_frequent_range(log, ring.count),
+        beam=2 * np.array([curve[0], half_width_error]),
         curve=curve,
-        asked=asked.sum(axis=0),
-        answered=answered.sum(axis=0),
-        beam_each=2 * each[place] * stretch[place],
-        centre=centre[place] * stretch[place],
+        asked=expected_in_all,
+        answered=detected_in_all,
+        beam_each=2 * half_width[place] * scale[place],
+        centre=direction[place] * scale[place],
         remarks=("",) * ring.count,
         findings=(),
     )
-    remarks, findings = findings_of(health, pairs, sigma)
+    remarks, findings = describe_findings(health, pairs, sigma)
     return replace(health, remarks=remarks, findings=findings)
 
 
-def _walls(
+def _reference_walls(
     ring: Ring, log: Log, sigma: float | None, progress: Callable[[int, int], None] | None
-) -> tuple[Log, Scene, str, str]:
-    """The scans that are compared with walls, their scene, where it comes from, and why there is none if so."""
-    part = thinned(log, evenly(len(log), MOST_SCANS))
-    scene = scene_of_scans(ring, part, sigma, progress)
-    if scene.solid.sum() >= max(5, len(part) // 10):
+) -> tuple[Log, ReferenceScene, str, str]:
+    """The scans to analyse, their reference scene, its source, and the reason if there are no walls."""
+    settings = SETTINGS.reference
+    part = select_scans(log, evenly_spaced(len(log), settings.max_scans))
+    scene = scene_from_scans(ring, part, sigma, progress)
+    if scene.is_wall.sum() >= max(settings.min_walls, len(part) // 10):
         return part, scene, "scans", ""
     if not (np.asarray(ring.corrected(part.range, part.tx, part.rx)) < ring.max_range).any():
         if not len(log.range):
@@ -145,46 +137,79 @@ def _walls(
         reach = f"none of the {len(log.range)} echoes is within the maximum range, {ring.max_range:g} m"
         return part, scene, "", f"{reach}: are ranges half path lengths in metres?"
     if np.isfinite(part.pose).all(axis=1).sum() < 2:
-        return part, scene, "", "single scans carry too few walls, and the log has no poses to gather them by"
-    scene = scene_of_map(ring, log)
-    if scene.solid.any():
+        return part, scene, "", "single scans show too few walls, and the log has no poses to gather them by"
+    scene = scene_from_map(ring, log)
+    if scene.is_wall.any():
         return log, scene, "map", ""
-    return log, scene, "", "neither single scans nor windows of the path carry walls"
+    return log, scene, "", "neither single scans nor windows of the trajectory show walls"
 
 
-def _sightings(
-    look: Look, usable: Bool[np.ndarray, " rows"], heard: Bool[np.ndarray, " rows"], count: int
+def _detections(
+    table: ResidualTable, offset: Float[np.ndarray, " sensors"], noise: float
+) -> tuple[Bool[np.ndarray, " rows"], Bool[np.ndarray, " rows"]]:
+    """Which rows are fair tests of detection, and which of all rows were detected.
+
+    A test is fair if other echoes support the wall, nothing obstructs it, and no echo just in front of the expected one
+    blanks it.
+    """
+    settings = SETTINGS.detection
+    residual = table.residual - (offset[table.tx] + offset[table.rx]) / 2
+    gate = settings.gate * noise + settings.gate_margin
+    blanked = (residual > -settings.blanking) & (residual < -gate)
+    usable = table.unobstructed & (table.independent_echoes >= settings.min_independent_echoes) & ~blanked
+    return usable, np.abs(residual) < gate
+
+
+def _count_well_inside(
+    table: ResidualTable, usable: Bool[np.ndarray, " rows"], detected: Bool[np.ndarray, " rows"], sensors: int
 ) -> tuple[Int[np.ndarray, "sensors 3"], Int[np.ndarray, "sensors 3"]]:
-    """Sightings of walls well inside the cones, and those heard: direct, as transmitter, as receiver."""
-    central = usable & (look.share > 0.95) & (look.beyond <= 0.01)
-    direct = look.tx == look.rx
-    columns = ((look.tx, central & direct), (look.tx, central & ~direct), (look.rx, central & ~direct))
-    expected = [np.bincount(sensor[rows], minlength=count) for sensor, rows in columns]
-    told = [np.bincount(sensor[rows & heard], minlength=count) for sensor, rows in columns]
-    return np.stack(expected, axis=-1), np.stack(told, axis=-1)
+    """Expected and detected echoes of walls well inside the cones: direct, cross as transmitter, cross as receiver."""
+    inside = usable & (table.visibility > SETTINGS.detection.min_visibility)
+    inside &= table.beyond_end <= SETTINGS.detection.max_beyond_end
+    direct = table.tx == table.rx
+    columns = ((table.tx, inside & direct), (table.tx, inside & ~direct), (table.rx, inside & ~direct))
+    expected = [np.bincount(sensor[rows], minlength=sensors) for sensor, rows in columns]
+    heard = [np.bincount(sensor[rows & detected], minlength=sensors) for sensor, rows in columns]
+    return np.stack(expected, axis=-1), np.stack(heard, axis=-1)
 
 
-def _repeats(log: Log, count: int) -> tuple[Float[np.ndarray, " sensors"], Int[np.ndarray, " sensors"]]:
-    """Shares of nearest direct ranges that are exactly those of the scan before, and how many could be."""
+def _residual_statistics(
+    table: ResidualTable, offsets: OffsetEstimate, sensors: int
+) -> tuple[Float[np.ndarray, "sensors 5"], Float[np.ndarray, "sensors 2"]]:
+    """Quantiles (5, 25, 50, 75, 95 %) of each sensor's direct residuals, and the scatter of its direct and all ones."""
+    tx, rx, residual = table.tx[offsets.row], table.rx[offsets.row], offsets.residual
+    offset = np.nan_to_num(offsets.offset)
+    least = SETTINGS.detection.min_residuals
+    direct = [residual[(tx == k) & (rx == k)] + offset[k] for k in range(sensors)]
+    both = [residual[(tx == k) | (rx == k)] for k in range(sensors)]
+    quantiles = [np.percentile(x, (5, 25, 50, 75, 95)) if len(x) >= least else np.full(5, np.nan) for x in direct]
+    spread = [[_scaled_mad(x), _scaled_mad(y)] for x, y in zip(direct, both, strict=True)]
+    return np.array(quantiles), np.array(spread)
+
+
+def _repeated_ranges(log: Log, sensors: int) -> tuple[Float[np.ndarray, " sensors"], Int[np.ndarray, " sensors"]]:
+    """Fraction of first direct ranges that equal that of the previous scan, and the number of compared pairs."""
     own = np.flatnonzero(log.tx == log.rx)
-    nearest = np.full((len(log), count), np.inf)
-    np.minimum.at(nearest, (log.echo_scan[own], log.tx[own]), log.range[own])
-    both = np.isfinite(nearest[1:]) & np.isfinite(nearest[:-1])
+    first = np.full((len(log), sensors), np.inf)
+    np.minimum.at(first, (log.echo_scan[own], log.tx[own]), log.range[own])
+    both = np.isfinite(first[1:]) & np.isfinite(first[:-1])
     pairs = both.sum(axis=0)
-    same = (both & (nearest[1:] == nearest[:-1])).sum(axis=0)
+    same = (both & (first[1:] == first[:-1])).sum(axis=0)
     return np.where(pairs > 0, same / np.maximum(pairs, 1), np.nan), pairs
 
 
-def _most_frequent(log: Log, count: int) -> Float[np.ndarray, "sensors 2"]:
-    """Each sensor's most frequent range, metres, and the share of its direct echoes that have it."""
-    constant = np.full((count, 2), np.nan)
-    for k in range(count):
+def _most_frequent_range(log: Log, sensors: int) -> Float[np.ndarray, "sensors 2"]:
+    """Each sensor's most frequent range, metres, and the fraction of its direct echoes with that range."""
+    constant = np.full((sensors, 2), np.nan)
+    for k in range(sensors):
         values, times = np.unique(log.range[(log.tx == k) & (log.rx == k)], return_counts=True)
         if len(values):
             constant[k] = values[times.argmax()], times.max() / times.sum()
     return constant
 
 
-def _deviation(values: Float[np.ndarray, " echoes"]) -> float:
-    """1.4826 x median absolute deviation; NaN of fewer than five values."""
-    return float(1.4826 * np.median(np.abs(values - np.median(values)))) if len(values) >= 5 else float("nan")
+def _scaled_mad(values: Float[np.ndarray, " echoes"]) -> float:
+    """1.4826 x median absolute deviation; NaN for fewer than five values."""
+    if len(values) < SETTINGS.detection.min_residuals:
+        return float("nan")
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))

@@ -1,114 +1,126 @@
-"""What each path should hear of the walls of every scan, and the echo nearest to it."""
+"""Residuals of echoes against reference walls: what every path should hear of them, and its nearest echo."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.diagnostics.reference_scene import BLOCK, Scene, outlook_of
+from jaxsonar.diagnostics.reference_scene import ReferenceScene, predict_reports
+from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.geometry.se2 import tangent_of, unit
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import is_fresh_reading
 from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
 
-MARGIN = 0.25
-"""Metres that a wall is taken to go on beyond its outermost feet, where nothing cuts it."""
 
+class ResidualTable(NamedTuple):
+    """Predicted and reported ranges.
 
-class Look(NamedTuple):
-    """Columns, one row for every path and wall that it may hear; then of every echo in scans with walls."""
+    The columns ``rows`` have an entry for every wall and path that may hear it; the columns ``echoes`` for every echo
+    in scans with walls.
+    """
 
     wall: Int[np.ndarray, " rows"]
     """Number of the wall, counted over all scans."""
     tx: Int[np.ndarray, " rows"]
-    """Sensor that sends."""
+    """Transmitter."""
     rx: Int[np.ndarray, " rows"]
-    """Sensor that hears."""
+    """Receiver."""
     residual: Float[np.ndarray, " rows"]
-    """Reported - expected, metres, of the nearest echo; inf: none."""
-    mine: Bool[np.ndarray, " rows"]
-    """No other reflector is nearer to that echo."""
-    slope: Float[np.ndarray, "rows 2"]
-    """Derivatives of the expected range by the wall's rho and theta."""
-    share: Float[np.ndarray, " rows"]
-    """How far it lies within both cones."""
-    angle: Float[np.ndarray, " rows"]
-    """Off the axis of the transmitter, radians."""
-    beyond: Float[np.ndarray, " rows"]
-    """Metres from the wall's ends to the point of reflection; 0 between them."""
-    open: Bool[np.ndarray, " rows"]
-    """Nothing stands before it, as far as is known, and the reading is new."""
-    others: Int[np.ndarray, " rows"]
-    """Echoes that the wall rests on without the sensor (of cross echoes: the path, there and back) itself."""
+    """Reported minus predicted range of the path's nearest echo, metres; inf without an echo."""
+    is_nearest: Bool[np.ndarray, " rows"]
+    """Whether no other reflector predicts a range closer to that echo."""
+    d_range_d_wall: Float[np.ndarray, "rows 2"]
+    """Derivatives of the predicted range with respect to the wall's rho and theta."""
+    visibility: Float[np.ndarray, " rows"]
+    """Weight by both detection cones: 1 inside, 0 outside."""
+    off_axis: Float[np.ndarray, " rows"]
+    """Angle of the sound off the axis of the transmitter, radians."""
+    beyond_end: Float[np.ndarray, " rows"]
+    """Distance of the point of reflection from the wall's ends, metres; 0 between them."""
+    unobstructed: Bool[np.ndarray, " rows"]
+    """Whether no known wall is in the way, and the reading is a new one."""
+    independent_echoes: Int[np.ndarray, " rows"]
+    """Echoes that support the wall without those of the sensor itself (for a cross path: of the path, both ways)."""
     echo_tx: Int[np.ndarray, " echoes"]
-    """Sensor that sent the echo."""
+    """Transmitter of each echo."""
     echo_rx: Int[np.ndarray, " echoes"]
-    """Sensor that heard it."""
+    """Receiver of each echo."""
     echo_residual: Float[np.ndarray, " echoes"]
-    """Metres to the nearest reflector that its path can hear; inf: none."""
+    """Distance to the nearest reflector that the path can hear, metres; inf without one."""
 
 
-def looked(ring: Ring, scene: Scene, log: Log) -> Look:
-    """What each path should hear of each wall, and the echo nearest to it."""
+def predict_and_match(ring: Ring, scene: ReferenceScene, log: Log) -> ResidualTable:
+    """Predict what each path should hear of each wall, and match it with the nearest echo."""
     flat, _ = FlatEchoes.from_log(ring, log)
-    fresh = is_fresh_reading(flat) if scene.fixed else np.ones(len(flat.scan), bool)
-    number = np.cumsum(scene.solid).reshape(scene.solid.shape) - 1
-    blocks = [slice(first, min(first + BLOCK, len(log))) for first in range(0, max(1, len(log)), BLOCK)]
-    parts = [_looked_at(ring, scene, block, *_dense(flat, block, fresh, len(ring.paths)), number) for block in blocks]
-    return Look(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    fresh = is_fresh_reading(flat) if scene.from_map else np.ones(len(flat.scan), bool)
+    wall_number = np.cumsum(scene.is_wall).reshape(scene.is_wall.shape) - 1
+    size = SETTINGS.reference.block_scans
+    blocks = [slice(first, min(first + size, len(log))) for first in range(0, max(1, len(log)), size)]
+    tables = [
+        _match_block(ring, scene, block, *_dense_ranges(flat, block, fresh, len(ring.paths)), wall_number)
+        for block in blocks
+    ]
+    return ResidualTable(*(np.concatenate(column) for column in zip(*tables, strict=True)))
 
 
-def _looked_at(
+def _match_block(
     ring: Ring,
-    scene: Scene,
+    scene: ReferenceScene,
     block: slice,
     reported: Float[np.ndarray, "block paths slots"],
-    new: Bool[np.ndarray, "block paths"],
-    number: Int[np.ndarray, "scans reflectors"],
-) -> Look:
-    """The same of a block of scans; ranges as reported, and whether they are new readings."""
+    is_new: Bool[np.ndarray, "block paths"],
+    wall_number: Int[np.ndarray, "scans reflectors"],
+) -> ResidualTable:
+    """The table of one block of scans, from reported ranges and whether they are new readings."""
     tx, rx = ring.paths.T
-    seen, wanted = outlook_of(ring, scene, block)
-    solid = scene.solid[block]
-    # Each echo belongs to the reflector nearest to it; each wall gets the nearest echo of each path.
-    away = reported[:, None] - wanted[..., None]
-    away = np.where(seen.exists[..., None] & np.isfinite(away), away, np.inf)
-    heard = np.where((seen.visibility > 0)[..., None], np.abs(away), np.inf)
-    nearest = np.abs(away).argmin(axis=-1)[..., None]
-    residual = np.take_along_axis(away, nearest, axis=-1)[..., 0]
-    best = np.broadcast_to(heard.argmin(axis=1)[:, None], away.shape)
-    owner = np.take_along_axis(best, nearest, axis=-1)[..., 0]
-    low, high = np.moveaxis(scene.ends[block], -1, 0)
-    beyond = np.maximum(low[..., None] - seen.footpoint, seen.footpoint - high[..., None])
-    clear = ~_behind(scene, block, seen.footpoint) & new[:, None]
-    if scene.fixed:
-        clear &= ~_hidden(np.asarray(ring.echo_paths.midpoint, np.float64), scene, block, seen.footpoint)
-    kept = solid[..., None] & seen.exists & (seen.range < ring.max_range - 0.02)
-    kept &= (seen.visibility > 0) | (tx == rx)
+    predicted, expected = predict_reports(ring, scene, block)
+    is_wall = scene.is_wall[block]
+    # Each echo belongs to the nearest reflector. Each wall gets the nearest echo of each path.
+    difference = reported[:, None] - expected[..., None]
+    difference = np.where(predicted.exists[..., None] & np.isfinite(difference), difference, np.inf)
+    distance = np.where((predicted.visibility > 0)[..., None], np.abs(difference), np.inf)
+    nearest = np.abs(difference).argmin(axis=-1)[..., None]
+    residual = np.take_along_axis(difference, nearest, axis=-1)[..., 0]
+    nearest_reflector = np.broadcast_to(distance.argmin(axis=1)[:, None], difference.shape)
+    owner = np.take_along_axis(nearest_reflector, nearest, axis=-1)[..., 0]
+    # Where the sound is reflected, and whether something is in the way.
+    start, end = np.moveaxis(scene.extent[block], -1, 0)
+    beyond_end = np.maximum(start[..., None] - predicted.footpoint, predicted.footpoint - end[..., None])
+    unobstructed = ~_is_behind_wall(scene, block, predicted.footpoint) & is_new[:, None]
+    if scene.from_map:
+        midpoint = np.asarray(ring.echo_paths.midpoint, np.float64)
+        unobstructed &= ~_is_occluded(midpoint, scene, block, predicted.footpoint)
+    # Walls that a path may hear; direct paths also if the wall is outside of the cone, to measure the cone.
+    kept = is_wall[..., None] & predicted.exists & (predicted.range < ring.max_range - SETTINGS.reference.range_margin)
+    kept &= (predicted.visibility > 0) | (tx == rx)
     row = s, r, p = np.nonzero(kept)
-    alone = np.where(tx[p] == rx[p], scene.own[block][s, r, tx[p]], 2)
+    own = np.where(tx[p] == rx[p], scene.echoes_of_sensor[block][s, r, tx[p]], 2)
     scale = REFERENCE_SPEED_OF_SOUND / float(ring.speed_of_sound)
-    scan, path, slot = np.nonzero(np.isfinite(reported) & np.any(solid, axis=1)[:, None, None])
-    return Look(
-        wall=number[block][s, r],
+    scan, path, slot = np.nonzero(np.isfinite(reported) & np.any(is_wall, axis=1)[:, None, None])
+    return ResidualTable(
+        wall=wall_number[block][s, r],
         tx=tx[p],
         rx=rx[p],
         residual=residual[row],
-        mine=np.equal(owner[row], r),
-        slope=seen.d_range_d_reflector[row] * scale * (not scene.fixed),
-        share=seen.visibility[row],
-        angle=seen.departure_angle[row],
-        beyond=np.maximum(beyond, 0)[row],
-        open=clear[row],
-        others=scene.support[block][s, r] - alone,
+        is_nearest=np.equal(owner[row], r),
+        d_range_d_wall=predicted.d_range_d_landmark[row] * scale * (not scene.from_map),
+        visibility=predicted.visibility[row],
+        off_axis=predicted.departure_angle[row],
+        beyond_end=np.maximum(beyond_end, 0)[row],
+        unobstructed=unobstructed[row],
+        independent_echoes=scene.echoes[block][s, r] - own,
         echo_tx=tx[path],
         echo_rx=rx[path],
-        echo_residual=heard.min(axis=1)[scan, path, slot],
+        echo_residual=distance.min(axis=1)[scan, path, slot],
     )
 
 
-def _dense(flat: FlatEchoes, block: slice, fresh: np.ndarray, paths: int) -> tuple[np.ndarray, np.ndarray]:
-    """Ranges (scans, paths, slots), NaN = none; and where all of them are new readings (scans, paths)."""
+def _dense_ranges(
+    flat: FlatEchoes, block: slice, fresh: Bool[np.ndarray, " echoes"], paths: int
+) -> tuple[Float[np.ndarray, "block paths slots"], Bool[np.ndarray, "block paths"]]:
+    """Reported ranges in ascending order, NaN for none, and whether all readings of a path are new."""
     begin, end = int(flat.start[block.start]), int(flat.start[block.stop])
     scan, path = flat.scan[begin:end] - block.start, flat.path[begin:end]
     order = np.lexsort((flat.reported[begin:end], path, scan))
@@ -116,47 +128,56 @@ def _dense(flat: FlatEchoes, block: slice, fresh: np.ndarray, paths: int) -> tup
     rank = np.arange(len(key)) - np.searchsorted(key, key)
     reported = np.full((block.stop - block.start, paths, max(1, int(rank.max(initial=0)) + 1)), np.nan)
     reported[scan[order], path[order], rank] = flat.reported[begin:end][order]
-    new = np.ones(reported.shape[:2], bool)
+    is_new = np.ones(reported.shape[:2], bool)
     stale = ~fresh[begin:end]
-    new[scan[stale], path[stale]] = False
-    return reported, new
+    is_new[scan[stale], path[stale]] = False
+    return reported, is_new
 
 
-def _behind(scene: Scene, block: slice, foot: np.ndarray) -> np.ndarray:
-    """Points of reflection beyond a wall's seen ends that lie behind another wall: (scans, reflectors, paths)."""
+def _is_behind_wall(
+    scene: ReferenceScene, block: slice, footpoint: Float[np.ndarray, "block reflectors paths"]
+) -> Bool[np.ndarray, "block reflectors paths"]:
+    """Points of reflection beyond the observed ends of their wall that lie behind the line of another wall."""
+    settings = SETTINGS.reference
     rho, theta = np.moveaxis(scene.parameters[block].astype(np.float64), -1, 0)
-    solid, (low, high) = scene.solid[block], np.moveaxis(scene.ends[block], -1, 0)
-    turn = theta[:, :, None] - theta[:, None, :]
-    # n_j . (rho_i n_i + foot t_i) = rho_i cos + foot sin(theta_j - theta_i)
-    depth = rho[..., None, None] * np.cos(turn)[..., None] - foot[:, :, None, :] * np.sin(turn)[..., None]
-    over = (depth > rho[:, None, :, None] + 0.02) & solid[:, None, :, None] & (np.abs(turn) > 0.1)[..., None]
-    outside = (foot < low[..., None]) | (foot > high[..., None])
-    return over.any(axis=2) & outside
+    is_wall, (start, end) = scene.is_wall[block], np.moveaxis(scene.extent[block], -1, 0)
+    angle = theta[:, :, None] - theta[:, None, :]
+    # n_j . (rho_i n_i + s t_i) = rho_i cos(theta_i - theta_j) - s sin(theta_i - theta_j)
+    depth = rho[..., None, None] * np.cos(angle)[..., None] - footpoint[:, :, None, :] * np.sin(angle)[..., None]
+    behind = (depth > rho[:, None, :, None] + settings.range_margin) & is_wall[:, None, :, None]
+    behind &= (np.abs(angle) > settings.min_wall_angle)[..., None]
+    beyond_end = (footpoint < start[..., None]) | (footpoint > end[..., None])
+    return behind.any(axis=2) & beyond_end
 
 
-def _hidden(midpoint: np.ndarray, scene: Scene, block: slice, foot: np.ndarray) -> np.ndarray:
-    """Points of reflection that another wall hides from the virtual sensor: (scans, reflectors, paths)."""
+def _is_occluded(
+    midpoint: Float[np.ndarray, "paths 2"],
+    scene: ReferenceScene,
+    block: slice,
+    footpoint: Float[np.ndarray, "block reflectors paths"],
+) -> Bool[np.ndarray, "block reflectors paths"]:
+    """Points of reflection that another wall occludes from the virtual sensor of the path."""
     rho, theta = np.moveaxis(scene.parameters[block].astype(np.float64), -1, 0)
-    n, t = (np.stack(pair, axis=-1) for pair in ((np.cos(theta), np.sin(theta)), (-np.sin(theta), np.cos(theta))))
-    point = (rho[..., None] * n)[:, :, None] + foot[..., None] * t[:, :, None]  # (scans, walls, paths, 2)
+    n, t = unit(theta), tangent_of(theta)
+    point = (rho[..., None] * n)[:, :, None] + footpoint[..., None] * t[:, :, None]  # (scans, walls, paths, 2)
     ray = point - midpoint
-    towards = np.einsum("swpx,sjx->swjp", ray, n)
-    share = (rho[:, None, :, None] - np.einsum("px,sjx->sjp", midpoint, n)[:, None]) / np.where(
-        towards == 0, 1, towards
-    )
-    where = np.einsum("px,sjx->sjp", midpoint, t)[:, None] + share * np.einsum("swpx,sjx->swjp", ray, t)
-    low, high = np.moveaxis(scene.ends[block], -1, 0)[..., None, :, None]
-    crossed = (share > 0) & (share < 0.97) & (where > low) & (where < high) & scene.solid[block][:, None, :, None]
-    return crossed.any(axis=2)
+    # Where the ray to the point of wall w crosses the line of wall j, as a fraction of the ray and along the wall.
+    toward = np.einsum("swpx,sjx->swjp", ray, n)
+    height = rho[:, None, :, None] - np.einsum("px,sjx->sjp", midpoint, n)[:, None]
+    share = height / np.where(toward == 0, 1, toward)
+    along = np.einsum("px,sjx->sjp", midpoint, t)[:, None] + share * np.einsum("swpx,sjx->swjp", ray, t)
+    start, end = np.moveaxis(scene.extent[block], -1, 0)[..., None, :, None]
+    crosses = (share > 0) & (share < 0.97) & (along > start) & (along < end) & scene.is_wall[block][:, None, :, None]
+    return crosses.any(axis=2)
 
 
-def explained_share(look: Look, gate: float, count: int) -> np.ndarray:
-    """Share of the echoes of each sensor, sent or heard, that a reflector explains."""
-    once = look.echo_tx != look.echo_rx
-    fits = np.abs(look.echo_residual) < gate
+def explained_share(table: ResidualTable, gate: float, sensors: int) -> Float[np.ndarray, " sensors"]:
+    """Fraction of the echoes of each sensor, sent or received, within ``gate`` (metres) of a reflector."""
+    cross = table.echo_tx != table.echo_rx
+    explained = np.abs(table.echo_residual) < gate
 
-    def each(which: Bool[np.ndarray, " echoes"]) -> np.ndarray:
-        return np.bincount(np.append(look.echo_tx[which], look.echo_rx[which & once]), minlength=count)
+    def count(which: Bool[np.ndarray, " echoes"]) -> np.ndarray:
+        return np.bincount(np.append(table.echo_tx[which], table.echo_rx[which & cross]), minlength=sensors)
 
-    total = each(np.ones(len(fits), bool))
-    return np.where(total > 0, each(fits) / np.maximum(total, 1), np.nan)
+    total = count(np.ones(len(explained), bool))
+    return np.where(total > 0, count(explained) / np.maximum(total, 1), np.nan)

@@ -1,4 +1,4 @@
-"""What the health check of a ring tells of each sensor."""
+"""The result of the health check of a ring."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -11,78 +11,82 @@ from jaxsonar.sensors.ring import Ring
 
 @dataclass(frozen=True, eq=False)
 class Health:
-    """What a log tells of each sensor of a ring; arrays have one entry a sensor, NaN where there is too little to tell.
+    """Measurements of every sensor of a ring, from a log.
 
-    Sensors are numbered as in the log. A sensor that seems to sit elsewhere (``place``) is judged as the one there.
+    Arrays have one entry per sensor, and NaN where data are missing. Sensors are numbered as in the log.
+    A sensor that seems to be at another position (``place``) is compared with predictions for that position. The field
+    names are the keys of the JSON file.
     """
 
     ring: Ring
     """The ring as it should be."""
     scans: int
-    """Scans of the log."""
+    """Number of scans in the log."""
     used: int
-    """Of them, those that were explained."""
+    """Number of scans that were analysed."""
     walls: int
-    """Walls in all these scans that the sensors were compared with."""
+    """Number of reference walls, counted once per scan."""
     source: str
-    """Where the walls come from: "scans" (each for itself), "map" (the log's poses: residuals hold their errors and the
-    sensors' delay, too), or "" (there are none)."""
+    """Source of the reference walls: "scans" (each scan alone), "map" (a map by the log's poses; residuals then include
+    pose errors and delays of the sensors), or "" (no walls)."""
     empty: str
-    """Why there are no walls; empty if there are."""
+    """Reason why there are no reference walls; empty if there are."""
     left_out: int
-    """Echoes of pairs (tx, rx) that the ring does not listen to."""
+    """Number of echoes of pairs (tx, rx) that the ring does not listen to."""
     sigma: float
-    """Robust standard deviation of the ranges around the walls, metres; NaN without walls."""
+    """Robust standard deviation of the ranges about the walls, metres; NaN without walls."""
     direct: Int[np.ndarray, " sensors"]
-    """Direct echoes in the log."""
+    """Number of direct echoes in the log."""
     cross: Int[np.ndarray, " sensors"]
-    """Cross echoes in the log that the sensor sent or heard."""
+    """Number of cross echoes in the log that the sensor sent or received."""
     expected: Int[np.ndarray, "sensors 3"]
-    """Sightings of walls well inside the cones: direct, cross as transmitter, cross as receiver."""
+    """Expected echoes of walls well inside the cones: direct, cross as transmitter, cross as receiver."""
     heard: Int[np.ndarray, "sensors 3"]
-    """How many of them were heard."""
+    """Number of them that were detected."""
     place: Int[np.ndarray, " sensors"]
-    """Which sensor of the ring it seems to be; itself where the wiring is right."""
+    """Number of the sensor of the ring at whose position it seems to be; its own if the wiring is right."""
     fits: Float[np.ndarray, "sensors 2"]
-    """Share of its echoes that what stands around explains: as numbered, and at ``place``."""
+    """Fraction of its echoes that reflectors explain: at its own position, and at ``place``."""
     offset: Float[np.ndarray, " sensors"]
-    """What it reports too much, relative to the others, metres."""
+    """Range offset relative to the other sensors, metres; positive if it reports too much."""
     offset_error: Float[np.ndarray, " sensors"]
     """Standard error of the offset, metres."""
     median: Float[np.ndarray, " sensors"]
-    """Median residual of its direct echoes against walls from the other echoes, metres."""
+    """Median residual of its direct echoes against walls that the other echoes determine, metres."""
     quartiles: Float[np.ndarray, "sensors 4"]
-    """5, 25, 75 and 95 % points of the same residuals, metres."""
+    """5, 25, 75 and 95 % quantiles of the same residuals, metres."""
     spread: Float[np.ndarray, "sensors 2"]
-    """1.4826 x median absolute deviation of the residuals, metres: of direct, and of all its echoes."""
+    """1.4826 x median absolute deviation of the residuals of its direct echoes, and of all its echoes, metres."""
     repeats: Float[np.ndarray, " sensors"]
-    """Share of its nearest direct echoes whose range is exactly that of the scan before."""
+    """Fraction of its first direct echoes with exactly the range of the previous scan."""
     constant: Float[np.ndarray, "sensors 2"]
-    """Its most frequent range, metres, and the share of its direct echoes that have it."""
+    """Its most frequent range, metres, and the fraction of its direct echoes with that range."""
     beam: Float[np.ndarray, " 2"]
-    """Full width of the cones, measured, and its standard deviation, radians."""
+    """Measured full width of the cones and its standard deviation, radians."""
     curve: Float[np.ndarray, " 4"]
-    """Share heard as a function of the angle off the axis: half width, softness (both rad), share inside, outside."""
+    """Detection probability as a function of the off-axis angle: half width and roll-off width (radians), probability
+    inside and outside."""
     asked: Int[np.ndarray, " bins"]
-    """Direct sightings by angle off the axis, in bins of 2.5 deg from -90 to 90 deg."""
+    """Expected direct echoes by off-axis angle, in bins of 2.5 degrees from -90 to 90 degrees."""
     answered: Int[np.ndarray, " bins"]
-    """How many of them were heard."""
+    """Number of them that were detected."""
     beam_each: Float[np.ndarray, "sensors 2"]
     """Full width of each sensor's cone and its standard deviation, radians."""
     centre: Float[np.ndarray, "sensors 2"]
-    """Where the middle of its cone looks, counter-clockwise from its heading, and its standard deviation, radians."""
+    """Direction of the middle of its cone relative to its heading, counter-clockwise, and its standard deviation,
+    radians."""
     remarks: tuple[str, ...]
-    """What is the matter with each sensor, in a few words; empty: nothing."""
+    """Short remark for each sensor; empty if nothing is wrong."""
     findings: tuple[str, ...]
-    """One sentence for each thing that is not as it should be, the worst first; empty: healthy."""
+    """One sentence per fault, the most severe first; none if the ring is healthy."""
 
     @property
     def nominal(self) -> float:
-        """Mean full width of the cones as the ring has it, radians."""
+        """Mean full width of the cones as the ring specifies it, radians."""
         return float(np.mean(self.ring.beam))
 
     def as_json(self) -> dict[str, Any]:
-        """Plain numbers for a JSON file, SI units and radians; null where there is nothing to tell."""
+        """Plain numbers for a JSON file, SI units and radians; null for NaN."""
 
         def plain(value: Any) -> Any:
             if isinstance(value, np.ndarray):

@@ -1,91 +1,113 @@
-"""What each sensor reports too much or too little: all offsets and all walls at once."""
+"""Range offsets of all sensors, estimated jointly with small corrections of all walls."""
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from jaxsonar.diagnostics.echo_residuals import MARGIN, Look
-
-GATE = 0.1
-"""Metres; an echo farther than this from where a wall is expected does not come from it."""
+from jaxsonar.diagnostics.echo_residuals import ResidualTable
+from jaxsonar.diagnostics.settings import SETTINGS
 
 
-class Offsets(NamedTuple):
-    """What each sensor reports too much, metres, and how far its echoes lie from walls that others tell of."""
+class OffsetEstimate(NamedTuple):
+    """Range offsets, and the residuals that remain."""
 
-    offset: np.ndarray
-    error: np.ndarray
+    offset: Float[np.ndarray, " sensors"]
+    """What each sensor reports too much, metres; NaN where it has too few echoes."""
+    error: Float[np.ndarray, " sensors"]
+    """Standard error of the offset, metres."""
     sigma: float
-    row: np.ndarray  # rows of the look
-    residual: np.ndarray  # m, each without its own pull on the wall
+    """Robust standard deviation of the residuals, metres; NaN without residuals."""
+    row: Int[np.ndarray, " used"]
+    """Rows of the table that were used."""
+    residual: Float[np.ndarray, " used"]
+    """Residual of each row against a wall that is determined without it (leave-one-out), metres."""
 
 
-def offsets_of(look: Look, count: int, floor: float) -> Offsets:
-    """Robust least squares over all offsets and all walls at once: a bad sensor does not blame its neighbors.
+def estimate_offsets(table: ResidualTable, sensors: int, min_noise: float) -> OffsetEstimate:
+    """Robust least squares over all offsets and all walls jointly, so that a bad sensor does not spoil its neighbors.
 
     Args:
-        look: what was heard.
-        count: number of sensors.
-        floor: noise, metres, below which residuals of walls with few echoes do not count as small.
+        table: residuals of the echoes.
+        sensors: number of sensors.
+        min_noise: lower limit of the noise, metres, for walls with so few echoes that their residuals are too small.
     """
+    settings = SETTINGS.offsets
     row = np.flatnonzero(
-        (np.abs(look.residual) < GATE) & look.mine & (look.share > 0.2) & look.open & (look.beyond <= MARGIN)
+        (np.abs(table.residual) < settings.gate)
+        & table.is_nearest
+        & (table.visibility > settings.min_visibility)
+        & table.unobstructed
+        & (table.beyond_end <= SETTINGS.reference.end_margin)
     )
-    tx, rx, residual = look.tx[row], look.rx[row], look.residual[row]
-    _, wall = np.unique(look.wall[row], return_inverse=True)
-    walls, slope = int(wall.max(initial=-1)) + 1, look.slope[row]
-    mix = np.zeros((len(row), count))
-    mix[np.arange(len(row)), tx] += 0.5
-    mix[np.arange(len(row)), rx] += 0.5
-    seen = mix.sum(axis=0) > 0
-    offset = np.array([_median(residual[(tx == k) & (rx == k)]) for k in range(count)])
-    move, noise = np.zeros((walls, 2)), 0.01
-    inverse, error = np.zeros((walls, 2, 2)), np.full(count, np.nan)
+    tx, rx, residual = table.tx[row], table.rx[row], table.residual[row]
+    _, wall = np.unique(table.wall[row], return_inverse=True)
+    walls, d_wall = int(wall.max(initial=-1)) + 1, table.d_range_d_wall[row]
+    # The offset of a path is the mean of the offsets of its two sensors.
+    d_offset = np.zeros((len(row), sensors))
+    d_offset[np.arange(len(row)), tx] += 0.5
+    d_offset[np.arange(len(row)), rx] += 0.5
+    has_echoes = d_offset.sum(axis=0) > 0
+    offset = np.array([_median(residual[(tx == k) & (rx == k)]) for k in range(sensors)])
+    correction, noise = np.zeros((walls, 2)), settings.initial_noise
+    wall_cov, error = np.zeros((walls, 2, 2)), np.full(sensors, np.nan)
     weight = np.ones(len(row))
-    for _ in range(12 if len(row) else 0):
-        left = residual - (slope * move[wall]).sum(axis=1) - (offset[tx] + offset[rx]) / 2
-        noise = max(1.4826 * float(np.median(np.abs(left))), floor)
-        weight = np.clip(1 - (left / (4.685 * noise)) ** 2, 0, None) ** 2 / noise**2
-        # Walls are eliminated one by one (Schur complement); both are held by wide priors, 50 mm and 0.05 rad.
-        a = _summed(wall, weight[:, None, None] * slope[:, :, None] * slope[:, None, :], walls) + 400 * np.eye(2)
-        b = _summed(wall, weight[:, None, None] * slope[:, :, None] * mix[:, None, :], walls)
-        right = _summed(wall, (weight * residual)[:, None] * slope, walls)
-        inverse = np.linalg.inv(a)
-        held = mix.T @ (weight[:, None] * mix) + 400 * np.eye(count) - np.einsum("wik,wij,wjl->kl", b, inverse, b)
-        pull = mix.T @ (weight * residual) - np.einsum("wik,wij,wj->k", b, inverse, right)
-        offset = np.linalg.solve(held, pull)
-        offset, error = without_gauge(offset, held, seen)
-        move = np.einsum("wij,wj->wi", inverse, right - np.einsum("wik,k->wi", b, offset))
-    left = residual - (slope * move[wall]).sum(axis=1) - (offset[tx] + offset[rx]) / 2
-    own = weight * np.einsum("ei,eij,ej->e", slope, inverse[wall], slope)
-    left = left / np.maximum(1 - own, 0.1)
-    enough = np.bincount(tx, minlength=count) + np.bincount(rx, minlength=count) * 1 >= 16
+    prior = settings.prior_information
+    for _ in range(settings.iterations if len(row) else 0):
+        left = residual - (d_wall * correction[wall]).sum(axis=1) - (offset[tx] + offset[rx]) / 2
+        noise = max(1.4826 * float(np.median(np.abs(left))), min_noise)
+        weight = np.clip(1 - (left / (settings.tukey * noise)) ** 2, 0, None) ** 2 / noise**2
+        # Normal equations; the walls are eliminated one by one (Schur complement).
+        info_wall = _sum_groups(wall, weight[:, None, None] * d_wall[:, :, None] * d_wall[:, None, :], walls)
+        info_wall = info_wall + prior * np.eye(2)
+        coupling = _sum_groups(wall, weight[:, None, None] * d_wall[:, :, None] * d_offset[:, None, :], walls)
+        gradient_wall = _sum_groups(wall, (weight * residual)[:, None] * d_wall, walls)
+        wall_cov = np.linalg.inv(info_wall)
+        information = d_offset.T @ (weight[:, None] * d_offset) + prior * np.eye(sensors)
+        information = information - np.einsum("wik,wij,wjl->kl", coupling, wall_cov, coupling)
+        gradient = d_offset.T @ (weight * residual) - np.einsum("wik,wij,wj->k", coupling, wall_cov, gradient_wall)
+        offset, error = remove_gauge_freedom(np.linalg.solve(information, gradient), information, has_echoes)
+        correction = np.einsum("wij,wj->wi", wall_cov, gradient_wall - np.einsum("wik,k->wi", coupling, offset))
+    left = residual - (d_wall * correction[wall]).sum(axis=1) - (offset[tx] + offset[rx]) / 2
+    leverage = weight * np.einsum("ei,eij,ej->e", d_wall, wall_cov[wall], d_wall)
+    left = left / np.maximum(1 - leverage, 0.1)
+    enough = np.bincount(tx, minlength=sensors) + np.bincount(rx, minlength=sensors) * 1 >= settings.min_echoes
     offset, error = (np.where(enough, values, np.nan) for values in (offset, error))
-    return Offsets(offset, error, noise if len(row) else np.nan, row, left)
+    return OffsetEstimate(offset, error, noise if len(row) else np.nan, row, left)
 
 
-def without_gauge(offset: np.ndarray, held: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets that are the same for the echoes, with as few sensors off as can be, and their standard errors.
+def remove_gauge_freedom(
+    offset: Float[np.ndarray, " sensors"],
+    information: Float[np.ndarray, "sensors sensors"],
+    has_echoes: Bool[np.ndarray, " sensors"],
+) -> tuple[Float[np.ndarray, " sensors"], Float[np.ndarray, " sensors"]]:
+    """The equivalent offsets with the fewest sensors off, and their standard errors.
 
-    Walls move with offsets that change slowly from sensor to sensor (all the same; a ring moved aside), so that the
-    echoes cannot tell these apart.
+    Corrections of the walls can absorb offsets that vary slowly from sensor to sensor (a common offset; a translation
+    of the ring). The echoes cannot determine these, so the sparsest solution (L1 norm) is chosen.
+
+    Args:
+        offset: offsets, metres.
+        information: their information matrix.
+        has_echoes: sensors with echoes.
     """
-    information, mode = np.linalg.eigh(held)
-    vague = information < 0.03 * np.median(information)
-    vague[0] = True
-    free = mode[:, vague]
-    weight = seen.astype(np.float64)
+    settings = SETTINGS.offsets
+    eigenvalue, mode = np.linalg.eigh(information)
+    unobservable = eigenvalue < settings.weak_information * np.median(eigenvalue)
+    unobservable[0] = True
+    free = mode[:, unobservable]
+    weight = has_echoes.astype(np.float64)
     project = np.eye(len(offset))
-    for _ in range(30):
+    for _ in range(settings.sparsity_iterations):
         normal = free.T @ (weight[:, None] * free) + 1e-9 * np.eye(free.shape[1])
         project = np.eye(len(offset)) - free @ np.linalg.solve(normal, (free * weight[:, None]).T)
-        weight = seen / np.sqrt((project @ offset) ** 2 + 0.0005**2) * 0.0005
-    certain = mode[:, ~vague] / np.sqrt(information[~vague])
-    return project @ offset, np.linalg.norm(project @ certain, axis=1)
+        scale = settings.sparsity_scale
+        weight = has_echoes / np.sqrt((project @ offset) ** 2 + scale**2) * scale
+    observable = mode[:, ~unobservable] / np.sqrt(eigenvalue[~unobservable])
+    return project @ offset, np.linalg.norm(project @ observable, axis=1)
 
 
-def _summed(group: np.ndarray, values: np.ndarray, groups: int) -> np.ndarray:
+def _sum_groups(group: np.ndarray, values: np.ndarray, groups: int) -> np.ndarray:
     flat = values.reshape(len(values), -1)
     total = np.stack([np.bincount(group, column, minlength=groups) for column in flat.T], axis=-1)
     return total.reshape(groups, *values.shape[1:])

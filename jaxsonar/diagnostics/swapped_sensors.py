@@ -1,4 +1,4 @@
-"""Sensors that seem to sit in each other's places: their echoes fit better where another one is."""
+"""Exchanged sensors: their echoes are more likely at the position of another sensor."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -8,113 +8,125 @@ from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from jaxsonar import kernels
-from jaxsonar.diagnostics.reference_scene import BLOCK, Scene, evenly, noise_of, outlook_of, scene_of_scans, thinned
+from jaxsonar.diagnostics.reference_scene import (
+    ReferenceScene,
+    evenly_spaced,
+    predict_reports,
+    scene_from_scans,
+    select_scans,
+)
+from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
-DOUBT = 0.25
-"""Of the nats for a sensor where it is numbered, which do not count while exchanges are looked for."""
-EXCHANGE = 30.0
-"""Nats that an exchange must gain, and be ahead of others."""
-MOST_SCANS = 100
-"""Of longer logs so many scans are tried with sensors exchanged, evenly spread over it."""
-_BLUR = 0.002  # m; errors of walls and sensors, beside noise, that must not look like exchanged sensors
 
-
-class _Trial(NamedTuple):
-    """A numbering, and what it makes of the log."""
+class _Hypothesis(NamedTuple):
+    """A permutation of the sensors, and the log-likelihoods under it."""
 
     place: Int[np.ndarray, " sensors"]
-    likeness: Float[np.ndarray, "sensors sensors"]
+    """Position of the ring at which each sensor is assumed to be."""
+    log_likelihood: Float[np.ndarray, "sensors sensors"]
+    """Of the echoes of each sensor (row) at each position (column), with the walls found under this hypothesis."""
 
     @property
-    def nats(self) -> float:
-        return float(np.trace(self.likeness))
+    def total(self) -> float:
+        """Log-likelihood of the hypothesis."""
+        return float(np.trace(self.log_likelihood))
 
     @property
     def moved(self) -> set[int]:
-        """Sensors that are not where they are numbered."""
+        """Sensors that are not at their own position."""
         return set(np.flatnonzero(self.place != np.arange(len(self.place))).tolist())
 
 
-def exchanged(ring: Ring, log: Log, scene: Scene, *, sigma: float | None) -> Int[np.ndarray, " sensors"]:
-    """Which sensor of the ring each one seems to be: itself, or where it is not certain.
+def find_exchanged_sensors(
+    ring: Ring, log: Log, scene: ReferenceScene, *, sigma: float | None
+) -> Int[np.ndarray, " sensors"]:
+    """The position of the ring at which each sensor seems to be; its own position where that is not certain.
 
     Args:
-        ring: as it should be.
-        log: as it was numbered.
-        scene: of this log.
-        sigma: standard deviation of the ranges, metres; estimated if None.
+        ring: the ring as it should be.
+        log: the log with its original sensor numbers.
+        scene: reference reflectors of this log.
+        sigma: standard deviation of the ranges, metres; None estimates it.
     """
-    rows = evenly(len(log), MOST_SCANS)
-    log, scene = thinned(log, rows), scene.at(rows)
+    rows = evenly_spaced(len(log), SETTINGS.swaps.max_scans)
+    log, scene = select_scans(log, rows), scene.at(rows)
 
-    def tried(place: Int[np.ndarray, " sensors"]) -> _Trial:
-        # The walls are found once more: they no longer suffer if this is where the sensors are.
-        renamed = replace(log, tx=place[log.tx], rx=place[log.rx])
-        anew = scene if scene.fixed else scene_of_scans(ring, renamed, sigma, None)
-        return _Trial(place, likeness(ring, anew, renamed))
+    def evaluate(place: Int[np.ndarray, " sensors"]) -> _Hypothesis:
+        # Detect the walls again with the exchanged numbers: they improve if the hypothesis is right.
+        renumbered = replace(log, tx=place[log.tx], rx=place[log.rx])
+        improved = scene if scene.from_map else scene_from_scans(ring, renumbered, sigma, None)
+        return _Hypothesis(place, position_log_likelihood(ring, improved, renumbered))
 
-    now = _Trial(np.arange(ring.count), likeness(ring, scene, log))
-    for _ in range(3):
-        trials = [now, *(tried(found[now.place]) for found in _candidates(now.likeness))]
-        best = max(trials, key=lambda trial: trial.nats)
-        rivals = [trial for trial in trials if trial is now or not trial.moved & best.moved]
-        if best is now or any(best.nats < rival.nats + EXCHANGE for rival in rivals):
+    current = _Hypothesis(np.arange(ring.count), position_log_likelihood(ring, scene, log))
+    for _ in range(SETTINGS.swaps.iterations):
+        proposals = _propose_exchanges(current.log_likelihood)
+        hypotheses = [current, *(evaluate(found[current.place]) for found in proposals)]
+        best = max(hypotheses, key=lambda hypothesis: hypothesis.total)
+        # The best one must beat the present numbering, and every exchange of other sensors.
+        rivals = [other for other in hypotheses if other is current or not other.moved & best.moved]
+        if best is current or any(best.total < rival.total + SETTINGS.swaps.min_gain for rival in rivals):
             break
-        now = best
-    return now.place
+        current = best
+    return current.place
 
 
-def _candidates(likeness: Float[np.ndarray, "sensors sensors"]) -> list[Int[np.ndarray, " sensors"]]:
-    """Numberings worth a trial, none if every sensor is most like itself; generous, since walls suffer from exchanges.
+def _propose_exchanges(log_likelihood: Float[np.ndarray, "sensors sensors"]) -> list[Int[np.ndarray, " sensors"]]:
+    """Permutations worth an evaluation; none if every sensor fits its own position best.
 
-    All sensors where they fit best, the best exchange of two, and its neighbors about the same axis: a wall that few
-    sensors see squarely is hardly told from its mirror image, and with it (4, 8) from (5, 7).
+    These are the assignment with the largest log-likelihood, the best exchange of two sensors, and its two neighbors
+    about the same axis. A wall that few sensors face at a right angle is hard to distinguish from its mirror image,
+    and then, for example, (4, 8) from (5, 7).
     """
-    count, own = len(likeness), np.diag(likeness)
-    nats = likeness - np.diag(DOUBT * np.maximum(own, 0)) + np.eye(count)
-    best = linear_sum_assignment(-nats)[1]
+    count, own = len(log_likelihood), np.diag(log_likelihood)
+    # Prefer other positions slightly, because exchanged sensors spoil the walls.
+    discounted = log_likelihood - np.diag(SETTINGS.swaps.discount * np.maximum(own, 0)) + np.eye(count)
+    best = linear_sum_assignment(-discounted)[1]
     if (best == np.arange(count)).all():
         return []
-    gain = likeness + likeness.T - own - own[:, None]
+    gain = log_likelihood + log_likelihood.T - own - own[:, None]
     a, b = np.unravel_index(np.where(np.eye(count, dtype=bool), -np.inf, gain).argmax(), gain.shape)
-    found = {tuple(best.tolist())}
+    proposals = {tuple(best.tolist())}
     for step in (0, 1, -1):
         pair = (a + step) % count, (b - step) % count
         place = np.arange(count)
         place[[*pair]] = pair[::-1]
-        found.add(tuple(place.tolist()))
-    return [np.array(place) for place in sorted(found) if place != tuple(range(count))]
+        proposals.add(tuple(place.tolist()))
+    return [np.array(place) for place in sorted(proposals) if place != tuple(range(count))]
 
 
-def likeness(ring: Ring, scene: Scene, log: Log) -> Float[np.ndarray, "sensors sensors"]:
-    """Nats (sensor, place), above clutter, of the echoes of each sensor if it were the one at that place.
+def position_log_likelihood(ring: Ring, scene: ReferenceScene, log: Log) -> Float[np.ndarray, "sensors sensors"]:
+    """Log-likelihood ratio to clutter of the echoes of each sensor (row) at each position (column), nats.
 
-    The other end of a cross echo is taken to be right; a pair that the ring does not listen to gives no echo.
+    The other sensor of a cross echo is assumed to be at its own position. Pairs that the ring does not listen to give
+    no echoes.
     """
-    expected = kernels.DetectionSettings()
-    everyone = replace(ring, neighbors=ring.count // 2)
-    listens = ring.path_index[tuple(everyone.paths.T)] >= 0
-    blur = float(np.hypot(noise_of(scene), _BLUR))
-    row, places = everyone.path_index, np.arange(ring.count)
-    nats = np.zeros((ring.count, ring.count))
-    for first in range(0, len(log), BLOCK):
-        block = slice(first, min(first + BLOCK, len(log)))
-        if not scene.solid[block].any():
+    detector = kernels.DetectionSettings()
+    all_pairs = replace(ring, neighbors=ring.count // 2)
+    listens = ring.path_index[tuple(all_pairs.paths.T)] >= 0
+    sigma = float(np.hypot(scene.noise(default=SETTINGS.reference.default_sigma), SETTINGS.swaps.extra_sigma))
+    path_of, positions = all_pairs.path_index, np.arange(ring.count)
+    odds = detector.detection_probability / detector.clutter_density
+    log_likelihood = np.zeros((ring.count, ring.count))
+    size = SETTINGS.reference.block_scans
+    for first in range(0, len(log), size):
+        block = slice(first, min(first + size, len(log)))
+        if not scene.is_wall[block].any():
             continue
-        seen, wanted = outlook_of(everyone, scene, block)
-        share = seen.visibility * listens
+        predicted, expected = predict_reports(all_pairs, scene, block)
+        visibility = predicted.visibility * listens
         of = slice(int(log.start[block.start]), int(log.start[block.stop]))
         scan, tx, rx, reported = log.echo_scan[of] - first, log.tx[of], log.rx[of], log.range[of]
         direct, cross = np.flatnonzero(tx == rx), np.flatnonzero(tx != rx)
+        # Echoes, the sensor that is judged, and the path that they would have with that sensor at each position.
         for echo, sensor, paths in (
-            (direct, tx[direct], np.broadcast_to(row[places, places], (len(direct), ring.count))),
-            (cross, tx[cross], row[:, rx[cross]].T),
-            (cross, rx[cross], row[tx[cross], :]),
+            (direct, tx[direct], np.broadcast_to(path_of[positions, positions], (len(direct), ring.count))),
+            (cross, tx[cross], path_of[:, rx[cross]].T),
+            (cross, rx[cross], path_of[tx[cross], :]),
         ):
-            where = (scan[echo, None, None], np.arange(share.shape[1])[:, None], paths[:, None, :])
-            away = (reported[echo, None, None] - wanted[where]) / blur
-            rate = (share[where] * np.exp(-0.5 * away**2) / (blur * np.sqrt(2 * np.pi))).sum(axis=1)
-            np.add.at(nats, sensor, np.log1p(expected.detection_probability / expected.clutter_density * rate))
-    return nats
+            index = (scan[echo, None, None], np.arange(visibility.shape[1])[:, None], paths[:, None, :])
+            normalized = (reported[echo, None, None] - expected[index]) / sigma
+            density = (visibility[index] * np.exp(-0.5 * normalized**2) / (sigma * np.sqrt(2 * np.pi))).sum(axis=1)
+            np.add.at(log_likelihood, sensor, np.log1p(odds * density))
+    return log_likelihood

@@ -9,16 +9,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
-from jaxsonar.diagnostics.beam_width import curve_share
+from jaxsonar.diagnostics.beam_width import detection_probability
 from jaxsonar.diagnostics.health_report import Health
-from jaxsonar.reports.plot_style import CROSS, DIRECT, FAINT, LINE, ROBOT, styled
+from jaxsonar.reports.plot_style import CROSS_COLOR, DIRECT_COLOR, FAINT_COLOR, LINE_COLOR, ROBOT_COLOR, figure_style
 
 _LINES = 7  # of findings on the page
 
 
 def health_figure(health: Health) -> Figure:
     """Residuals and echoes of each sensor, share heard by the angle off the axis, and the ring; findings below."""
-    with styled():
+    with figure_style():
         figure = Figure(figsize=(11.0, 8.2), layout="constrained")
         grid = figure.add_gridspec(3, 2, width_ratios=(1.75, 1), height_ratios=(1, 1, 0.42))
         residuals, ring = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
@@ -40,32 +40,32 @@ def _draw_residuals(axes: Axes, health: Health) -> None:
     axes.set_title("Direct echoes against walls that the other echoes tell of")
     known = np.flatnonzero(np.isfinite(health.median))
     low, first, third, high = 1e3 * health.quartiles[known].T
-    axes.axhline(0, color=FAINT, lw=1, zorder=0)
-    axes.vlines(known, low, high, color=DIRECT, lw=1, alpha=0.5)
-    axes.vlines(known, first, third, color=DIRECT, lw=5, alpha=0.5)
-    axes.plot(known, 1e3 * health.median[known], "_", color=DIRECT, ms=9, mew=2)
+    axes.axhline(0, color=FAINT_COLOR, lw=1, zorder=0)
+    axes.vlines(known, low, high, color=DIRECT_COLOR, lw=1, alpha=0.5)
+    axes.vlines(known, first, third, color=DIRECT_COLOR, lw=5, alpha=0.5)
+    axes.plot(known, 1e3 * health.median[known], "_", color=DIRECT_COLOR, ms=9, mew=2)
     sure = np.flatnonzero(np.isfinite(health.offset))
     axes.errorbar(
         sure + 0.3,
         1e3 * health.offset[sure],
         2e3 * health.offset_error[sure],
         fmt="o",
-        color=ROBOT,
+        color=ROBOT_COLOR,
         ms=3,
         lw=1,
         capsize=2,
     )
     bad = np.flatnonzero(["offset" in remark for remark in health.remarks])
-    axes.plot(bad + 0.3, 1e3 * health.offset[bad], "o", color=LINE, ms=6)
+    axes.plot(bad + 0.3, 1e3 * health.offset[bad], "o", color=LINE_COLOR, ms=6)
     axes.set_ylabel("reported – expected (mm)")
     axes.set_xlim(-0.7, health.ring.count - 0.1)
     axes.tick_params(labelbottom=False)
     handles = [
-        Line2D([], [], color=DIRECT, marker="_", ls="", ms=9, mew=2, label="median, quartiles, 5–95 %"),
-        Line2D([], [], color=ROBOT, marker="o", ms=3, lw=1, label="offset ± 2 standard errors"),
+        Line2D([], [], color=DIRECT_COLOR, marker="_", ls="", ms=9, mew=2, label="median, quartiles, 5–95 %"),
+        Line2D([], [], color=ROBOT_COLOR, marker="o", ms=3, lw=1, label="offset ± 2 standard errors"),
     ]
     if len(bad):
-        handles.append(Line2D([], [], color=LINE, marker="o", ls="", label="suspicious"))
+        handles.append(Line2D([], [], color=LINE_COLOR, marker="o", ls="", label="suspicious"))
     if len(known):
         reach = max(1.0, float(np.abs([low, high]).max()), float(np.nanmax(1e3 * np.abs(health.offset), initial=0)))
         axes.set_ylim(-1.1 * reach, 1.5 * reach)
@@ -77,8 +77,8 @@ def _draw_residuals(axes: Axes, health: Health) -> None:
 def _draw_share(axes: Axes, health: Health) -> None:
     axes.set_title("Share heard of what should be heard")
     columns = (
-        (DIRECT, "direct echoes", -0.27, health.expected[:, 0], health.heard[:, 0]),
-        (CROSS, "cross, as transmitter", 0.0, health.expected[:, 1], health.heard[:, 1]),
+        (DIRECT_COLOR, "direct echoes", -0.27, health.expected[:, 0], health.heard[:, 0]),
+        (CROSS_COLOR, "cross, as transmitter", 0.0, health.expected[:, 1], health.heard[:, 1]),
         ("#009E73", "cross, as receiver", 0.27, health.expected[:, 2], health.heard[:, 2]),
     )
     shown = [column for column in columns if column[3].any()]
@@ -94,7 +94,7 @@ def _draw_share(axes: Axes, health: Health) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(24, integer=True))
     for k, remark in enumerate(health.remarks):
         if remark:
-            axes.axvspan(k - 0.5, k + 0.5, color=LINE, alpha=0.12, lw=0)
+            axes.axvspan(k - 0.5, k + 0.5, color=LINE_COLOR, alpha=0.12, lw=0)
     if shown:
         axes.legend(loc="upper right", ncols=3, fontsize=8)
     else:
@@ -113,13 +113,13 @@ def _draw_cone(axes: Axes, health: Health) -> None:
     enough = health.asked >= 3
     share = 100 * health.answered / np.maximum(health.asked, 1)
     size = np.clip(4 * np.sqrt(health.asked / max(1, health.asked.max())), 1.5, None) ** 2
-    axes.scatter(middle[enough], share[enough], size[enough] * 1.6, color=DIRECT, label="walls heard, by angle")
+    axes.scatter(middle[enough], share[enough], size[enough] * 1.6, color=DIRECT_COLOR, label="walls heard, by angle")
     if np.isfinite(width):
         fine = np.linspace(-90, 90, 721)
-        axes.plot(fine, 100 * curve_share(health.curve, np.radians(fine)), color=LINE, lw=1.4, label="fitted")
+        axes.plot(fine, 100 * detection_probability(health.curve, np.radians(fine)), color=LINE_COLOR, lw=1.4, label="fitted")
     for side in (-1, 1):
         label = "nominal border" if side == 1 else None
-        axes.plot([side * nominal / 2] * 2, [0, 100], color=ROBOT, lw=1, ls=(0, (4, 3)), label=label)
+        axes.plot([side * nominal / 2] * 2, [0, 100], color=ROBOT_COLOR, lw=1, ls=(0, (4, 3)), label=label)
     axes.set_xlim(-90, 90)
     axes.set_ylim(0, 135)
     axes.xaxis.set_major_locator(MultipleLocator(30))
@@ -136,20 +136,20 @@ def _draw_ring(axes: Axes, health: Health) -> None:
     extent = max(0.1, float(np.abs(position).max()))
     for (x, y), direction, beam in zip(position, np.degrees(heading), np.degrees(np.asarray(ring.beam)), strict=True):
         axes.add_patch(
-            Wedge((x, y), 0.45 * extent, direction - beam / 2, direction + beam / 2, color=FAINT, alpha=0.25, lw=0)
+            Wedge((x, y), 0.45 * extent, direction - beam / 2, direction + beam / 2, color=FAINT_COLOR, alpha=0.25, lw=0)
         )
     bad = np.array([bool(remark) for remark in health.remarks])
-    axes.plot(*position[~bad].T, "o", color=ROBOT, ms=4)
-    axes.plot(*position[bad].T, "o", color=LINE, ms=8)
+    axes.plot(*position[~bad].T, "o", color=ROBOT_COLOR, ms=4)
+    axes.plot(*position[bad].T, "o", color=LINE_COLOR, ms=8)
     inward = position - 0.16 * extent * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     for k, (x, y) in enumerate(inward):
-        weight, colour = ("bold", LINE) if bad[k] else ("normal", ROBOT)
+        weight, colour = ("bold", LINE_COLOR) if bad[k] else ("normal", ROBOT_COLOR)
         axes.text(x, y, str(k), ha="center", va="center", fontsize=7, color=colour, fontweight=weight)
     axes.annotate(
         "",
         xy=(0.35 * extent, 0),
         xytext=(0, 0),
-        arrowprops={"arrowstyle": "-|>", "color": ROBOT},
+        arrowprops={"arrowstyle": "-|>", "color": ROBOT_COLOR},
         annotation_clip=False,
     )
     axes.set_aspect("equal")
@@ -170,9 +170,9 @@ def _write(axes: Axes, health: Health) -> None:
     lines = [line for word in words if word for line in textwrap.wrap(f"• {word}", 150, subsequent_indent="   ")]
     if len(lines) > _LINES:
         lines = [*lines[: _LINES - 1], f"… and more: {len(health.findings)} findings in all"]
-    colour = LINE if health.findings else ROBOT
+    colour = LINE_COLOR if health.findings else ROBOT_COLOR
     axes.text(0, 1, "\n".join(lines), va="top", fontsize=9, color=colour, parse_math=False, transform=axes.transAxes)
 
 
 def _nothing(axes: Axes) -> None:
-    axes.text(0.5, 0.5, "too little to tell", transform=axes.transAxes, ha="center", va="center", color=ROBOT)
+    axes.text(0.5, 0.5, "too little to tell", transform=axes.transAxes, ha="center", va="center", color=ROBOT_COLOR)

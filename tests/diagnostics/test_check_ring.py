@@ -11,11 +11,11 @@ import pytest
 from rich.console import Console
 
 from jaxsonar import Log, Ring, SonarError, random_pose, random_room, simulate
-from jaxsonar.diagnostics.beam_width import CENTRES, curve_share, each_cone, fitted_cone
+from jaxsonar.diagnostics.beam_width import BIN_CENTRES, detection_probability, fit_cone, fit_each_cone
 from jaxsonar.diagnostics.check_ring import check
-from jaxsonar.diagnostics.range_offsets import without_gauge
+from jaxsonar.diagnostics.range_offsets import remove_gauge_freedom
 from jaxsonar.kernels.measurement_model import predict_all_echoes
-from jaxsonar.reports import plot_style as figures
+from jaxsonar.reports import plot_style
 from jaxsonar.reports.plot_health import health_figure
 from jaxsonar.reports.terminal_tables_health import health_table
 from jaxsonar.simulation.office import load_office
@@ -168,7 +168,7 @@ def test_no_echo_and_no_wall_say_why(log, rng):
     assert "within the maximum range, 2 m: are ranges half path lengths in metres?" in far.empty
     fullest = only(log, log.echo_scan == np.bincount(log.echo_scan).argmax())
     few = check(RING, dataclasses.replace(fullest, range=rng.uniform(0.3, 2, len(fullest.range))))
-    assert few.empty.startswith("single scans carry too few walls")
+    assert few.empty.startswith("single scans show too few walls")
     assert few.source == ""
     assert few.walls == 0
     for found in (silent, far, few):
@@ -206,7 +206,7 @@ def test_json_table_and_figure(healthy, tmp_path):
     with open(tmp_path / "table.txt", "w", encoding="utf-8") as file:
         Console(file=file, width=160).print(health_table(healthy))
     assert "Health of ring" in (tmp_path / "table.txt").read_text(encoding="utf-8")
-    figures.save(health_figure(healthy), tmp_path / "health.svg")
+    plot_style.save_figure(health_figure(healthy), tmp_path / "health.svg")
     assert (tmp_path / "health.svg").stat().st_size > 10_000
 
 
@@ -235,20 +235,20 @@ def test_predicted_echoes_are_those_of_the_image_source(rng):
 @pytest.mark.parametrize("half", [10.0, 25.0, 45.0])
 def test_cones_are_found_in_drawn_sightings(rng, half):
     truth = np.array([np.radians(half), np.radians(2), 0.85, 0.03])
-    asked = np.full(len(CENTRES), 60)
-    answered = rng.binomial(asked, curve_share(truth, CENTRES))
-    curve, error = fitted_cone(asked, answered)
+    asked = np.full(len(BIN_CENTRES), 60)
+    answered = rng.binomial(asked, detection_probability(truth, BIN_CENTRES))
+    curve, error = fit_cone(asked, answered)
     assert abs(curve[0] - truth[0]) < 4 * error
     assert error < np.radians(1)
-    assert np.isnan(fitted_cone(asked // 60, answered // 60)[1])
+    assert np.isnan(fit_cone(asked // 60, answered // 60)[1])
 
 
 def test_a_cone_that_looks_aside_is_found(rng):
     truth = np.array([np.radians(30), np.radians(2), 0.9, 0.02])
-    asked = np.full((3, len(CENTRES)), 5)
+    asked = np.full((3, len(BIN_CENTRES)), 5)
     turn = np.radians([0.0, 12.0, -9.0])[:, None]
-    answered = rng.binomial(asked, curve_share(truth, CENTRES - turn))
-    half, centre = each_cone(asked, answered, truth)
+    answered = rng.binomial(asked, detection_probability(truth, BIN_CENTRES - turn))
+    half, centre = fit_each_cone(asked, answered, truth)
     assert (np.abs(centre[:, 0] - turn[:, 0]) < 4 * centre[:, 1]).all()
     assert (np.abs(half[:, 0] - truth[0]) < 4 * half[:, 1]).all()
 
@@ -261,6 +261,6 @@ def test_offsets_lose_what_walls_can_absorb():
     held = frame @ np.diag(np.r_[np.full(3, 1e2), np.full(21, 1e6)]) @ frame.T
     sparse = np.zeros(24)
     sparse[5] = 0.008
-    offset, error = without_gauge(sparse + modes @ np.array([0.02, -0.01, 0.005]), held, np.ones(24, bool))
+    offset, error = remove_gauge_freedom(sparse + modes @ np.array([0.02, -0.01, 0.005]), held, np.ones(24, bool))
     np.testing.assert_allclose(offset, sparse, atol=3e-4)
     assert (error < 2e-3).all()

@@ -47,7 +47,7 @@ def near(one, two, tolerance, *, extent=None):
     across = np.abs(((one.centre - two.centre) * one.normal).sum(-1))
     assert turn.max() < tolerance
     assert across.max() < tolerance
-    assert np.abs(one.endpoints - two.endpoints).max() < (tolerance if ends is None else ends)
+    assert np.abs(one.endpoints - two.endpoints).max() < (tolerance if extent is None else extent)
     for name in ("info_offset", "info_theta", "chi_squared", "viewing_distance", "last_seen"):
         assert getattr(one, name) == pytest.approx(getattr(two, name), rel=tolerance, abs=tolerance), name
     assert one.count.tolist() == two.count.tolist()

@@ -1,0 +1,176 @@
+"""Numeric settings of the health check. Unless a field says otherwise, its value was chosen by hand on simulations."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class ReferenceSettings:
+    """Reference walls, and the comparison of echoes with them."""
+
+    max_scans: int = 1000
+    """Number of scans that are analysed; longer logs are sampled evenly."""
+    block_scans: int = 32
+    """Scans per compiled step."""
+    window: float = 1.5
+    """Length of trajectory gathered into one local model where single scans show too few walls, metres."""
+    min_echoes: int = 3
+    """Echoes that support a reference wall, and sensors that took part in them."""
+    min_walls: int = 5
+    """Number of reference walls below which single scans are not used. One wall per ten scans is needed, too."""
+    map_walls: int = 10
+    """Number of walls of a map that each scan is compared with, the nearest ones."""
+    map_distance: float = 0.5
+    """Walls of a map farther than the maximum range by more than this are left out, metres."""
+    default_sigma: float = 0.01
+    """Standard deviation of the ranges where it is unknown, metres."""
+    min_sigma: float = 1e-4
+    """Lower limit of the noise where it is unknown, metres."""
+    end_margin: float = 0.25
+    """Length that a wall is assumed to extend beyond its outermost footpoints, unless another wall ends it, metres."""
+    range_margin: float = 0.02
+    """Predicted echoes this close to the maximum range are left out, metres. Also the depth behind another wall from
+    which on a point of reflection is occluded."""
+    min_wall_angle: float = 0.1
+    """A wall occludes only walls whose direction differs by more than this, radians."""
+
+
+@dataclass(frozen=True)
+class DetectionCheckSettings:
+    """Which expected echoes were detected."""
+
+    min_independent_echoes: int = 3
+    """Echoes that must support a wall besides those of the sensor that is judged."""
+    blanking: float = 0.06
+    """Distance behind an echo in which another echo may be missed, metres."""
+    gate: float = 4.0
+    """An echo within this many standard deviations of the expected range is a detection."""
+    gate_margin: float = 0.003
+    """Added to the gate, metres."""
+    explained_gate: float = 3.0
+    """An echo within this many standard deviations of a reflector is explained by it."""
+    explained_margin: float = 0.002
+    """Added to that gate, metres."""
+    default_sigma: float = 0.005
+    """Standard deviation of the ranges where it could not be estimated, metres."""
+    min_visibility: float = 0.95
+    """Visibility from which on a wall is well inside both cones."""
+    max_beyond_end: float = 0.01
+    """Largest distance of such a point of reflection from the wall's ends, metres."""
+    min_residuals: int = 5
+    """Number of residuals needed for their median and scatter."""
+
+
+@dataclass(frozen=True)
+class OffsetSettings:
+    """Estimation of range offsets."""
+
+    gate: float = 0.1
+    """An echo farther than this from the expected range of a wall does not come from it, metres."""
+    min_visibility: float = 0.2
+    """Least visibility of a wall whose echo is used."""
+    iterations: int = 12
+    """Iterations of the reweighted least squares."""
+    initial_noise: float = 0.01
+    """Standard deviation of the residuals before the first iteration, metres."""
+    tukey: float = 4.685
+    """Tuning constant of Tukey's biweight, standard deviations: 95 % efficiency for normally distributed errors."""
+    prior_information: float = 400.0
+    """Inverse variance of the prior of offsets and walls: 50 mm, 0.05 rad."""
+    min_echoes: int = 16
+    """Echoes (direct ones count twice) that the offset of a sensor needs."""
+    weak_information: float = 0.03
+    """Directions with less than this fraction of the median information are not observable."""
+    sparsity_scale: float = 0.0005
+    """Offsets below this are treated as zero when the sparsest solution is sought, metres."""
+    sparsity_iterations: int = 30
+    """Iterations of that search (iteratively reweighted least squares)."""
+
+
+@dataclass(frozen=True)
+class SwapSettings:
+    """Search for exchanged sensors."""
+
+    max_scans: int = 100
+    """Number of scans that are analysed; longer logs are sampled evenly."""
+    iterations: int = 3
+    """Largest number of successive exchanges."""
+    discount: float = 0.25
+    """Fraction of the log-likelihood of a sensor at its own position that does not count in the search for candidates;
+    exchanged sensors spoil the walls, which favors their wrong positions."""
+    min_gain: float = 30.0
+    """Log-likelihood ratio that an exchange must reach, also against rival exchanges, nats."""
+    extra_sigma: float = 0.002
+    """Errors of walls and sensor positions, added to the noise in quadrature, metres; they must not look like an
+    exchange."""
+
+
+@dataclass(frozen=True)
+class ConeSettings:
+    """Measurement of the detection cones."""
+
+    bin_width: float = float(np.radians(2.5))
+    """Width of a bin of off-axis angles, radians."""
+    bins: int = 72
+    """Number of bins, from -90 to 90 degrees."""
+    min_expected: int = 100
+    """Expected echoes that the fit of the common cone needs."""
+    min_detected: int = 30
+    """Detected echoes that it needs."""
+    min_per_side: int = 20
+    """Expected echoes that it needs inside, and outside of the border."""
+    max_error: float = float(np.radians(4.0))
+    """Largest standard deviation of a width or direction that is reported, radians."""
+    min_expected_each: int = 40
+    """Expected echoes that the cone of a single sensor needs."""
+    min_detected_each: int = 15
+    """Detected echoes that it needs."""
+
+
+@dataclass(frozen=True)
+class FindingSettings:
+    """Thresholds of the findings."""
+
+    min_offset: float = 0.002
+    """Smaller range offsets are never reported, metres."""
+    min_offset_from_map: float = 0.015
+    """The same if the walls come from a map, metres: pose errors and delays of a moving robot add to the residuals."""
+    min_explained: float = 0.3
+    """Fraction of echoes that reflectors must explain; below, the ring or the units are probably wrong."""
+    min_expected: int = 8
+    """Expected echoes that a detection rate needs."""
+    dead_rate: float = 0.15
+    """A sensor with less than this fraction of the usual detection rate is dead, deaf or mute."""
+    weak_rate: float = 0.6
+    """A sensor with less than this fraction of the usual detection rate is weak."""
+    min_repeats: float = 0.3
+    """Fraction of repeated ranges above which a sensor is stale; at least three times the usual fraction, too."""
+    min_constant: float = 0.25
+    """Fraction of identical ranges above which a sensor saturates; at least four times the usual fraction, too."""
+    min_turn_deg: float = 10.0
+    """Rotation of a sensor that is reported, degrees; at least four standard deviations, too."""
+    min_beam_deg: float = 5.0
+    """Deviation of the cone width that is reported, degrees; at least three standard deviations, too."""
+
+
+@dataclass(frozen=True)
+class DiagnosticsSettings:
+    """All settings of the health check."""
+
+    reference: ReferenceSettings = field(default_factory=ReferenceSettings)
+    """Reference walls."""
+    detection: DetectionCheckSettings = field(default_factory=DetectionCheckSettings)
+    """Which expected echoes were detected."""
+    offsets: OffsetSettings = field(default_factory=OffsetSettings)
+    """Range offsets."""
+    swaps: SwapSettings = field(default_factory=SwapSettings)
+    """Exchanged sensors."""
+    cones: ConeSettings = field(default_factory=ConeSettings)
+    """Detection cones."""
+    findings: FindingSettings = field(default_factory=FindingSettings)
+    """Findings."""
+
+
+SETTINGS = DiagnosticsSettings()
+"""The settings in use."""
