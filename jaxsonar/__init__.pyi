@@ -1,7 +1,7 @@
 from .batch_jobs.run_batch import BatchReport as BatchReport
 from .batch_jobs.run_batch import batch as batch
 from .calibration.autofocus import autofocus_ring as autofocus_ring
-from .calibration.calibrate import Calibration as Calibration
+from .calibration.calibration_result import Calibration as Calibration
 from .calibration.calibrate import calibrate as calibrate
 from .calibration.calibration_toml import save_calibration as save_calibration
 from .detection.extract import extract_lines as extract_lines
@@ -14,11 +14,11 @@ from .diagnostics.check_ring import Health as Health
 from .diagnostics.check_ring import check as check
 from .estimation.odometry_noise import OdometryNoise as OdometryNoise
 from .estimation.trajectory import Trajectory as Trajectory
-from .estimation.trajectory import errors as errors
 from .estimation.trajectory import load_trajectory as load_trajectory
 from .estimation.trajectory import save_trajectory as save_trajectory
 from .evaluation.map_accuracy import Evaluation as Evaluation
 from .evaluation.map_accuracy import evaluate as evaluate
+from .evaluation.trajectory_errors import trajectory_errors as trajectory_errors
 from .floor_plans.room import Room as Room
 from .floor_plans.room_geojson import load_room as load_room
 from .floor_plans.room_geojson import save_room as save_room
@@ -32,7 +32,7 @@ from .hardware.errors import SonarError as SonarError
 from .kernels.hough_accumulator import HoughSettings as HoughSettings
 from .live.live_map import LiveMap as LiveMap
 from .live.live_map import LiveScan as LiveScan
-from .live.stream import Status as Status
+from .live.status import Status as Status
 from .live.stream import stream as stream
 from .localization.localize import Localized as Localized
 from .localization.localize import localize as localize
@@ -51,5 +51,5 @@ from .simulation.random_rooms import random_pose as random_pose
 from .simulation.random_rooms import random_room as random_room
 from .simulation.simulator import Simulation as Simulation
 from .simulation.simulator import simulate as simulate
-from .smoothing.smoother import Smoothed as Smoothed
-from .smoothing.smoother import smooth as smooth
+from .smoothing.smooth_log import Smoothed as Smoothed
+from .smoothing.smooth_log import smooth as smooth

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import numpy as np
 
-    from jaxsonar.estimation.trajectory import Trajectory, TrajectoryErrors
+    from jaxsonar.estimation.trajectory import Trajectory
+    from jaxsonar.evaluation.trajectory_errors import TrajectoryErrors
     from jaxsonar.graph_slam.slam import Slam
     from jaxsonar.scans.scan_log import Log
 
@@ -57,7 +58,8 @@ def run(options: argparse.Namespace) -> None:
     """``jaxsonar slam``."""
     import numpy as np
 
-    from jaxsonar.estimation.trajectory import errors, load_trajectory, save_trajectory
+    from jaxsonar.estimation.trajectory import load_trajectory, save_trajectory
+    from jaxsonar.evaluation.trajectory_errors import trajectory_errors
     from jaxsonar.fileio.atomic_files import check_outputs, open_output, shown
     from jaxsonar.graph_slam.slam import slam as run_slam
     from jaxsonar.hardware.errors import SonarError
@@ -95,7 +97,9 @@ def run(options: argparse.Namespace) -> None:
 
     # Everything is made before anything is written.
     trajectory = found.trajectory
-    against = None if truth is None else _trajectory_errors(errors, trajectory, truth, found, str(options.truth))
+    against = (
+        None if truth is None else _trajectory_errors(trajectory_errors, trajectory, truth, found, str(options.truth))
+    )
     figure = None
     if options.figure:
         from jaxsonar.reports import plot_slam as figures_slam
@@ -155,23 +159,24 @@ def _check_truth(truth: "Trajectory", log: "Log", name: str, source: str) -> Non
     """Complain before the work about true poses that belong to no scan."""
     import numpy as np
 
-    from jaxsonar.estimation.trajectory import associated, stamps_of
+    from jaxsonar.estimation.trajectory import stamps_of
+    from jaxsonar.evaluation.trajectory_errors import associate_stamps
     from jaxsonar.fileio.atomic_files import shown
     from jaxsonar.hardware.errors import SonarError
 
     if not np.array_equal(stamps_of(log), log.stamp):
         raise SonarError(f"{shown(source)}: stamps are missing or do not rise; allowed with --truth are some that do")
-    if not len(associated(log.stamp, truth.stamp, tolerance=0.01)[0]):
+    if not len(associate_stamps(log.stamp, truth.stamp, tolerance=0.01)[0]):
         one, other = (f"{stamp.min():g} to {stamp.max():g} s" for stamp in (truth.stamp, log.stamp))
         raise SonarError(f"--truth {shown(name)}: stamps {one}, the log's are {other}; allowed are common ones")
 
 
 def _truth_in_estimate_frame(estimate: "Trajectory", truth: "Trajectory") -> "np.ndarray":
     """The truth in the frame of the estimate: their first common poses are one."""
-    from jaxsonar.estimation.trajectory import associated
+    from jaxsonar.evaluation.trajectory_errors import associate_stamps
     from jaxsonar.geometry.se2 import compose, inverse
 
-    mine, theirs = associated(estimate.stamp, truth.stamp, tolerance=0.01)
+    mine, theirs = associate_stamps(estimate.stamp, truth.stamp, tolerance=0.01)
     return compose(compose(estimate.poses[mine[0]], inverse(truth.poses[theirs[0]])), truth.poses)
 
 
@@ -191,7 +196,7 @@ def _as_json(found: "Slam", against: "dict[str, TrajectoryErrors | None] | None"
         "scans": len(found.poses),
         "left_out": found.left_out.tolist(),
         "closures": [
-            tie._asdict() | {"pose": tie.pose.tolist(), "determined": tie.determined.T.tolist()}
+            tie._asdict() | {"pose": tie.first_from_second.tolist(), "determined": tie.determined.T.tolist()}
             for tie in found.closures
         ],
     }

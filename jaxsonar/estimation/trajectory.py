@@ -6,13 +6,12 @@ TUM is what evo and its kin read: a line a pose, ``stamp x y z qx qy qz qw``, me
 import os
 import re
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.fileio.atomic_files import DECIMAL, open_output, read_bytes, shown
-from jaxsonar.geometry.se2 import composed, inverse, relative, rotation, to_world, wrap_angle
+from jaxsonar.geometry.se2 import compose, rotate_covariance, wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.scan_log import Log
 
@@ -23,7 +22,6 @@ NORM_WITHIN = 1e-3
 """How far the length of a quaternion may be from 1: a file of three digits still is one."""
 _NUMBER = re.compile(DECIMAL)
 
-Align = Literal["best", "first", "none"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,17 +64,16 @@ class Trajectory:
         )
 
     @property
-    def way(self) -> Float[np.ndarray, " poses"]:
+    def distance_traveled(self) -> Float[np.ndarray, " poses"]:
         """Metres driven up to each pose, 0 at the first."""
         steps = np.linalg.norm(np.diff(self.poses[:, :2], axis=0), axis=-1)
         return np.concatenate([np.zeros(min(len(self), 1)), np.cumsum(steps)])
 
-    def moved(self, new_from_world: Float[np.ndarray, "3"]) -> "Trajectory":
+    def transform(self, new_from_world: Float[np.ndarray, "3"]) -> "Trajectory":
         """The same in another frame."""
-        turn = np.eye(3)
-        turn[:2, :2] = rotation(float(new_from_world[2]))
-        covariance = None if self.covariance is None else turn @ self.covariance @ turn.T
-        return replace(self, poses=composed(new_from_world, self.poses), covariance=covariance)
+        angle = float(new_from_world[2])
+        covariance = None if self.covariance is None else rotate_covariance(angle, self.covariance)
+        return replace(self, poses=compose(new_from_world, self.poses), covariance=covariance)
 
 
 def stamps_of(log: Log) -> Float[np.ndarray, " scans"]:
@@ -142,149 +139,3 @@ def _numbers(fields: list[str], place: str) -> list[float]:
         if not (_NUMBER.fullmatch(field) and abs(float(field)) <= 1e18):  # 1e18: stamps in nanoseconds
             raise SonarError(f"{place}, {name}: {shown(field, 40)!r} came; allowed is a finite number")
     return [float(field) for field in fields]
-
-
-@dataclass(frozen=True)
-class TrajectoryErrors:
-    """How far an estimate is from the truth; root mean squares over the poses that both have."""
-
-    poses: int
-    """How many were compared."""
-    ate: float
-    """Absolute trajectory error: distance of the aligned positions, metres."""
-    ate_heading: float
-    """The same of the headings, radians."""
-    worst: float
-    """Largest distance of the aligned positions, metres."""
-    worst_heading: float
-    """Largest difference of the headings, radians."""
-    relative: float
-    """Relative pose error: how far a robot that was in the right place is from it one metre on, metres per metre;
-    NaN where the truth is shorter than that."""
-    relative_heading: float
-    """The same of the heading, radians per metre."""
-    nees: float
-    """Normalised squared error of the poses over its 3 degrees of freedom, the mean over them; 1 is right, more is
-    overconfident, infinite where a covariance is none. NaN where there is none. Neighboring poses share their errors:
-    of one run it is far from 1 by chance."""
-    truth_from_estimate: Float[np.ndarray, "3"]
-    """The alignment: x, y (m), theta (rad)."""
-
-
-def errors(
-    estimate: Trajectory, truth: Trajectory, *, align: Align = "best", tolerance: float = 0.01, way: float = 1.0
-) -> TrajectoryErrors:
-    """Absolute and relative errors of a trajectory.
-
-    Args:
-        estimate: what is judged; its covariance, if it has one, with respect to its first pose.
-        truth: what it should be.
-        align: "best": turned and shifted (not scaled) so that the squared distances of the positions are least
-            (Umeyama), as ``evo_ape --align`` does; "first": so that the first pose that both have is the same;
-            "none": as they are. NEES is of the poses with the first one in its place, since their covariances are; but
-            with "none" as they are.
-        tolerance: poses belong together whose stamps are each other's nearest and this near, seconds.
-        way: over which relative errors are taken, metres.
-
-    Raises:
-        SonarError: no pose of the two belongs to the other.
-    """
-    own, other = associated(estimate.stamp, truth.stamp, tolerance=tolerance)
-    if not len(own):
-        raise SonarError(f"errors: no two stamps within {tolerance:g} s; allowed are trajectories of the same time")
-    estimate, truth = estimate[own], truth[other]
-    truth_from_estimate = alignment(estimate.poses, truth.poses, align=align)
-    off = _difference(composed(truth_from_estimate, estimate.poses), truth.poses)
-    distance, turn = np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])
-    step, step_heading = _relative_errors(estimate.poses, truth, way)
-    return TrajectoryErrors(
-        poses=len(own),
-        ate=_rms(distance),
-        ate_heading=_rms(turn),
-        worst=float(distance.max()),
-        worst_heading=float(turn.max()),
-        relative=_rms(step),
-        relative_heading=_rms(step_heading),
-        nees=_nees(estimate, truth.poses, "none" if align == "none" else "first"),
-        truth_from_estimate=truth_from_estimate,
-    )
-
-
-def associated(
-    stamps: Float[np.ndarray, " a"], others: Float[np.ndarray, " b"], *, tolerance: float
-) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
-    """Rows of both that are each other's nearest in time, not further apart than ``tolerance`` (seconds)."""
-    if not (len(stamps) and len(others)):
-        return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
-    there, back = _nearest(stamps, others), _nearest(others, stamps)
-    own = np.arange(len(stamps))
-    kept = (back[there] == own) & (np.abs(stamps - others[there]) <= tolerance)
-    return own[kept], there[kept]
-
-
-def _nearest(stamps: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """For every stamp the row of the nearest of the others."""
-    order = np.argsort(others, kind="stable")
-    ordered = others[order]
-    after = np.clip(np.searchsorted(ordered, stamps), 0, len(others) - 1)
-    before = np.maximum(after - 1, 0)
-    nearer = np.abs(ordered[before] - stamps) < np.abs(ordered[after] - stamps)
-    return order[np.where(nearer, before, after)]
-
-
-def alignment(
-    poses: Float[np.ndarray, "poses 3"], onto: Float[np.ndarray, "poses 3"], *, align: Align = "best"
-) -> Float[np.ndarray, "3"]:
-    """onto_from_poses: the motion that brings poses onto those of another frame, row by row.
-
-    With "best" the positions decide; where they are all one place, the headings do.
-    """
-    if align == "none":
-        return np.zeros(3)
-    if align == "first":
-        return composed(onto[0], inverse(poses[0]))
-    middle, other = poses[:, :2].mean(axis=0), onto[:, :2].mean(axis=0)
-    a, b = poses[:, :2] - middle, onto[:, :2] - other
-    along, across = float((a * b).sum()), float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
-    if np.hypot(along, across) <= 1e-12 * max(1.0, float((other**2).sum())):
-        apart = onto[:, 2] - poses[:, 2]
-        along, across = float(np.cos(apart).sum()), float(np.sin(apart).sum())
-    turn = float(np.arctan2(across, along))
-    return np.append(other - to_world(np.array([0.0, 0.0, turn]), middle), turn)
-
-
-def _difference(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    off = poses - truth
-    off[:, 2] = wrap_angle(off[:, 2])
-    return off
-
-
-def _relative_errors(poses: np.ndarray, truth: Trajectory, way: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of every stretch of at least ``way`` metres, one from each pose that has so much before it: errors per metre."""
-    driven = truth.way
-    last = np.searchsorted(driven, driven + way)
-    first = np.flatnonzero(last < len(driven))
-    last = last[first]
-    off = relative(relative(truth.poses[first], truth.poses[last]), relative(poses[first], poses[last]))
-    length = driven[last] - driven[first]
-    return np.hypot(off[:, 0], off[:, 1]) / length, np.abs(off[:, 2]) / length
-
-
-def _nees(estimate: Trajectory, truth: np.ndarray, align: Align) -> float:
-    """Mean over the poses; those that are known (the first one, no covariance at all) say nothing."""
-    if estimate.covariance is None:
-        return np.nan
-    estimate_from_truth = alignment(truth, estimate.poses, align=align)
-    off = _difference(estimate.poses.copy(), composed(estimate_from_truth, truth))
-    unknown = np.abs(estimate.covariance).reshape(len(estimate), 9).max(axis=1) > 1e-18
-    unknown[0] &= align == "none"
-    if not unknown.any():
-        return np.nan
-    off, covariance = off[unknown], estimate.covariance[unknown]
-    if np.linalg.eigvalsh(covariance)[:, 0].min() <= 0:
-        return np.inf
-    return float((off * np.linalg.solve(covariance, off[..., None])[..., 0]).sum(-1).mean() / 3)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan

@@ -8,7 +8,8 @@ import pytest
 from support.slam_scene import COUNT, RING, ROOM, SIGMA, SLIP, log, truth
 
 from jaxsonar import SonarError, local_models, simulate
-from jaxsonar.estimation.trajectory import Trajectory, errors
+from jaxsonar.estimation.trajectory import Trajectory
+from jaxsonar.evaluation.trajectory_errors import trajectory_errors
 from jaxsonar.geometry.se2 import compose, relative
 from jaxsonar.graph_slam.incremental_mapper import Mapper
 from jaxsonar.graph_slam.slam import Slam, slam
@@ -35,8 +36,8 @@ def tracked():
 def assert_near(found, *, share):
     """Errors are at most this share of odometry's, and as large as is said."""
     real = Trajectory(found.stamp, truth())
-    own = errors(found, real, align="first")
-    wheels = errors(Trajectory(found.stamp, np.array(log().pose)), real, align="first")
+    own = trajectory_errors(found, real, align="first")
+    wheels = trajectory_errors(Trajectory(found.stamp, np.array(log().pose)), real, align="first")
     assert own.ate < share * wheels.ate
     assert own.ate_heading < 0.5 * wheels.ate_heading
     assert 0.05 < own.nees < 4.0
@@ -97,7 +98,7 @@ def test_without_odometry_scans_are_placed_by_what_they_see():
     first, *rest = np.flatnonzero(known)
     np.testing.assert_allclose(found.covariance[first], 0, atol=1e-8)
     assert (np.linalg.eigvalsh(found.covariance[rest]) > 0).all()
-    own = errors(Trajectory(found.stamp[known], found.poses[known]), Trajectory(found.stamp, truth()[:16]))
+    own = trajectory_errors(Trajectory(found.stamp[known], found.poses[known]), Trajectory(found.stamp, truth()[:16]))
     assert own.ate < 0.1
 
 
@@ -112,7 +113,7 @@ def test_scans_without_odometry_between_others_bend_nothing(missing):
     kept = np.setdiff1d(np.arange(16), missing)
     assert np.isfinite(found.poses[kept]).all()
     known = np.isfinite(found.poses[:, 0])
-    own = errors(
+    own = trajectory_errors(
         Trajectory(found.stamp[known], found.poses[known], found.covariance[known]),
         Trajectory(found.stamp, truth()[:16]),
         align="first",
