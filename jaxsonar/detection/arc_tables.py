@@ -45,7 +45,7 @@ class ArcTables:
             settings: the settings of these tables.
         """
         pose = jnp.asarray(path_pose, jnp.float32)
-        return ArcTables(kernels.moved_arcs(self.arcs, pose, settings=settings), self.pieces)
+        return ArcTables(kernels.transform_arcs(self.arcs, pose, settings=settings), self.pieces)
 
 
 def arc_tables(ring: Ring, settings: kernels.HoughSettings) -> ArcTables:
@@ -54,6 +54,6 @@ def arc_tables(ring: Ring, settings: kernels.HoughSettings) -> ArcTables:
     if key not in ring.cache:
         points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
         arcs = kernels.ring_arcs(ring.sensors, settings=settings, points=points)
-        pieces = -(-np.asarray(arcs.arcs.counts).sum(axis=1) // kernels.PIECE)
+        pieces = -(-np.asarray(arcs.arcs.counts).sum(axis=1) // kernels.PIECE_POINTS)
         ring.cache[key] = ArcTables(arcs, pieces)
     return ring.cache[key]

@@ -33,7 +33,7 @@ class Centroids(NamedTuple):
 def component_centroids(
     tables: ArcTables,
     batch: EchoBatch,
-    voted: kernels.Voted,
+    voted: kernels.Votes,
     labels: Int[np.ndarray, "rows theta_and_one rho"],
     counts: Int[np.ndarray, " rows"],
 ) -> Centroids:
@@ -113,12 +113,12 @@ class _Runs(NamedTuple):
 
 
 def _find_runs(
-    tables: ArcTables, batch: EchoBatch, voted: kernels.Voted, labels: Int[np.ndarray, "rows theta_and_one rho"]
+    tables: ArcTables, batch: EchoBatch, voted: kernels.Votes, labels: Int[np.ndarray, "rows theta_and_one rho"]
 ) -> _Runs:
     """Runs of points in components. Only the steps up to ``reduceat`` pass over all points."""
     assert batch.piece is not None
     assert batch.owner is not None
-    scans, width = len(batch.scans), kernels.PIECE
+    scans, width = len(batch.scans), kernels.PIECE_POINTS
     piece, owner = batch.piece[:scans], batch.owner[:scans]
     cell, rho = np.asarray(voted.cell), np.asarray(voted.rho)[:scans].ravel()
     # Look up the component of each point; scan by scan, so that the labels of a scan stay in the cache.

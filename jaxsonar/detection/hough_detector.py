@@ -82,7 +82,7 @@ def hough_detections(
         voted = kernels.vote(tables.arcs, batch.packed, settings=settings)
         # Clusters are regions of cohesive highly occupied cells: a connected components analysis.
         labels, counts = label_components(np.asarray(voted.occupied))
-        # Lines are the centers of gravity of the points in each cluster; their endpoints come from the sensors involved.
+        # Lines are the centers of gravity of the points in each cluster, with endpoints from the sensors involved.
         centroids = component_centroids(tables, batch, voted, labels, counts)
         lines, involved = _filter_and_sort(centroids, min_echoes=settings.min_echoes)
         yield HoughBatch(batch, lines, involved, counts[: len(batch.scans)])

@@ -24,7 +24,7 @@ class Lines:
     theta: Float[np.ndarray, "scans lines"]
     """Direction of the normal, radians, in [-pi, pi)."""
     votes: Float[np.ndarray, "scans lines"]
-    """Strength. Method hough: number of arc points in the component. Method ml: log-likelihood ratio to clutter, nats."""
+    """Strength. Method hough: arc points in the component. Method ml: log-likelihood ratio to clutter, nats."""
     echoes: Int[np.ndarray, "scans lines"]
     """Number of echoes with a point in the component (hough), or explained by the line (ml)."""
     segments: Float[np.ndarray, "scans lines 2 2"]
@@ -45,7 +45,7 @@ class Line:
     """Endpoints (x, y), metres: the outermost feet of the perpendiculars from the involved real and virtual sensors
     (paper, section 5)."""
     votes: int | float
-    """Strength. Method hough: number of arc points in the component. Method ml: log-likelihood ratio to clutter, nats."""
+    """Strength. Method hough: arc points in the component. Method ml: log-likelihood ratio to clutter, nats."""
     echoes: int
     """Number of echoes with a point in the component (hough), or explained by the line (ml)."""
     paths: Int[np.ndarray, "paths 2"]

@@ -44,7 +44,7 @@ def confirmed_walls(
     # Keep the candidates that the plane model explains clearly better; scores are NaN where there is no candidate.
     is_plane = plane > SETTINGS.plane_to_point_ratio * point
     explained = np.asarray(fits.explained) & is_plane[..., None]
-    # Greedy assignment of the echoes, best plane first; one wall per stretch without a gap.
+    # Greedy assignment of the echoes, best plane first; one wall per part without a gap.
     walls: list[list[LineCandidate]] = [[] for _ in range(rows)]
     unassigned = np.ones((rows, explained.shape[2]), dtype=bool)
     for row in range(rows):

@@ -14,7 +14,7 @@ METHODS = ("ml", "hough")
 
 
 @dataclass(frozen=True)
-class DetectionSettings:
+class DecisionSettings:
     """Constants of the detectors on the host; those of the kernels are in ``kernels.HoughSettings`` and the prior."""
 
     min_probability: float = 0.7
@@ -33,9 +33,9 @@ class DetectionSettings:
     """Length along the wall that its echoes must cover, metres: a shorter one does not determine the direction."""
 
 
-SETTINGS = DetectionSettings()
+SETTINGS = DecisionSettings()
 
-MIN_SIGMA = kernels.Expectations().least_sigma
+MIN_SIGMA = kernels.DetectionSettings().min_sigma
 """Smallest standard deviation of ranges, metres; ranges have single precision."""
 
 

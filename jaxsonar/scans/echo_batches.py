@@ -70,10 +70,10 @@ class EchoBatch(NamedTuple):
     """Column of the echo to which each arc piece belongs."""
 
     @property
-    def packed(self) -> kernels.Echoes:
+    def packed(self) -> kernels.PackedEchoes:
         """The arrays as the argument of a kernel; they stay NumPy arrays until the compiled call transfers them."""
         arrays: Any = (self.path, self.reported, self.pose, self.gathered, self.piece, self.owner)
-        return kernels.Echoes(*arrays)
+        return kernels.PackedEchoes(*arrays)
 
 
 def pack(

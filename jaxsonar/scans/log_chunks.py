@@ -1,4 +1,4 @@
-"""Scan logs in parts: where the scans of a file stand, found without holding it, and any run of them read alone."""
+"""Chunks of scan logs: location of the scans in a file of any size, and reading of any run of them."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -10,95 +10,103 @@ from jaxtyping import Bool, Int
 
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.scans.csv_log import BLOCK, LONGEST, _fields, _is_scan_number, _whole, csv_header, read_csv_rows
+from jaxsonar.scans.csv_log import (
+    BLOCK,
+    MAX_NUMBER_LENGTH,
+    csv_header,
+    fields_of,
+    integers_of,
+    is_scan_number,
+    read_csv_rows,
+)
 from jaxsonar.scans.parquet_log import open_parquet, read_batch
 from jaxsonar.scans.scan_log import Log
 
-AT_ONCE = 65536
-"""Rows of a Parquet file whose scan numbers are looked at at once."""
+ROWS_PER_READ = 65536
+"""Rows of a Parquet file whose scan numbers are read at once."""
 NO_NUMBER = -(2**63)
-"""Stands for the number of a scan that has none; such scans are refused when they are read."""
+"""Placeholder for a missing scan number; such scans are rejected when they are read."""
 
 
 @dataclass(frozen=True)
-class Part:
-    """A run of whole scans of one file."""
+class LogChunk:
+    """A run of complete scans of one file."""
 
     first: int
     """Row of the first scan in the log, from 0."""
     scans: int
-    """How many there are."""
+    """Number of scans."""
     begin: int = 0
-    """CSV: byte of the file that they begin at."""
+    """CSV: byte offset of the first scan in the file."""
     end: int = 0
-    """CSV: byte that they end before."""
+    """CSV: byte offset of the end."""
     line: int = 0
-    """CSV: line of the file that the first one begins at; the header is line 1."""
+    """CSV: line number of the first scan in the file; the header is line 1."""
     repeated: tuple[int, ...] = ()
-    """Rows, from ``first`` on, of scans whose number an earlier scan of the file has."""
+    """Rows, counted from ``first``, of scans whose number already occurred in the file."""
 
 
-class _Begun(NamedTuple):
-    """Where scans begin in a file, some of them after another; columns of one length."""
+class _ScanStarts(NamedTuple):
+    """Starts of consecutive scans in a file; columns of equal length."""
 
     number: Int[np.ndarray, " scans"]
     offset: Int[np.ndarray, " scans"]
     line: Int[np.ndarray, " scans"]
 
 
-def csv_parts(path: str | os.PathLike[str], *, name: str, scans: int) -> list[Part]:
-    """The scans of a CSV log in runs of ``scans``, by one pass through the file that holds 1 MB of it.
+def csv_chunks(filename: str | os.PathLike[str], *, name: str, scans: int) -> list[LogChunk]:
+    """Chunks of a CSV log with this number of scans, by one pass through the file with 1 MB of memory.
 
-    A row belongs to the scan of the row above it if it has its number, and where the number of either cannot be read.
+    A row belongs to the scan of the previous row if both have the same number, or if either number is unreadable.
 
     Args:
-        path: the file.
-        name: what messages call it.
-        scans: in every part but the last one.
+        filename: the file.
+        name: name of the file in error messages.
+        scans: number of scans of every chunk but the last one.
 
     Raises:
         SonarError: the file cannot be read, or its header is not that of a scan log.
     """
-    size = os.stat(path).st_size
-    parts: list[Part] = []
+    size = os.stat(filename).st_size
+    chunks: list[LogChunk] = []
     count = 0
-    for begun in _csv_scans(path, name):
-        for k in range(-count % scans, len(begun.number), scans):
-            parts.append(Part(count + k, scans, int(begun.offset[k]), size, int(begun.line[k])))
-        count += len(begun.number)
-    ends = [*(part.begin for part in parts[1:]), size][: len(parts)]
-    numbers = lambda: (begun.number for begun in _csv_scans(path, name))  # noqa: E731
-    return _finished(parts, ends, count, numbers)
+    for starts in _csv_scans(filename, name):
+        for k in range(-count % scans, len(starts.number), scans):
+            chunks.append(LogChunk(count + k, scans, int(starts.offset[k]), size, int(starts.line[k])))
+        count += len(starts.number)
+    ends = [*(chunk.begin for chunk in chunks[1:]), size][: len(chunks)]
+    numbers = lambda: (starts.number for starts in _csv_scans(filename, name))  # noqa: E731
+    return _complete_chunks(chunks, ends, count, numbers)
 
 
-def parquet_parts(path: str | os.PathLike[str], *, name: str, scans: int) -> list[Part]:
-    """The scans of a Parquet log in runs of ``scans``, by one pass over their numbers alone.
+def parquet_chunks(filename: str | os.PathLike[str], *, name: str, scans: int) -> list[LogChunk]:
+    """Chunks of a Parquet log with this number of scans, by one pass over the scan numbers.
 
     Args:
-        path: the file.
-        name: what messages call it.
-        scans: in every part but the last one.
+        filename: the file.
+        name: name of the file in error messages.
+        scans: number of scans of every chunk but the last one.
 
     Raises:
-        SonarError: the file cannot be read or is no scan log, or the extra is missing.
+        SonarError: the file cannot be read or is no scan log, or the parquet extra is missing.
     """
-    file = open_parquet(path, name=name)
+    file = open_parquet(filename, name=name)
     count = file.metadata.num_rows
-    parts = [Part(first, scans) for first in range(0, count, scans)]
-    return _finished(parts, [0] * len(parts), count, lambda: _parquet_numbers(file, name))
+    chunks = [LogChunk(first, scans) for first in range(0, count, scans)]
+    return _complete_chunks(chunks, [0] * len(chunks), count, lambda: _parquet_numbers(file, name))
 
 
-def csv_reader(path: str | os.PathLike[str], part: Part, *, name: str) -> Callable[[int, int], Log]:
-    """What reads some scans of a part of a CSV log: ``read(a, b)`` are those from a up to b, counted from its first."""
-    with _opened(path, name) as file:
+def csv_chunk_reader(filename: str | os.PathLike[str], chunk: LogChunk, *, name: str) -> Callable[[int, int], Log]:
+    """A function ``read(a, b)`` that reads the scans a to b (exclusive) of a chunk of a CSV log."""
+    with _open(filename, name) as file:
         columns = csv_header(name, _header_line(file))
-        file.seek(part.begin)
-        text = file.read(part.end - part.begin)
+        file.seek(chunk.begin)
+        text = file.read(chunk.end - chunk.begin)
     if not text.endswith(b"\n"):
         text += b"\n"
-    first, lines = next(_begun(name, iter([text]), 0))[1:]
-    offset, line = np.append(first, len(text)), lines + part.line
-    if len(first) != part.scans:
+    first, lines = next(_find_starts(name, iter([text]), 0))[1:]
+    offset, line = np.append(first, len(text)), lines + chunk.line
+    if len(first) != chunk.scans:
         raise SonarError(f"{shown(name)}: changed since it was looked at; needed is a log that stays as it is")
 
     def read(begin: int, end: int) -> Log:
@@ -109,131 +117,137 @@ def csv_reader(path: str | os.PathLike[str], part: Part, *, name: str) -> Callab
     return read
 
 
-def parquet_reader(path: str | os.PathLike[str], part: Part, *, name: str) -> Callable[[int, int], Log]:
-    """The same of a Parquet log; only the row groups that the part touches are read."""
+def parquet_chunk_reader(filename: str | os.PathLike[str], chunk: LogChunk, *, name: str) -> Callable[[int, int], Log]:
+    """As ``csv_chunk_reader`` for a Parquet log; only the row groups of the chunk are read."""
     import pyarrow as pa
 
-    file = open_parquet(path, name=name)
+    file = open_parquet(filename, name=name)
     sizes = [file.metadata.row_group(k).num_rows for k in range(file.metadata.num_row_groups)]
     ends = np.cumsum(sizes)
-    last = part.first + part.scans
-    touched = np.flatnonzero((ends > part.first) & (ends - sizes < last)).tolist()
-    row, taken = int(ends[touched[0]] - sizes[touched[0]]), []
+    last = chunk.first + chunk.scans
+    touched = np.flatnonzero((ends > chunk.first) & (ends - sizes < last)).tolist()
+    row, batches = int(ends[touched[0]] - sizes[touched[0]]), []
     try:
         for batch in file.iter_batches(batch_size=8192, row_groups=touched):
-            begin, end = max(part.first - row, 0), min(last - row, len(batch))
+            begin, end = max(chunk.first - row, 0), min(last - row, len(batch))
             if begin < end:
-                taken.append(batch.slice(begin, end - begin))
+                batches.append(batch.slice(begin, end - begin))
             row += len(batch)
-        (rows,) = pa.Table.from_batches(taken).combine_chunks().to_batches()
+        (rows,) = pa.Table.from_batches(batches).combine_chunks().to_batches()
     except (pa.ArrowException, OSError, ValueError) as failure:
         raise SonarError(f"{shown(name)}: {reason(failure)}; needed is a scan log as a whole Parquet file") from None
-    return lambda begin, end: read_batch(name, rows.slice(begin, end - begin), part.first + begin)
+    return lambda begin, end: read_batch(name, rows.slice(begin, end - begin), chunk.first + begin)
 
 
-def _finished(parts: list[Part], ends: list[int], count: int, numbers: Callable[[], Iterator[Any]]) -> list[Part]:
-    """Parts with their ends, the last one with what is left, and the repeated scans of each."""
-    again = _repeated(numbers)
-    finished = []
-    for part, end in zip(parts, ends, strict=True):
-        scans = min(part.scans, count - part.first)
-        own = again[np.searchsorted(again, part.first) : np.searchsorted(again, part.first + scans)] - part.first
-        finished.append(Part(part.first, scans, part.begin, end, part.line, tuple(own.tolist())))
-    return finished
+def _complete_chunks(
+    chunks: list[LogChunk], ends: list[int], count: int, numbers: Callable[[], Iterator[Any]]
+) -> list[LogChunk]:
+    """Chunks with their ends, the number of scans of the last one, and the repeated scans of each."""
+    repeated = _repeated_rows(numbers)
+    complete = []
+    for chunk, end in zip(chunks, ends, strict=True):
+        scans = min(chunk.scans, count - chunk.first)
+        first, last = np.searchsorted(repeated, [chunk.first, chunk.first + scans])
+        rows = tuple((repeated[first:last] - chunk.first).tolist())
+        complete.append(LogChunk(chunk.first, scans, chunk.begin, end, chunk.line, rows))
+    return complete
 
 
-def _repeated(numbers: Callable[[], Iterator[Int[np.ndarray, " scans"]]]) -> Int[np.ndarray, " repeated"]:
-    """Rows of scans whose number came before. Where numbers rise, as they mostly do, nothing is held."""
+def _repeated_rows(numbers: Callable[[], Iterator[Int[np.ndarray, " scans"]]]) -> Int[np.ndarray, " repeated"]:
+    """Rows of scans whose number already occurred. Needs no memory for increasing numbers, the usual case."""
     last = NO_NUMBER
-    for some in numbers():
-        some = some[some != NO_NUMBER]
-        if len(some) and (some[0] <= last or (np.diff(some) <= 0).any()):
+    for block in numbers():
+        known = block[block != NO_NUMBER]
+        if len(known) and (known[0] <= last or (np.diff(known) <= 0).any()):
             break
-        last = int(some[-1]) if len(some) else last
+        last = int(known[-1]) if len(known) else last
     else:
         return np.zeros(0, np.int64)
     every = np.concatenate(list(numbers()))
     order = np.argsort(every, kind="stable")
-    came = order[1:][np.diff(every[order]) == 0]
-    return np.sort(came[every[came] != NO_NUMBER])
+    repeated = order[1:][np.diff(every[order]) == 0]
+    return np.sort(repeated[every[repeated] != NO_NUMBER])
 
 
 def _parquet_numbers(file: Any, name: str) -> Iterator[Int[np.ndarray, " scans"]]:
+    """Scan numbers of a Parquet log, block by block."""
     import pyarrow as pa
 
     try:
-        for batch in file.iter_batches(batch_size=AT_ONCE, columns=["scan"]):
+        for batch in file.iter_batches(batch_size=ROWS_PER_READ, columns=["scan"]):
             yield batch.column("scan").cast(pa.int64()).fill_null(NO_NUMBER).to_numpy(zero_copy_only=False)
     except (pa.ArrowException, OSError) as failure:
         raise SonarError(f"{shown(name)}: {reason(failure)}; needed is a scan log as a whole Parquet file") from None
 
 
-def _csv_scans(path: str | os.PathLike[str], name: str) -> Iterator[_Begun]:
-    """Where the scans of a CSV log begin, block by block."""
-    with _opened(path, name) as file:
-        header = _header_line(file)
-        csv_header(name, header)
-        here = file.tell()
-        for begun in _begun(name, iter(lambda: file.read(BLOCK), b""), here):
-            yield _Begun(begun.number, begun.offset, begun.line + 2)
+def _csv_scans(filename: str | os.PathLike[str], name: str) -> Iterator[_ScanStarts]:
+    """Starts of the scans of a CSV log, block by block."""
+    with _open(filename, name) as file:
+        csv_header(name, _header_line(file))
+        for starts in _find_starts(name, iter(lambda: file.read(BLOCK), b""), file.tell()):
+            yield _ScanStarts(starts.number, starts.offset, starts.line + 2)
 
 
-def _opened(path: str | os.PathLike[str], name: str) -> Any:
+def _open(filename: str | os.PathLike[str], name: str) -> Any:
+    """A CSV log, opened for reading."""
     try:
-        return open(path, "rb")
+        return open(filename, "rb")
     except OSError as failure:
         raise SonarError(f"{shown(name)}: {reason(failure)}; needed is a readable file with a scan log (CSV)") from None
 
 
 def _header_line(file: Any) -> bytes:
-    """The first row of a file, as ``csv_header`` takes it; no more than a block of what is no text."""
+    """The first row of a file as an argument of ``csv_header``; at most one block, in case this is no text."""
     return file.readline(BLOCK).removeprefix(b"\xef\xbb\xbf").rstrip(b"\n").removesuffix(b"\r")
 
 
-def _begun(name: str, blocks: Iterator[bytes], here: int) -> Iterator[_Begun]:
-    """Where scans begin in rows that come in blocks; ``here`` is the offset of the first, whose line is 0."""
-    left, line, state = b"", 0, None
-    for block in blocks:
-        block = left + block
-        whole = block.rfind(b"\n") + 1
-        if whole == 0 and len(block) > BLOCK:
+def _find_starts(name: str, blocks: Iterator[bytes], offset: int) -> Iterator[_ScanStarts]:
+    """Starts of scans in blocks of rows; ``offset`` is that of the first block, whose first line is 0."""
+    rest, line, state = b"", 0, None
+    for read in blocks:
+        block = rest + read
+        complete = block.rfind(b"\n") + 1
+        if complete == 0 and len(block) > BLOCK:
             raise SonarError(f"{shown(name)}: row {line + 2}: more than 1 MB came; allowed are rows of numbers")
-        left = block[whole:]
-        if whole:
-            begun, lines, state = _first_rows(block[:whole], state)
-            yield _Begun(begun.number, begun.offset + here, begun.line + line)
-            here, line = here + whole, line + lines
-    if left:
-        begun, _, _ = _first_rows(left + b"\n", state)
-        yield _Begun(begun.number, begun.offset + here, begun.line + line)
+        rest = block[complete:]
+        if complete:
+            starts, lines, state = _starts_in_block(block[:complete], state)
+            yield _ScanStarts(starts.number, starts.offset + offset, starts.line + line)
+            offset, line = offset + complete, line + lines
+    if rest:
+        starts, _, _ = _starts_in_block(rest + b"\n", state)
+        yield _ScanStarts(starts.number, starts.offset + offset, starts.line + line)
 
 
-def _first_rows(block: bytes, before: tuple[int, bool] | None) -> tuple[_Begun, int, tuple[int, bool]]:
-    """Rows of a block that begin a scan; ``before`` is the number of the row above, and whether it could be read."""
+def _starts_in_block(block: bytes, previous: tuple[int, bool] | None) -> tuple[_ScanStarts, int, tuple[int, bool]]:
+    """Starts of scans in complete rows, the number of rows, and the state for the next block.
+
+    The state ``previous`` is the scan number of the previous row, and whether that number was readable.
+    """
     buffer = np.frombuffer(block, dtype=np.uint8)
     end = np.flatnonzero(buffer == ord("\n"))
     start = np.concatenate([[0], end[:-1] + 1])
     comma = np.append(np.flatnonzero(buffer == ord(",")), len(block))
-    stop = np.minimum(np.minimum(comma[np.searchsorted(comma, start)], end), start + LONGEST)
-    text = _fields(block, start, stop)
-    other = np.concatenate([[True], text[1:] != text[:-1]])
-    number, known = _numbers(text[other])
-    which = np.cumsum(other) - 1
+    stop = np.minimum(np.minimum(comma[np.searchsorted(comma, start)], end), start + MAX_NUMBER_LENGTH)
+    text = fields_of(block, start, stop)
+    changes = np.concatenate([[True], text[1:] != text[:-1]])
+    number, known = _scan_numbers(text[changes])
+    which = np.cumsum(changes) - 1
     number, known = number[which], known[which]
-    above = np.concatenate([[number[0] if before is None else before[0]], number[:-1]])
-    above_known = np.concatenate([[True if before is None else before[1]], known[:-1]])
+    above = np.concatenate([[number[0] if previous is None else previous[0]], number[:-1]])
+    above_known = np.concatenate([[True if previous is None else previous[1]], known[:-1]])
     begins = known & above_known & (number != above)
-    begins[0] |= before is None
+    begins[0] |= previous is None
     rows = np.flatnonzero(begins)
-    return _Begun(number[rows], start[rows], rows), len(start), (int(number[-1]), bool(known[-1]))
+    return _ScanStarts(number[rows], start[rows], rows), len(start), (int(number[-1]), bool(known[-1]))
 
 
-def _numbers(text: np.ndarray) -> tuple[Int[np.ndarray, " texts"], Bool[np.ndarray, " texts"]]:
-    """Scan numbers, and which texts are one."""
+def _scan_numbers(text: np.ndarray) -> tuple[Int[np.ndarray, " texts"], Bool[np.ndarray, " texts"]]:
+    """Scan numbers, and which fields are valid ones."""
     try:
-        return _whole(text), np.ones(len(text), bool)
+        return integers_of(text), np.ones(len(text), bool)
     except (ValueError, OverflowError):
-        known = np.array([_is_scan_number(one) for one in text.tolist()])
+        known = np.array([is_scan_number(one) for one in text.tolist()])
         number = np.full(len(text), NO_NUMBER)
         number[known] = [int(one) if one.lstrip(b"+-").isdigit() else int(float(one)) for one in text[known].tolist()]
         return number, known

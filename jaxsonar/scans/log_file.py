@@ -1,4 +1,4 @@
-"""Read and write scan logs; the suffix of the file chooses the format."""
+"""Reading and writing of scan logs; the suffix of the file determines the format."""
 
 import os
 
@@ -6,45 +6,45 @@ from jaxsonar.hardware.recorder_base import recording_marker
 from jaxsonar.scans.scan_log import Log, log_format
 
 
-def load_log(path: str | os.PathLike[str]) -> Log:
-    """A scan log from a ``.csv`` or ``.parquet`` file.
+def load_log(filename: str | os.PathLike[str]) -> Log:
+    """Load a scan log from a ``.csv`` or ``.parquet`` file.
 
     Args:
-        path: the file; its suffix, in either case, decides how it is read. Of a recording whose process was killed
-            (there is a ``.recording`` file beside it) everything that is whole, with a warning if anything is not.
+        filename: the file; its suffix, in either case, determines the format. If a ``.recording`` file beside it shows
+            that the recording process was killed, all complete scans are loaded, with a warning if any is incomplete.
 
     Raises:
-        SonarError: the file cannot be read or holds what no log can; one line with file, row, column and what is
-            allowed.
+        SonarError: the file cannot be read or is invalid; the message names file, row, column and allowed values.
     """
-    if recording_marker(path).exists():
-        from jaxsonar.scans.recording_journal import load_cut_short
+    if recording_marker(filename).exists():
+        from jaxsonar.scans.recording_journal import recover_recording
 
-        return load_cut_short(path)
-    if log_format(path) == "csv":
+        return recover_recording(filename)
+    if log_format(filename) == "csv":
         from jaxsonar.scans.csv_log import read_csv
 
-        return read_csv(path)
+        return read_csv(filename)
     from jaxsonar.scans.parquet_log import read_parquet
 
-    return read_parquet(path)
+    return read_parquet(filename)
 
 
-def save_log(log: Log, path: str | os.PathLike[str]) -> None:
-    """Write a scan log as ``.csv`` or ``.parquet``; both carry the same, without loss.
+def save_log(log: Log, filename: str | os.PathLike[str]) -> None:
+    """Write a scan log as ``.csv`` or ``.parquet``; both formats are lossless.
 
     Args:
         log: the scans.
-        path: the file; its suffix, in either case, decides the format. It is replaced only once all is written.
+        filename: the file; its suffix, in either case, determines the format. An existing file is replaced only after
+            the new one is complete.
 
     Raises:
-        SonarError: another suffix, or a place that cannot be written.
+        SonarError: another suffix, or the file cannot be written.
     """
-    if log_format(path) == "csv":
+    if log_format(filename) == "csv":
         from jaxsonar.scans.csv_log import write_csv
 
-        write_csv(log, path)
+        write_csv(log, filename)
     else:
         from jaxsonar.scans.parquet_log import write_parquet
 
-        write_parquet(log, path)
+        write_parquet(log, filename)

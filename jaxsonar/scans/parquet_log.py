@@ -1,6 +1,6 @@
-"""Scan logs as Parquet: one row a scan, its echoes a list. Needs the extra ``parquet``.
+"""Scan logs as Parquet: one row per scan, with a list of echoes. Needs the extra ``parquet``.
 
-Row numbers in messages count scans from 1, echoes within a row from 0.
+Error messages count rows (scans) from 1 and echoes within a row from 0.
 """
 
 import os
@@ -11,76 +11,80 @@ import numpy as np
 
 from jaxsonar.fileio.atomic_files import atomic_write, read_bytes, reason, shown
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.scans.scan_log import ALLOWED, Log, LogFault
+from jaxsonar.scans.scan_log import ALLOWED, InvalidLogValue, Log
 
-SCANS_AT_ONCE = 8192  # a row group; keeps 32-bit list offsets and memory far from their limits
+SCANS_PER_GROUP = 8192
+"""Scans of a row group; keeps memory and the 32-bit list offsets far below their limits."""
 
 SCAN_COLUMNS = ("scan", "stamp", "x", "y", "theta", "echoes")
 ECHO_COLUMNS = ("tx", "rx", "range", "amplitude")
-WHOLE = ("scan", "tx", "rx")
-MAY_BE_ABSENT = ("stamp", "x", "y", "theta", "amplitude")
+INTEGER_COLUMNS = ("scan", "tx", "rx")
+OPTIONAL_VALUES = ("stamp", "x", "y", "theta", "amplitude")
 
 
-def read_parquet(path: str | os.PathLike[str]) -> Log:
-    """A scan log from Parquet.
+def read_parquet(filename: str | os.PathLike[str]) -> Log:
+    """Read a scan log from Parquet.
 
-    Columns may stand in any order and be of any integer or floating type; null and NaN both mean that there is no such
-    value. ``amplitude`` may be left out.
+    Columns may have any order and any integer or floating type. Null and NaN both mean a missing value. The column
+    ``amplitude`` is optional.
 
     Args:
-        path: the file.
+        filename: the file.
 
     Raises:
-        SonarError: the file cannot be read or is no scan log; one line with file, row, column and what is allowed; or
-            the extra is missing.
+        SonarError: the file cannot be read or is no scan log, or the extra is missing; the message names file, row,
+            column and allowed values.
     """
-    pa, pq = _pyarrow(path)
-    data = read_bytes(path, what="a scan log (Parquet)")
+    pa, pq = _pyarrow(filename)
+    data = read_bytes(filename, what="a scan log (Parquet)")
     try:
         file = pq.ParquetFile(pa.BufferReader(data))
-        _check_schema(path, pa, file.schema_arrow)
+        _check_schema(filename, pa, file.schema_arrow)
         parts, row = [], 0
-        for batch in file.iter_batches(batch_size=SCANS_AT_ONCE):
-            parts.append(_batch(path, pa, batch, row))
+        for batch in file.iter_batches(batch_size=SCANS_PER_GROUP):
+            parts.append(_batch(filename, pa, batch, row))
             row += len(batch)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as failure:  # the last from column names
-        raise SonarError(f"{shown(path)}: {reason(failure)}; needed is a scan log as a whole Parquet file") from None
-    return _log(path, parts)
+        raise SonarError(
+            f"{shown(filename)}: {reason(failure)}; needed is a scan log as a whole Parquet file"
+        ) from None
+    return _log(filename, parts)
 
 
-def read_batch(path: str | os.PathLike[str], batch: Any, row: int) -> Log:
-    """As ``read_parquet``, from a record batch of a file whose schema was checked (``open_parquet``).
+def read_batch(filename: str | os.PathLike[str], batch: Any, row: int) -> Log:
+    """As ``read_parquet``, from a record batch of a file with a valid schema (``open_parquet``).
 
     Args:
-        path: for messages.
+        filename: the file, for error messages.
         batch: rows of the file.
-        row: row of the file that the first of them is, from 0.
+        row: index of the first of them in the file, from 0.
     """
-    pa, _ = _pyarrow(path)
-    return _log(path, [_batch(path, pa, batch, row)], row)
+    pa, _ = _pyarrow(filename)
+    return _log(filename, [_batch(filename, pa, batch, row)], row)
 
 
-def open_parquet(path: str | os.PathLike[str], *, name: str | None = None) -> Any:
-    """A ``pyarrow.parquet.ParquetFile`` of a scan log, for those who read it in parts.
+def open_parquet(filename: str | os.PathLike[str], *, name: str | None = None) -> Any:
+    """A ``pyarrow.parquet.ParquetFile`` of a scan log with a valid schema, for reading in parts.
 
     Args:
-        path: the file.
-        name: what messages call it; the path if left out.
+        filename: the file.
+        name: name of the file in error messages; the filename if omitted.
 
     Raises:
         SonarError: as ``read_parquet``.
     """
-    name = os.fspath(path) if name is None else name
+    name = os.fspath(filename) if name is None else name
     pa, pq = _pyarrow(name)
     try:
-        file = pq.ParquetFile(path)
+        file = pq.ParquetFile(filename)
         _check_schema(name, pa, file.schema_arrow)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as failure:
         raise SonarError(f"{shown(name)}: {reason(failure)}; needed is a scan log as a whole Parquet file") from None
     return file
 
 
-def _log(path: str | os.PathLike[str], parts: list[dict[str, np.ndarray]], row: int = 0) -> Log:
+def _log(filename: str | os.PathLike[str], parts: list[dict[str, np.ndarray]], row: int = 0) -> Log:
+    """The log of some record batches; ``row`` is the index of the first scan in the file."""
     none = {"scan": np.zeros(0, np.int64), "tx": np.zeros(0, np.int64), "rx": np.zeros(0, np.int64)}
     column = {
         name: np.concatenate([none.get(name, np.zeros(0)), *(part[name] for part in parts)])
@@ -96,28 +100,28 @@ def _log(path: str | os.PathLike[str], parts: list[dict[str, np.ndarray]], row: 
             start=start,
             **{name: column[name] for name in ECHO_COLUMNS},
         )
-    except LogFault as fault:
+    except InvalidLogValue as fault:
         name = fault.column if fault.echo is None else f"echoes[{fault.echo - start[fault.scan]}].{fault.column}"
         name = "x, y, theta" if name == "pose" else name
-        _fail(path, row + fault.scan, name, str(fault.value), ALLOWED[fault.column])
+        _fail(filename, row + fault.scan, name, str(fault.value), ALLOWED[fault.column])
 
 
-def write_parquet(log: Log, path: str | os.PathLike[str]) -> None:
+def write_parquet(log: Log, filename: str | os.PathLike[str]) -> None:
     """Write a scan log as Parquet.
 
     Args:
         log: the scans.
-        path: the file, replaced only once all is written.
+        filename: the file; an existing one is replaced only after the new one is complete.
 
     Raises:
-        SonarError: the place cannot be written, or the extra is missing.
+        SonarError: the file cannot be written, or the extra is missing.
     """
-    write_parquet_parts([log], path)
+    write_parquet_chunks([log], filename)
 
 
-def write_parquet_parts(parts: Iterable[Log], path: str | os.PathLike[str]) -> None:
-    """As ``write_parquet``, from logs that follow each other, each written before the next one is asked for."""
-    pa, pq = _pyarrow(path)
+def write_parquet_chunks(parts: Iterable[Log], filename: str | os.PathLike[str]) -> None:
+    """As ``write_parquet``, from consecutive parts of a log, each written before the next one is requested."""
+    pa, pq = _pyarrow(filename)
     number = pa.float64()
     echo = pa.struct(
         [
@@ -135,8 +139,8 @@ def write_parquet_parts(parts: Iterable[Log], path: str | os.PathLike[str]) -> N
             pa.field("echoes", echoes, nullable=False),
         ]
     )
-    with atomic_write(path, binary=True) as file, pq.ParquetWriter(file, schema) as writer:
-        for part in _blocks(parts):
+    with atomic_write(filename, binary=True) as file, pq.ParquetWriter(file, schema) as writer:
+        for part in _row_groups(parts):
             values = pa.StructArray.from_arrays(
                 [
                     pa.array(part.tx.astype(np.int32)),
@@ -154,73 +158,80 @@ def write_parquet_parts(parts: Iterable[Log], path: str | os.PathLike[str]) -> N
             writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
 
 
-def _blocks(parts: Iterable[Log]) -> Iterator[Log]:
+def _row_groups(parts: Iterable[Log]) -> Iterator[Log]:
+    """Parts of a log, cut into row groups."""
     for log in parts:
-        for begin in range(0, len(log), SCANS_AT_ONCE):
-            yield log[begin : begin + SCANS_AT_ONCE]
+        for begin in range(0, len(log), SCANS_PER_GROUP):
+            yield log[begin : begin + SCANS_PER_GROUP]
 
 
-def _pyarrow(path: str | os.PathLike[str]) -> tuple[Any, Any]:
+def _pyarrow(filename: str | os.PathLike[str]) -> tuple[Any, Any]:
+    """The modules pyarrow and pyarrow.parquet; a SonarError if the extra is missing."""
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
         extra = "pip install 'jaxsonar[parquet]'"
-        raise SonarError(f"{shown(path)}: Parquet needs the parquet extra: {extra}") from None
+        raise SonarError(f"{shown(filename)}: Parquet needs the parquet extra: {extra}") from None
     return pyarrow, pyarrow.parquet
 
 
-def _fail(path: str | os.PathLike[str], row: int, column: str, came: str, allowed: str) -> NoReturn:
-    raise SonarError(f"{shown(path)}: row {row + 1}, column {column}: {shown(came, 80)} came; allowed is {allowed}")
+def _fail(filename: str | os.PathLike[str], row: int, column: str, came: str, allowed: str) -> NoReturn:
+    raise SonarError(f"{shown(filename)}: row {row + 1}, column {column}: {shown(came, 80)} came; allowed is {allowed}")
 
 
-def _check_schema(path: str | os.PathLike[str], pa: Any, schema: Any) -> None:
-    _check_names(path, schema.names, SCAN_COLUMNS, "")
+def _check_schema(filename: str | os.PathLike[str], pa: Any, schema: Any) -> None:
+    """Raise a SonarError for a schema that is not that of a scan log."""
+    _check_names(filename, schema.names, SCAN_COLUMNS, "")
     for name in SCAN_COLUMNS[:-1]:
-        _check_type(path, pa, name, name, schema.field(name).type)
+        _check_type(filename, pa, name, name, schema.field(name).type)
     echoes = schema.field("echoes").type
     if not ((pa.types.is_list(echoes) or pa.types.is_large_list(echoes)) and pa.types.is_struct(echoes.value_type)):
         wanted = f"a list of struct<{', '.join(ECHO_COLUMNS)}>"
-        raise SonarError(f"{shown(path)}: column echoes: type {shown(str(echoes), 80)} came; allowed is {wanted}")
+        raise SonarError(f"{shown(filename)}: column echoes: type {shown(str(echoes), 80)} came; allowed is {wanted}")
     fields = {field.name: field.type for field in echoes.value_type}
     names = [field.name for field in echoes.value_type]
-    _check_names(path, names if "amplitude" in names else [*names, "amplitude"], ECHO_COLUMNS, "echoes.")
+    _check_names(filename, names if "amplitude" in names else [*names, "amplitude"], ECHO_COLUMNS, "echoes.")
     for name, kind in fields.items():
-        _check_type(path, pa, name, f"echoes.{name}", kind)
+        _check_type(filename, pa, name, f"echoes.{name}", kind)
 
 
-def _check_names(path: str | os.PathLike[str], names: list[str], wanted: tuple[str, ...], prefix: str) -> None:
+def _check_names(filename: str | os.PathLike[str], names: list[str], wanted: tuple[str, ...], prefix: str) -> None:
     for name in wanted:
         if names.count(name) != 1:
             what = "came twice" if name in names else "is missing"
-            raise SonarError(f"{shown(path)}: column {prefix}{name} {what}; allowed are {', '.join(wanted)}, each once")
+            raise SonarError(
+                f"{shown(filename)}: column {prefix}{name} {what}; allowed are {', '.join(wanted)}, each once"
+            )
     for name in names:
         if name not in wanted:
             raise SonarError(
-                f"{shown(path)}: unknown column {prefix}{shown(name, 40)}; allowed are {', '.join(wanted)}"
+                f"{shown(filename)}: unknown column {prefix}{shown(name, 40)}; allowed are {', '.join(wanted)}"
             )
 
 
-def _check_type(path: str | os.PathLike[str], pa: Any, name: str, shown_name: str, kind: Any) -> None:
-    if pa.types.is_integer(kind) or (name in MAY_BE_ABSENT and pa.types.is_null(kind)):
+def _check_type(filename: str | os.PathLike[str], pa: Any, name: str, shown_name: str, kind: Any) -> None:
+    if pa.types.is_integer(kind) or (name in OPTIONAL_VALUES and pa.types.is_null(kind)):
         return
-    if name in WHOLE or not pa.types.is_floating(kind):
-        wanted = "an integer type" if name in WHOLE else "a floating or integer type"
-        raise SonarError(f"{shown(path)}: column {shown_name}: type {shown(str(kind), 80)} came; allowed is {wanted}")
+    if name in INTEGER_COLUMNS or not pa.types.is_floating(kind):
+        wanted = "an integer type" if name in INTEGER_COLUMNS else "a floating or integer type"
+        raise SonarError(
+            f"{shown(filename)}: column {shown_name}: type {shown(str(kind), 80)} came; allowed is {wanted}"
+        )
 
 
-def _batch(path: str | os.PathLike[str], pa: Any, batch: Any, row: int) -> dict[str, np.ndarray]:
-    """Some scans as arrays: the scan columns, the number of echoes of each scan, the echo columns."""
+def _batch(filename: str | os.PathLike[str], pa: Any, batch: Any, row: int) -> dict[str, np.ndarray]:
+    """Arrays of a record batch: the scan columns, the number of echoes of each scan, the echo columns."""
     lists = batch.column("echoes")
     missing = _nulls(lists)
     if missing.any():
-        _fail(path, row + int(np.argmax(missing)), "echoes", "null", "a list, empty where nothing was heard")
+        _fail(filename, row + int(np.argmax(missing)), "echoes", "null", "a list, empty where nothing was heard")
     column = {"echoes": np.asarray(lists.value_lengths().cast(pa.int64()))}
     for name in SCAN_COLUMNS[:-1]:
         values = batch.column(name)
         missing = _nulls(values) if name == "scan" else np.zeros(0, bool)
         if missing.any():
-            _fail(path, row + int(np.argmax(missing)), name, "null", ALLOWED[name])
+            _fail(filename, row + int(np.argmax(missing)), name, "null", ALLOWED[name])
         column[name] = _array(pa, name, values)
 
     structs = lists.flatten()
@@ -229,11 +240,11 @@ def _batch(path: str | os.PathLike[str], pa: Any, batch: Any, row: int) -> dict[
     fields = dict(zip((field.name for field in structs.type), structs.flatten(), strict=True))
     column["amplitude"] = np.full(len(structs), np.nan)
     for name, values in fields.items():
-        missing = _nulls(values) if name not in MAY_BE_ABSENT else _nulls(structs)
+        missing = _nulls(values) if name not in OPTIONAL_VALUES else _nulls(structs)
         if missing.any():
             echo = int(np.argmax(missing))
             i = int(place[echo])
-            _fail(path, row + i, f"echoes[{echo - first[i]}].{name}", "null", ALLOWED[name])
+            _fail(filename, row + i, f"echoes[{echo - first[i]}].{name}", "null", ALLOWED[name])
         column[name] = _array(pa, name, values)
     return column
 
@@ -243,5 +254,5 @@ def _nulls(values: Any) -> np.ndarray:
 
 
 def _array(pa: Any, name: str, values: Any) -> np.ndarray:
-    kind = pa.int64() if name in WHOLE else pa.float64()
+    kind = pa.int64() if name in INTEGER_COLUMNS else pa.float64()
     return values.cast(kind).to_numpy(zero_copy_only=False)

@@ -1,4 +1,8 @@
-"""Logs that are recorded live, and what a killed process left of them."""
+"""Recording of scan logs, and recovery of a log whose recording process was killed.
+
+A Parquet file cannot be read before its footer is written. Its scans are therefore recorded as a CSV journal beside it
+and converted at the end. A marker file holds the number of bytes of complete scans.
+"""
 
 import os
 import warnings
@@ -10,60 +14,57 @@ from jaxsonar.hardware.recorder_base import Recorder, recording_marker
 from jaxsonar.scans.scan_log import Log, log_format
 
 
-class CutShort(UserWarning):
-    """A recording was not finished: its process was killed, or is still writing."""
+class TruncatedRecording(UserWarning):
+    """A recording is incomplete: its process was killed or is still writing."""
 
 
 class ParquetRecorder(CsvRecorder):
-    """A scan log as Parquet by way of a journal beside it, a CSV log.
+    """Recorder of a Parquet log by way of a CSV journal beside it."""
 
-    Of a Parquet file nothing can be read before its end is written; of the journal everything can, at any time.
-    """
-
-    def __init__(self, path: str | os.PathLike[str]):
-        """Begin a log.
+    def __init__(self, filename: str | os.PathLike[str]):
+        """Start a log.
 
         Raises:
-            SonarError: it cannot be written, or the extra is missing.
+            SonarError: the file cannot be written, or the parquet extra is missing.
         """
         from jaxsonar.scans.parquet_log import write_parquet
 
-        self._target = Path(path)
-        # An empty log first: a missing extra or folder shows now, and what was there before is gone.
-        write_parquet(Log.from_scans([]), path)
-        super().__init__(journal_of(path), marker=recording_marker(path))
+        self._target = Path(filename)
+        # Write an empty log first: a missing extra or folder is reported now, and an old log is replaced.
+        write_parquet(Log.from_scans([]), filename)
+        super().__init__(journal_filename(filename), marker=recording_marker(filename))
 
     def close(self) -> None:
-        """Turn the journal into Parquet, and take it away."""
+        """Convert the journal to Parquet and delete it."""
         if not self._descriptors:
             return
         from jaxsonar.scans.csv_log import read_csv
         from jaxsonar.scans.parquet_log import write_parquet
 
-        journal = journal_of(self._target)
+        journal = journal_filename(self._target)
         write_parquet(read_csv(journal), self._target)
         super().close()
         journal.unlink()
 
 
-def journal_of(path: str | os.PathLike[str]) -> Path:
-    """The CSV log beside a Parquet file that is being recorded."""
-    return Path(f"{os.fspath(path)}.recording.csv")
+def journal_filename(filename: str | os.PathLike[str]) -> Path:
+    """Filename of the CSV journal of a Parquet log that is being recorded."""
+    return Path(f"{os.fspath(filename)}.recording.csv")
 
 
-def open_record(path: str | os.PathLike[str]) -> Recorder:
-    """Begin a record: ``.csv``, ``.parquet`` or ``.mcap``; see ``hardware.recording.open_recorder``.
+def open_log_recorder(filename: str | os.PathLike[str]) -> Recorder:
+    """Start a recording as ``.csv``, ``.parquet`` or ``.mcap``; see ``hardware.recorder.open_recorder``.
 
     Raises:
-        SonarError: another suffix, a place that cannot be written, a missing extra.
+        SonarError: another suffix, a file that cannot be written, or a missing extra.
     """
-    return ParquetRecorder(path) if Path(path).suffix.lower() == ".parquet" else open_recorder(path)
+    return ParquetRecorder(filename) if Path(filename).suffix.lower() == ".parquet" else open_recorder(filename)
 
 
-def load_cut_short(path: str | os.PathLike[str]) -> Log:
-    """What is whole of a log that is being recorded, or was when its process was killed.
+def recover_recording(filename: str | os.PathLike[str]) -> Log:
+    """The complete scans of a log that is being recorded, or whose recording process was killed.
 
-    ``CutShort`` is warned of where anything is left out, or had to be taken from a journal.
+    Warns with ``TruncatedRecording`` if a scan was dropped or the journal was used.
 
     Raises:
         SonarError: as ``load_log``.
@@ -71,31 +72,32 @@ def load_cut_short(path: str | os.PathLike[str]) -> Log:
     from jaxsonar.scans.csv_log import read_csv_text
     from jaxsonar.scans.parquet_log import read_parquet
 
-    parquet = log_format(path) == "parquet"
-    source = journal_of(path) if parquet else path
-    if parquet and _later(path, source):
-        return read_parquet(path)  # only the journal was left to be taken away
+    parquet = log_format(filename) == "parquet"
+    source = journal_filename(filename) if parquet else filename
+    if parquet and _is_newer(filename, source):
+        return read_parquet(filename)  # complete; only the journal was not yet deleted
     text = read_bytes(source, what="a scan log (CSV)")
-    said = read_bytes(recording_marker(path), what="the size of a log").strip()
-    size = int(said) if said.isdigit() else 0
-    whole = text[:size] if len(text) >= size else _without_last_scan(text)
-    log = read_csv_text(source, whole) if b"\n" in whole else Log.from_scans([])
-    if parquet or len(whole) < len(text):
-        taken = f", taken from {shown(source)}" if parquet else "; a last one is not whole"
-        text = f"{shown(path)}: the recording was cut short: {len(log)} scans{taken}"
-        warnings.warn(text, CutShort, stacklevel=3)
+    marker = read_bytes(recording_marker(filename), what="the size of a log").strip()
+    size = int(marker) if marker.isdigit() else 0
+    complete = text[:size] if len(text) >= size else _without_last_scan(text)
+    log = read_csv_text(source, complete) if b"\n" in complete else Log.from_scans([])
+    if parquet or len(complete) < len(text):
+        detail = f", taken from {shown(source)}" if parquet else "; a last one is not whole"
+        message = f"{shown(filename)}: the recording was cut short: {len(log)} scans{detail}"
+        warnings.warn(message, TruncatedRecording, stacklevel=3)
     return log
 
 
-def _later(path: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
+def _is_newer(filename: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
+    """Whether a file exists and is not older than another one."""
     try:
-        return os.stat(path).st_mtime_ns >= os.stat(other).st_mtime_ns
+        return os.stat(filename).st_mtime_ns >= os.stat(other).st_mtime_ns
     except OSError:
-        return os.path.exists(path)
+        return os.path.exists(filename)
 
 
 def _without_last_scan(text: bytes) -> bytes:
-    """The rows before the last scan: of a file that is shorter than it should be, it may lack some."""
+    """The rows before the last scan, which may be incomplete in a file that is shorter than its marker says."""
     rows = text.splitlines(keepends=True)
     if rows and not rows[-1].endswith(b"\n"):
         rows.pop()

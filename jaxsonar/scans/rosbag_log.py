@@ -1,14 +1,14 @@
-"""Scans from ROS bags, ROS 1 and 2, without ROS (extra ``ros``).
+"""Scans from bags of ROS 1 and ROS 2, without a ROS installation (extra ``ros``).
 
-There is no message for what a ring hears, so this is what is read: ``sensor_msgs/Range``, one direct echo each, and
+ROS has no message type for cross echoes. These messages are read: ``sensor_msgs/Range``, one direct echo each, and
 ``nav_msgs/Odometry``.
 
-- The sensor is the number at the end of ``header.frame_id`` or, without one there, of the topic: ``sonar_7`` is
+- The sensor index is the number at the end of ``header.frame_id`` or, if it has none, of the topic: ``sonar_7`` is
   sensor 7 of the ring.
-- ``range`` counts as a half path length at 343.2 m/s. What is not finite, or not within ``min_range`` and below
-  ``max_range``, is no echo (REP 117, and drivers older than it).
-- A scan ends where a sensor speaks that has spoken in it already. Its stamp is that of its last message; its pose is
-  the latest odometry before that.
+- ``range`` is a half path length at 343.2 m/s. A value that is not finite, less than ``min_range``, or not less than
+  ``max_range`` means no echo (REP 117, and older drivers).
+- A scan ends before the second message of any sensor. Its stamp is that of its last message, and its pose is the latest
+  odometry before that message.
 """
 
 import math
@@ -27,15 +27,15 @@ from jaxsonar.scans.scan_log import Scan
 RANGE, ODOMETRY = "sensor_msgs/msg/Range", "nav_msgs/msg/Odometry"
 
 
-def bag_scans(path: str | os.PathLike[str], *, name: str) -> Iterator[Scan]:
-    """The scans of a bag, one after another, numbered from 0.
+def read_bag_scans(filename: str | os.PathLike[str], *, name: str) -> Iterator[Scan]:
+    """The scans of a bag in order, numbered from 0.
 
     Args:
-        path: ``.bag``, ``.db3``, ``.mcap``, or the folder of a ROS 2 bag.
-        name: what messages call it.
+        filename: ``.bag``, ``.db3``, ``.mcap``, or the folder of a ROS 2 bag.
+        name: name of the bag in error messages.
 
     Raises:
-        SonarError: it cannot be read, holds no ranges or does not say of which sensor, or the extra is missing.
+        SonarError: the bag cannot be read or contains no ranges, a sensor index is missing, or the extra is missing.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -43,43 +43,46 @@ def bag_scans(path: str | os.PathLike[str], *, name: str) -> Iterator[Scan]:
     except ImportError:
         raise SonarError(f"{shown(name)}: bags need the extra ros: pip install 'jaxsonar[ros]'") from None
     try:
-        with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        with AnyReader([Path(filename)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
             yield from _scans(bag, name)
     except SonarError:
         raise
-    except Exception as failure:  # whatever the library and its databases say of bytes that are no bag
+    except Exception as failure:  # the library and its databases raise many types for invalid bags
         raise SonarError(f"{shown(name)}: {reason(failure)}; needed is a whole bag") from None
 
 
 def _scans(bag: Any, name: str) -> Iterator[Scan]:
+    """The scans of an open bag."""
     wanted = [connection for connection in bag.connections if connection.msgtype in (RANGE, ODOMETRY)]
     if not any(connection.msgtype == RANGE for connection in wanted):
         held = ", ".join(sorted({connection.msgtype for connection in bag.connections})) or "nothing"
         raise SonarError(f"{shown(name)}: {shown(held)} came; needed are messages {RANGE}")
     latest = pose = np.full(3, np.nan)
-    number, stamp, heard = 0, 0.0, dict[int, float]()
+    number, stamp, ranges = 0, 0.0, dict[int, float]()
     for connection, time_ns, data in bag.messages(connections=wanted):
         message = bag.deserialize(data, connection.msgtype)
         if connection.msgtype == ODOMETRY:
             latest = _pose(message.pose.pose)
             continue
         sensor = _sensor(message.header.frame_id, connection.topic, name)
-        if sensor in heard:
-            yield _scan(number, stamp, pose, heard)
-            number, heard = number + 1, {}
+        if sensor in ranges:
+            yield _scan(number, stamp, pose, ranges)
+            number, ranges = number + 1, {}
         pose, stamp = latest, _stamp(message.header.stamp) or time_ns * 1e-9
-        heard[sensor] = _echo(message)
-    if heard:
-        yield _scan(number, stamp, pose, heard)
+        ranges[sensor] = _range(message)
+    if ranges:
+        yield _scan(number, stamp, pose, ranges)
 
 
-def _scan(number: int, stamp: float, pose: np.ndarray, heard: dict[int, float]) -> Scan:
-    sensor = np.array([k for k, range_ in heard.items() if not math.isnan(range_)], dtype=np.int64)
-    ranges = np.array([range_ for range_ in heard.values() if not math.isnan(range_)])
-    return Scan(number, stamp, pose, sensor, sensor, ranges, np.full(len(sensor), np.nan))
+def _scan(number: int, stamp: float, pose: np.ndarray, ranges: dict[int, float]) -> Scan:
+    """A scan of direct echoes from the range of each sensor; NaN is no echo."""
+    sensor = np.array([k for k, distance in ranges.items() if not math.isnan(distance)], dtype=np.int64)
+    distance = np.array([distance for distance in ranges.values() if not math.isnan(distance)])
+    return Scan(number, stamp, pose, sensor, sensor, distance, np.full(len(sensor), np.nan))
 
 
 def _sensor(frame: str, topic: str, name: str) -> int:
+    """Sensor index from the frame or the topic."""
     for text in (frame, topic):
         if found := re.search(r"(\d{1,9})\D*$", text):
             return int(found[1])
@@ -87,18 +90,19 @@ def _sensor(frame: str, topic: str, name: str) -> int:
     raise SonarError(f"{shown(name)}: {came}; needed is the sensor's number at the end of either")
 
 
-def _echo(message: Any) -> float:
-    """Half path length, metres; NaN where nothing was heard."""
-    heard = math.isfinite(message.range) and message.range > 0 and message.min_range <= message.range
-    return float(message.range) if heard and message.range < message.max_range else math.nan
+def _range(message: Any) -> float:
+    """Half path length, metres; NaN for no echo."""
+    valid = math.isfinite(message.range) and message.range > 0 and message.min_range <= message.range
+    return float(message.range) if valid and message.range < message.max_range else math.nan
 
 
 def _stamp(stamp: Any) -> float:
+    """Seconds of a ROS time."""
     return stamp.sec + stamp.nanosec * 1e-9
 
 
 def _pose(pose: Any) -> np.ndarray:
-    """x, y (m) and theta (rad) of a pose in space."""
+    """x, y (m) and theta (rad) of a pose in space; NaN if it is not finite."""
     q = pose.orientation
     theta = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
     planar = np.array([pose.position.x, pose.position.y, theta])

@@ -1,4 +1,4 @@
-"""The scan log: what a ring heard, scan after scan, in columns. NumPy only, so that tools around it start fast."""
+"""Scan log: the echoes of consecutive scans in columns. Imports NumPy only, so that tools start fast."""
 
 import operator
 import os
@@ -14,7 +14,7 @@ from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
 
 LARGEST_SENSOR = 2**31 - 1
-"""Sensor indices are 32-bit in Parquet, so a log in memory holds no larger ones."""
+"""Largest sensor index; sensor indices have 32 bits in Parquet."""
 
 ALLOWED = {
     "scan": "a whole number that no earlier scan has",
@@ -25,17 +25,17 @@ ALLOWED = {
     "range": "a finite number of metres above 0",
     "amplitude": "a finite number, or nothing",
 }
-"""What each column may hold, in the words of every message about it."""
+"""Allowed values of each column, as stated in error messages."""
 
 
-class LogFault(SonarError):
-    """One value that no log can hold; readers turn its place in the log into a place in their file."""
+class InvalidLogValue(SonarError):
+    """An invalid value of a log. Readers convert its position in the log to a position in their file."""
 
     def __init__(self, scan: int, echo: int | None, column: str, value: object):
         self.scan = scan
         """Row of the scan in the log, from 0."""
         self.echo = echo
-        """Row of the echo in the log's echo columns, from 0; None where the whole scan is meant."""
+        """Row of the echo in the log's echo columns, from 0; None for a value of the scan."""
         self.column = column
         self.value = value
         place = f"scans[{scan}]" if echo is None else f"scans[{scan}], echoes[{echo}]"
@@ -44,25 +44,25 @@ class LogFault(SonarError):
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What the ring heard in one scan."""
+    """The echoes of one scan."""
 
     scan: int
     """Scan number."""
     stamp: float
-    """Seconds; NaN where there is none."""
+    """Seconds; NaN if unknown."""
     pose: Float[np.ndarray, " 3"]
-    """world_from_robot: x, y (m), theta (rad); NaN where there is none."""
+    """world_from_robot: x, y (m), theta (rad); NaN if unknown."""
     tx: Int[np.ndarray, " echoes"]
-    """Sensor that fired."""
+    """Transmitter."""
     rx: Int[np.ndarray, " echoes"]
-    """Sensor that heard it."""
+    """Receiver."""
     range: Float[np.ndarray, " echoes"]
     """Half path length as reported, metres at the reference speed of sound."""
     amplitude: Float[np.ndarray, " echoes"]
-    """Strength of the echo in the device's own unit; NaN where there is none."""
+    """Amplitude of the echo in the unit of the device; NaN if unknown."""
 
     def as_log(self) -> "Log":
-        """A log of this scan alone."""
+        """A log with this scan only."""
         return Log(
             scan=np.array([self.scan]),
             stamp=np.array([self.stamp], dtype=np.float64),
@@ -77,28 +77,28 @@ class Scan:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Log:
-    """Scans in the order they were taken, one array a column; the arrays are read-only.
+    """Scans in chronological order, one read-only array per column.
 
-    A log is valid once it exists: every value was checked against ``ALLOWED``, so that whatever is written can be read
-    again. ``len(log)`` counts scans, ``log[i]`` is one ``Scan``, ``log[a:b]`` a shorter ``Log``.
+    The constructor checks every value against ``ALLOWED``. Therefore every log can be written and read again.
+    ``len(log)`` is the number of scans, ``log[i]`` is a ``Scan``, and ``log[a:b]`` is a shorter ``Log``.
     """
 
     scan: Int[np.ndarray, " scans"]
-    """Scan number, each once, in any order."""
+    """Scan number, unique, in any order."""
     stamp: Float[np.ndarray, " scans"]
-    """Seconds; NaN where there is none."""
+    """Seconds; NaN if unknown."""
     pose: Float[np.ndarray, "scans 3"]
-    """world_from_robot: x, y (m), theta (rad) from odometry; NaN where there is none."""
+    """world_from_robot: x, y (m), theta (rad) from odometry; NaN if unknown."""
     start: Int[np.ndarray, " scans+1"]
-    """The echoes of scan i are start[i]:start[i + 1]."""
+    """The echoes of scan i have the indices start[i]:start[i + 1]."""
     tx: Int[np.ndarray, " echoes"]
-    """Sensor that fired."""
+    """Transmitter."""
     rx: Int[np.ndarray, " echoes"]
-    """Sensor that heard it."""
+    """Receiver."""
     range: Float[np.ndarray, " echoes"]
-    """Half path length as reported, metres at the reference speed of sound (``Ring.corrected`` takes it from here)."""
+    """Half path length as reported, metres at the reference speed of sound; ``Ring.corrected`` corrects it."""
     amplitude: Float[np.ndarray, " echoes"]
-    """Strength of the echo in the device's own unit; NaN where there is none."""
+    """Amplitude of the echo in the unit of the device; NaN if unknown."""
 
     def __post_init__(self):
         scans, echoes = np.size(self.scan), np.size(self.tx)
@@ -121,34 +121,34 @@ class Log:
         if not np.can_cast(array.dtype, dtype, casting="same_kind") and array.size:
             raise SonarError(f"log: {name} holds {array.dtype}; allowed is what converts safely to {np.dtype(dtype)}")
         array = array.astype(dtype, copy=False).view()
-        array.flags.writeable = False  # of our view only: the caller's own array stays as it was
+        array.flags.writeable = False  # only this view; the caller's array stays writable
         object.__setattr__(self, name, array)
 
     def _check(self) -> None:
         for column in ("tx", "rx"):
             sensor = getattr(self, column)
-            self._refuse_echo((sensor < 0) | (sensor > LARGEST_SENSOR), column)
-        self._refuse_echo(~(np.isfinite(self.range) & (self.range > 0)), "range")
-        self._refuse_echo(np.isinf(self.amplitude), "amplitude")
-        self._refuse_scan(np.isinf(self.stamp), "stamp")
-        self._refuse_scan(~(np.all(np.isfinite(self.pose), axis=-1) | np.all(np.isnan(self.pose), axis=-1)), "pose")
+            self._check_echoes((sensor < 0) | (sensor > LARGEST_SENSOR), column)
+        self._check_echoes(~(np.isfinite(self.range) & (self.range > 0)), "range")
+        self._check_echoes(np.isinf(self.amplitude), "amplitude")
+        self._check_scans(np.isinf(self.stamp), "stamp")
+        self._check_scans(~(np.all(np.isfinite(self.pose), axis=-1) | np.all(np.isnan(self.pose), axis=-1)), "pose")
         if len(self) < 2:
             return
         order = np.argsort(self.scan, kind="stable")
-        came_back = np.zeros(len(self), dtype=bool)
-        came_back[order[1:]] = np.diff(self.scan[order]) == 0
-        self._refuse_scan(came_back, "scan")
+        repeated = np.zeros(len(self), dtype=bool)
+        repeated[order[1:]] = np.diff(self.scan[order]) == 0
+        self._check_scans(repeated, "scan")
 
-    def _refuse_scan(self, bad: np.ndarray, column: str) -> None:
+    def _check_scans(self, bad: np.ndarray, column: str) -> None:
         if bad.any():
             i = int(np.argmax(bad))
-            raise LogFault(i, None, column, getattr(self, column)[i].tolist())
+            raise InvalidLogValue(i, None, column, getattr(self, column)[i].tolist())
 
-    def _refuse_echo(self, bad: np.ndarray, column: str) -> None:
+    def _check_echoes(self, bad: np.ndarray, column: str) -> None:
         if bad.any():
             echo = int(np.argmax(bad))
             i = int(np.searchsorted(self.start, echo, side="right")) - 1
-            raise LogFault(i, echo, column, getattr(self, column)[echo].tolist())
+            raise InvalidLogValue(i, echo, column, getattr(self, column)[echo].tolist())
 
     @classmethod
     def from_echoes(
@@ -163,20 +163,20 @@ class Log:
         pose: Float[np.ndarray, "scans 3"],
         scan: Int[np.ndarray, " scans"] | None = None,
     ) -> "Log":
-        """A log from flat echoes that each name their scan.
+        """A log from flat echoes with the index of their scan.
 
         Args:
-            scan_index: row of the echo's scan, 0 to scans - 1, never falling; a row that is absent heard nothing.
-            tx: sensor that fired.
-            rx: sensor that heard it.
+            scan_index: row of the scan of each echo, 0 to scans - 1, not decreasing; scans without echoes are skipped.
+            tx: transmitter.
+            rx: receiver.
             range: half path length as reported, metres.
-            amplitude: strength, NaN or left out where there is none.
-            stamp: seconds, NaN where there is none; its length is the number of scans.
-            pose: world_from_robot x, y (m), theta (rad), NaN where there is none.
-            scan: scan numbers; 0, 1, 2, ... where left out.
+            amplitude: amplitude, NaN if unknown; all unknown if omitted.
+            stamp: seconds, NaN if unknown; its length is the number of scans.
+            pose: world_from_robot x, y (m), theta (rad), NaN if unknown.
+            scan: scan numbers; 0, 1, 2, ... if omitted.
 
         Raises:
-            SonarError: columns that do not fit together, or a value that no log can hold.
+            SonarError: columns of inconsistent length, or an invalid value.
         """
         scans = len(stamp)
         index = np.asarray(scan_index)
@@ -197,7 +197,7 @@ class Log:
 
     @classmethod
     def from_scans(cls, scans: Sequence[Scan]) -> "Log":
-        """A log of single scans, in the order given."""
+        """A log of these scans, in this order."""
         columns = {
             name: np.concatenate([np.zeros(0), *(getattr(scan, name) for scan in scans)])
             for name in ("tx", "rx", "range", "amplitude")
@@ -272,14 +272,14 @@ class Log:
         return f"Log({len(self)} scans, {len(self.tx)} echoes)"
 
 
-def log_format(path: str | os.PathLike[str]) -> str:
-    """``"csv"`` or ``"parquet"``, from the suffix of a file's name.
+def log_format(filename: str | os.PathLike[str]) -> str:
+    """Format of a log, "csv" or "parquet", from the suffix of its filename.
 
     Raises:
         SonarError: any other suffix.
     """
-    suffix = Path(path).suffix.lower()
+    suffix = Path(filename).suffix.lower()
     if suffix not in (".csv", ".parquet"):
         came = f"suffix '{shown(suffix)}'" if suffix else "no suffix"
-        raise SonarError(f"{shown(path)}: {came} came; allowed for a scan log is .csv or .parquet")
+        raise SonarError(f"{shown(filename)}: {came} came; allowed for a scan log is .csv or .parquet")
     return suffix[1:]

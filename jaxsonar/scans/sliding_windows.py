@@ -62,7 +62,7 @@ def gather_windows(ring: Ring, log: Log, *, length: float) -> tuple[Windows, int
     """Gather the echoes of a log over windows of its trajectory, each echo with the pose at which it was received.
 
     Three things are omitted: readings that were not renewed (``is_fresh_reading``), because they belong to an earlier
-    pose; scans of a robot at rest (``has_moved``); and scans without a pose. No window extends across a scan without a pose.
+    pose; scans of a robot at rest (``has_moved``); and scans without a pose. Windows end at scans without a pose.
 
     Args:
         ring: the sensors.

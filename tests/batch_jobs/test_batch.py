@@ -24,7 +24,7 @@ from jaxsonar.batch_jobs.scan_tables import scan_tables
 from jaxsonar.batch_jobs.shards import split_input
 from jaxsonar.batch_jobs.worker import job_spec, run_shard
 from jaxsonar.detection.settings import hough_settings
-from jaxsonar.scans.log_chunks import csv_parts, csv_reader, parquet_parts, parquet_reader
+from jaxsonar.scans.log_chunks import csv_chunks, csv_chunk_reader, parquet_chunks, parquet_chunk_reader
 from jaxsonar.simulation.poses_csv import load_poses
 
 pa = pytest.importorskip("pyarrow")
@@ -421,7 +421,7 @@ def test_a_folder_with_other_things_is_refused(logs, tmp_path):
 def test_parts_make_the_log(tmp_path, suffix, scans):
     log, path = office(40), tmp_path / f"log.{suffix}"
     save_log(log, path)
-    plan, reader = (csv_parts, csv_reader) if suffix == "csv" else (parquet_parts, parquet_reader)
+    plan, reader = (csv_chunks, csv_chunk_reader) if suffix == "csv" else (parquet_chunks, parquet_chunk_reader)
     parts = plan(path, name="log", scans=scans)
     assert [part.first for part in parts] == list(range(0, 40, scans))
     read = [reader(path, part, name="log")(0, part.scans) for part in parts]
@@ -444,7 +444,7 @@ def test_scans_may_come_in_any_order(tmp_path):
     log = office(9)
     mixed = Log.from_scans([log[k] for k in (5, 2, 8, 0, 1, 7, 3, 6, 4)])
     save_log(mixed, tmp_path / "log.csv")
-    assert not any(part.repeated for part in csv_parts(tmp_path / "log.csv", name="log", scans=4))
+    assert not any(part.repeated for part in csv_chunks(tmp_path / "log.csv", name="log", scans=4))
     rows = pq.read_table(pa.BufferReader(run_shard(JOB, shard(tmp_path / "log.csv")).tables["scans"]))
     assert rows["scan"].to_pylist() == mixed.scan.tolist()
 
@@ -459,7 +459,7 @@ def test_a_log_without_scans_has_no_shards(tmp_path):
 def test_planning_holds_no_log(tmp_path, suffix, monkeypatch):
     """Four times the scans, the same memory."""
     monkeypatch.setattr("jaxsonar.scans.log_chunks.BLOCK", 1 << 16)
-    monkeypatch.setattr("jaxsonar.scans.log_chunks.AT_ONCE", 1 << 10)
+    monkeypatch.setattr("jaxsonar.scans.log_chunks.ROWS_PER_READ", 1 << 10)
     path, peaks = tmp_path / f"log.{suffix}", []
     for scans in (10_000, 40_000):
         echo = np.arange(scans * 4)
@@ -468,7 +468,7 @@ def test_planning_holds_no_log(tmp_path, suffix, monkeypatch):
         log = Log.from_echoes(index, sensor, sensor, 1 + 0.001 * (echo % 7), stamp=none[:, 0], pose=none)
         save_log(log, path)
         del log
-        plan = csv_parts if suffix == "csv" else parquet_parts
+        plan = csv_chunks if suffix == "csv" else parquet_chunks
         before = pa.total_allocated_bytes()
         tracemalloc.start()
         assert sum(part.scans for part in plan(path, name="log", scans=2048)) == scans

@@ -244,7 +244,7 @@ def test_parsing_in_blocks_changes_nothing(scans, block):
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         save_log(log, f"{folder}/a.csv")
         patch.setattr(logs_csv, "BLOCK", block)
-        patch.setattr(logs_csv, "SCANS_AT_ONCE", 2)
+        patch.setattr(logs_csv, "SCANS_PER_WRITE", 2)
         save_log(log, f"{folder}/b.csv")
         assert load_log(f"{folder}/b.csv") == log
         assert Path(f"{folder}/a.csv").read_bytes() == Path(f"{folder}/b.csv").read_bytes()

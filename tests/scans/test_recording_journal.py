@@ -27,7 +27,7 @@ from jaxsonar.hardware.recorder_base import Recorder, recording_marker
 from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler
 from jaxsonar.hardware.transport_base import EndOfStream, LinkEvent, Source, open_source, parse_url
 from jaxsonar.live.replay import messages_of
-from jaxsonar.scans.recording_journal import CutShort, journal_of, open_record
+from jaxsonar.scans.recording_journal import TruncatedRecording, journal_filename, open_log_recorder
 
 SUFFIXES = (".csv", ".parquet", ".mcap")
 
@@ -58,7 +58,7 @@ def test_a_recorded_log_holds_what_came(suffix, tmp_path):
     path = tmp_path / f"log{suffix}"
     save_log(Log.from_scans([]), path)  # what was there before goes
     sent = list(messages())
-    scans, reader = read_all(Given(map(encode, sent)), open_record(path))
+    scans, reader = read_all(Given(map(encode, sent)), open_log_recorder(path))
     assert reader.counts["scans"] == len(scans) == 5
     log = load_log(path)
     assert log.scan.tolist() == list(range(5))
@@ -139,10 +139,10 @@ def test_a_log_that_was_cut_anywhere_opens(suffix, tmp_path):
     ends = [len(as_log(scans[:k]).encode()) for k in range(5)]
     (tmp_path / "whole.csv").write_bytes(text)
     whole = load_log(tmp_path / "whole.csv")
-    recorder = open_record(path)
+    recorder = open_log_recorder(path)
     for scan in scans:
         recorder.scan(scan)
-    mark, journal = recording_marker(path), path if suffix == ".csv" else journal_of(path)
+    mark, journal = recording_marker(path), path if suffix == ".csv" else journal_filename(path)
     assert journal.read_bytes() == text
     assert int(mark.read_text()) == len(text)
     lengths = {*range(ends[0], len(text) + 1, 29), *(end + k for end in ends[1:] for k in (-1, 0, 1))}
@@ -162,7 +162,7 @@ def test_a_log_that_was_cut_anywhere_opens(suffix, tmp_path):
         journal.write_bytes(text[:length])
         mark.write_text(f"{len(text):20d}\n")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CutShort)
+            warnings.simplefilter("ignore", TruncatedRecording)
             log = load_log(path)
         assert log == whole[: len(log)]
     journal.write_bytes(text)
@@ -176,8 +176,8 @@ def test_a_log_that_was_cut_anywhere_opens(suffix, tmp_path):
 
 def test_a_finished_parquet_file_wins_over_what_is_left_of_its_journal(tmp_path):
     path = tmp_path / "log.parquet"
-    journal_of(path).write_text(as_log(assembled(list(messages(2)))))
-    os.utime(journal_of(path), (1, 1))
+    journal_filename(path).write_text(as_log(assembled(list(messages(2)))))
+    os.utime(journal_filename(path), (1, 1))
     recording_marker(path).touch()
     save_log(Log.from_scans([]), path)
     assert len(load_log(path)) == 0
@@ -212,7 +212,7 @@ def test_errors_of_the_reading_thread_reach_the_consumer(tmp_path):
     queue: DropOldestQueue[RawScan] = DropOldestQueue()
     path = tmp_path / "log.csv"
     source = Given([*sent, ValueError("the driver broke")])
-    reader = ReaderThread(source, queue, recorder=open_record(path))
+    reader = ReaderThread(source, queue, recorder=open_log_recorder(path))
     reader.start()
     scans, errors = [], []
     while not queue.ended:
@@ -251,7 +251,7 @@ def test_frames_and_groups_that_cannot_be_are_counted_together():
 @pytest.mark.parametrize("name", ["log.txt", "log", "nowhere/log.csv", "nowhere/log.parquet", "nowhere/log.mcap"])
 def test_records_that_cannot_be(name, tmp_path):
     with pytest.raises(SonarError) as told:
-        open_record(tmp_path / name)
+        open_log_recorder(tmp_path / name)
     assert "allowed" in str(told.value)
     assert os.listdir(tmp_path) == []
 
@@ -292,7 +292,7 @@ def test_a_reader_that_is_stopped_has_written_everything(tmp_path):
     path = tmp_path / "log.csv"
     endless = (encode(message) for message in messages(100_000))
     queue: DropOldestQueue[RawScan] = DropOldestQueue(16)
-    reader = ReaderThread(Given(endless), queue, recorder=open_record(path))
+    reader = ReaderThread(Given(endless), queue, recorder=open_log_recorder(path))
     reader.start()
     while not queue.dropped:
         time.sleep(0.01)
@@ -344,9 +344,9 @@ from jaxsonar.hardware.protocol import encode
 from jaxsonar.hardware.drop_oldest_queue import DropOldestQueue
 from jaxsonar.hardware.reader_thread import ReaderThread
 from jaxsonar.hardware.recorder_base import Recorder
-from jaxsonar.scans.recording_journal import open_record
+from jaxsonar.scans.recording_journal import open_log_recorder
 
-records = [open_record({stem!r} + suffix) for suffix in (".csv", ".parquet", ".mcap")]
+records = [open_log_recorder({stem!r} + suffix) for suffix in (".csv", ".parquet", ".mcap")]
 
 class All(Recorder):
     def __getattribute__(self, name):
@@ -394,7 +394,7 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
         last = max(int(scan) for scan, _ in said)
         for suffix in (".csv", ".parquet"):
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", CutShort)
+                warnings.simplefilter("ignore", TruncatedRecording)
                 log = load_log(stem + suffix)
             assert log.scan.tolist() == list(range(len(log)))
             assert safe < len(log) <= last + 2, (suffix, safe, last)

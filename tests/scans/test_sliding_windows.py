@@ -23,8 +23,8 @@ RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # n
 FOUR = Ring.circular(count=4, beam=1.0, neighbors=0)
 SETTINGS = HoughSettings()
 ROOM = 256
-extent = jax.jit(kernels.extent)
-lines_of_scan = jax.jit(kernels.lines_of_scan, static_argnames="settings")
+endpoints_of = jax.jit(kernels.segment_endpoints)
+lines_of_scan = jax.jit(kernels.tangent_lines, static_argnames="settings")
 turns = st.floats(-3, 3)
 metres = st.floats(-1, 1)
 
@@ -36,7 +36,7 @@ def packed(echoes, *, poses=True, gathered=None):
     for k, (stood, row, reach) in enumerate(echoes):
         path[0, k], reported[0, k], pose[0, k] = row, reach, stood
     gathered = None if gathered is None else jnp.full(1, gathered, jnp.float32)
-    return kernels.Echoes(jnp.asarray(path), jnp.asarray(reported), jnp.asarray(pose) if poses else None, gathered)
+    return kernels.PackedEchoes(jnp.asarray(path), jnp.asarray(reported), jnp.asarray(pose) if poses else None, gathered)
 
 
 def one_scan(echoes):
@@ -83,7 +83,7 @@ def test_a_motion_of_all_poses_moves_the_lines(x, y, turn, seed):
     count = len(echoes)
     normals = np.stack([here.normal_x, here.normal_y], axis=-1)[:count] @ spin.T
     np.testing.assert_allclose(np.stack([there.normal_x, there.normal_y], -1)[:count], normals, atol=2e-6)
-    counts = np.asarray(arcs.arcs.counts)[[path for _, path, _ in echoes]]
+    counts = np.asarray(arcs.arcs.exists)[[path for _, path, _ in echoes]]
     np.testing.assert_allclose(
         np.asarray(there.rho)[:count][counts], (np.asarray(here.rho)[:count] + normals @ [x, y])[counts], atol=5e-6
     )
@@ -94,10 +94,10 @@ def test_a_motion_of_all_poses_moves_the_lines(x, y, turn, seed):
 def test_a_motion_of_line_and_sensors_moves_the_segment(x, y, turn, theta, seed):
     sensors = np.random.default_rng(seed).uniform(-1, 1, (9, 2)).astype(np.float32)
     motion, involved = np.array([x, y, turn]), np.arange(9) % 3 > 0
-    here = extent(jnp.float32(2), jnp.float32(theta), sensors, involved)
+    here = endpoints_of(jnp.float32(2), jnp.float32(theta), sensors, involved)
     rho = 2 + x * math.cos(theta + turn) + y * math.sin(theta + turn)
     moved_sensors = transform_points(motion, sensors.astype(float)).astype(np.float32)
-    there = extent(jnp.float32(rho), jnp.float32(theta + turn), moved_sensors, involved)
+    there = endpoints_of(jnp.float32(rho), jnp.float32(theta + turn), moved_sensors, involved)
     np.testing.assert_allclose(there, transform_points(motion, np.asarray(here, float)), atol=1e-5)
 
 
@@ -151,7 +151,7 @@ def test_gathered_is_a_factor_of_the_threshold(rng, gathered):
     echoes, arcs = mixed_echoes(rng), arc_tables(RING, SETTINGS).arcs
     _, smooth = kernels.accumulators(arcs, packed(echoes, gathered=gathered), settings=SETTINGS)
     came = kernels.vote(arcs, packed(echoes, gathered=gathered), settings=SETTINGS).occupied
-    np.testing.assert_array_equal(came, np.asarray(smooth) > np.float32(arcs.level) * np.float32(gathered))
+    np.testing.assert_array_equal(came, np.asarray(smooth) > np.float32(arcs.vote_threshold) * np.float32(gathered))
 
 
 # poses and logs
