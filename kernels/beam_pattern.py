@@ -1,57 +1,78 @@
-"""Where sensors really look, from which walls they heard and which they did not."""
+"""Directional sensitivity of the sensors, estimated from which walls each of them detected and which it did not."""
+
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .array_geometry import Sensors, echo_paths
+from .array_geometry import SensorArray, echo_paths
 from .data_association import CandidateReflections
 from .geometry import signed_angle
 from .landmarks import Landmarks, predict_reflection
 
-_CENTRE_SD = 0.2  # rad; what is expected of the directions of sensors
-_BORDER = (0.1, 0.3)  # rad and relative; how wide the border of a cone is, without which few sightings make it a cliff
+
+@dataclass(frozen=True)
+class BeamPatternPrior:
+    """Priors of the beam patterns. All of them were chosen by hand."""
+
+    centre_sd: float = 0.2
+    """Standard deviation of the direction of a sensor around its heading, radians."""
+    rolloff_width: float = 0.1
+    """Median of the rolloff width, radians. Without a prior, few observations would make it 0."""
+    log_rolloff_sd: float = 0.3
+    """Standard deviation of the logarithm of the rolloff width."""
+
+
+PRIOR = BeamPatternPrior()
 
 
 class BeamPattern(eqx.Module):
-    """Detection cones as their echoes show them."""
+    """Detection probability of direct echoes as a function of the direction of arrival."""
 
     centre: Float[Array, " sensors"]
-    """How far each sensor looks to the left of its heading, radians."""
+    """Centre of the beam of each sensor, counter-clockwise from its heading, radians."""
     half_width: Float[Array, ""]
-    """Off-axis angle at which half of the echoes are heard that are heard on the axis, radians."""
+    """Angle from the centre at which the detection probability is half of that at the centre, radians."""
     log_rolloff_width: Float[Array, ""]
-    """Logarithm of the width of that border, radians."""
+    """Logarithm of the angle over which the probability falls, radians."""
     detection_log_odds: Float[Array, ""]
-    """Log odds that an echo on the axis is heard."""
+    """Log odds of the detection at the centre."""
 
 
 @jax.jit
 def off_axis_angles(
-    sensors: Sensors,
-    scene: Landmarks,
+    sensors: SensorArray,
+    landmarks: Landmarks,
     candidates: CandidateReflections,
     poses: Float[Array, "scans 3"],
     world: Int[Array, " scans"],
 ) -> Float[Array, "scans candidates sensors"]:
-    """Direction from which every sensor's own echo of every candidate would arrive, from its heading, radians.
+    """Direction of arrival of every sensor's direct echo of every candidate, from its heading, radians.
 
-    NaN where there is none: behind the sensor, beyond the maximum range, beside the wall, in another world. The ring's
-    first paths are the direct ones.
+    NaN where there is no such echo: behind the sensor, beyond the maximum range, beside the wall, in another map. The
+    ring's first paths are the direct ones.
+
+    Args:
+        sensors: the ring.
+        landmarks: of all maps.
+        candidates: reflections at these landmarks.
+        poses: world_from_robot of the scans, metres and radians.
+        world: the map in which each scan was taken.
     """
     count = sensors.heading.shape[0]
     paths = jax.tree.map(lambda leaf: leaf[:count], echo_paths(sensors))
     wide = eqx.tree_at(lambda p: p.cone, paths, jnp.full_like(paths.cone, 2))  # half the plane
 
-    def one(pose, here, reflection, own, first, second, path):
-        reach, share, arrival = predict_reflection(pose, reflection, first, second, path)
-        axis = path.axes[0]
-        angle = signed_angle(axis, arrival)
-        return jnp.where((share > 0) & (reach < sensors.max_range) & (here == own), angle, jnp.nan)
+    def one_echo(pose, scan_world, reflection, candidate_world, first, second, path):
+        distance, visibility, arrival = predict_reflection(pose, reflection, first, second, path)
+        angle = signed_angle(path.axes[0], arrival)
+        exists = (visibility > 0) & (distance < sensors.max_range) & (scan_world == candidate_world)
+        return jnp.where(exists, angle, jnp.nan)
 
-    first, second = scene.take(candidates.reflection.first), scene.take(candidates.reflection.second)
-    each = jax.vmap(one, in_axes=(None, None, None, None, None, None, 0))
+    first, second = landmarks.take(candidates.reflection.first), landmarks.take(candidates.reflection.second)
+    each = jax.vmap(one_echo, in_axes=(None, None, None, None, None, None, 0))
     each = jax.vmap(each, in_axes=(None, None, 0, 0, 0, 0, None))
     each = jax.vmap(each, in_axes=(0, 0, None, None, None, None, None))
     return each(poses, world, candidates.reflection, candidates.world, first, second, wide)
@@ -59,24 +80,23 @@ def off_axis_angles(
 
 def beam_negative_log_likelihood(
     beams: BeamPattern,
-    sensor: Int[Array, " sightings"],
-    angle: Float[Array, " sightings"],
-    heard: Bool[Array, " sightings"],
-    counts: Bool[Array, " sightings"],
+    sensor: Int[Array, " observations"],
+    angle: Float[Array, " observations"],
+    detected: Bool[Array, " observations"],
+    valid: Bool[Array, " observations"],
 ) -> Float[Array, ""]:
-    """Negative logarithm of the likelihood of what was heard and what was not, and of what is expected of sensors.
+    """Negative log-likelihood of detections and missed detections, plus the negative log-prior, nats.
 
     Args:
-        beams: the cones.
-        sensor: which one could have heard.
-        angle: from which direction, radians from its heading.
-        heard: whether it did.
-        counts: False for padding.
+        beams: the beam pattern.
+        sensor: index of the sensor of each observation.
+        angle: direction of arrival from its heading, radians.
+        detected: whether the sensor reported the echo.
+        valid: False for padding.
     """
     inside = (beams.half_width - jnp.abs(angle - beams.centre[sensor])) / jnp.exp(beams.log_rolloff_width)
-    log_heard = jax.nn.log_sigmoid(beams.detection_log_odds) + jax.nn.log_sigmoid(inside)
-    log_not = jnp.log1p(-jnp.exp(jnp.minimum(log_heard, -1e-6)))
-    log_likelihood = jnp.where(counts, jnp.where(heard, log_heard, log_not), 0).sum()
-    width, spread = _BORDER
-    expected = (beams.centre**2).sum() / _CENTRE_SD**2 + ((beams.log_rolloff_width - jnp.log(width)) / spread) ** 2
-    return 0.5 * expected - log_likelihood
+    log_detected = jax.nn.log_sigmoid(beams.detection_log_odds) + jax.nn.log_sigmoid(inside)
+    log_missed = jnp.log1p(-jnp.exp(jnp.minimum(log_detected, -1e-6)))
+    log_likelihood = jnp.where(valid, jnp.where(detected, log_detected, log_missed), 0).sum()
+    rolloff = (beams.log_rolloff_width - jnp.log(PRIOR.rolloff_width)) / PRIOR.log_rolloff_sd
+    return 0.5 * ((beams.centre**2).sum() / PRIOR.centre_sd**2 + rolloff**2) - log_likelihood

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .array_geometry import Sensors
+from .array_geometry import SensorArray
 from .geometry import normal, tangent, wrap_angle
 from .landmarks import Landmarks, Reflection, landmark_in_robot_frame
 from .measurement_model import expected_range, reported_range
@@ -48,7 +48,7 @@ class Unknowns(eqx.Module):
 class LeastSquaresProblem(eqx.Module):
     """Measurements and priors."""
 
-    sensors: Sensors
+    sensors: SensorArray
     """The ring at coordinates 0."""
     basis: Float[Array, "parameters coordinates"]
     """Columns: changes of the range offsets (sensors), of the logarithm of the speed of sound, and of the positions
@@ -88,7 +88,7 @@ class Jacobians(eqx.Module):
     d_odometry_d_coordinates: Float[Array, "steps 3 coordinates"]
 
 
-def apply_parameters(sensors: Sensors, change: Float[Array, " parameters"]) -> Sensors:
+def apply_parameters(sensors: SensorArray, change: Float[Array, " parameters"]) -> SensorArray:
     """The ring after a change of its parameters (offsets, logarithm of the speed of sound, positions).
 
     Args:
@@ -199,7 +199,7 @@ class EchoGeometry(NamedTuple):
 
 
 def echo_geometry(
-    sensors: Sensors, landmarks: Landmarks, path: Int[Array, ""], reflection: Reflection, pose: Float[Array, "3"]
+    sensors: SensorArray, landmarks: Landmarks, path: Int[Array, ""], reflection: Reflection, pose: Float[Array, "3"]
 ) -> tuple[EchoGeometry, tuple[Landmarks, Landmarks]]:
     """What ONE echo depends on, and its two landmarks."""
     tx, rx = sensors.tx[path], sensors.rx[path]

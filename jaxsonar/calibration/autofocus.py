@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.kernels.array_geometry import Sensors
+from jaxsonar.kernels.array_geometry import SensorArray
 from jaxsonar.kernels.autofocus import ring_focus_measure
 from jaxsonar.kernels.hough_accumulator import HoughSettings
 from jaxsonar.kernels.shape_buckets import bucket_size
@@ -76,7 +76,7 @@ def autofocus_ring(ring: Ring, log: Log, *, poses: bool, speed: bool, scans: int
     )
 
 
-def _chosen(ring: Ring, log: Log, poses: bool, most: int) -> tuple[kernels.Echoes, float]:
+def _chosen(ring: Ring, log: Log, poses: bool, most: int) -> tuple[kernels.PackedEchoes, float]:
     """Packed echoes, all in one row if there are poses, and how far from the origin the sensors are, metres."""
     flat, _ = FlatEchoes.from_log(ring, log)
     usable = np.diff(flat.start) > 0
@@ -111,12 +111,12 @@ def _chosen(ring: Ring, log: Log, poses: bool, most: int) -> tuple[kernels.Echoe
     path, reported = np.zeros(shape, np.int32), np.full(shape, np.nan, np.float32)
     path[row, column] = flat.path[echo]
     reported[row, column] = flat.reported[echo]
-    return kernels.Echoes(jnp.asarray(path), jnp.asarray(reported), None if pose is None else jnp.asarray(pose)), size
+    return kernels.PackedEchoes(jnp.asarray(path), jnp.asarray(reported), None if pose is None else jnp.asarray(pose)), size
 
 
 @partial(jax.jit, static_argnames=("settings", "points", "speed"))
 def _momentum_ascent(
-    sensors: Sensors, echoes: kernels.Echoes, *, settings: HoughSettings, points: int, speed: bool
+    sensors: SensorArray, echoes: kernels.PackedEchoes, *, settings: HoughSettings, points: int, speed: bool
 ) -> tuple[Float[Array, " parameters"], Float[Array, ""]]:
     """Momentum steps of falling length on sharpness and prior, coarse to fine, in standard deviations of the prior.
 

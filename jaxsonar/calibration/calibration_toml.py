@@ -7,7 +7,7 @@ import numpy as np
 import tomli_w
 from jaxtyping import Float
 
-from jaxsonar.calibration.calibrate import Calibration
+from jaxsonar.calibration.calibration_result import Calibration
 from jaxsonar.fileio.atomic_files import open_output
 from jaxsonar.sensors.ring_toml import ring_toml
 

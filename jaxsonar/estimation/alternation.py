@@ -1,67 +1,79 @@
-"""Map, settle, map again: the loop that calibration and smoothing share."""
+"""Alternation of mapping and adjustment, the loop that calibration and smoothing share."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
-from jaxsonar.estimation.landmark_map import Surroundings, surroundings
-from jaxsonar.estimation.robust_adjustment import Settled, State
+from jaxsonar.estimation.adjustment_state import AdjustmentResult, AdjustmentState
+from jaxsonar.estimation.landmark_map import LandmarkMap, landmark_map_of
 from jaxsonar.mapping.global_map import GlobalMap
 
-AGAIN = 0.01
-"""Metres; scale of the first association after the map was made anew."""
-MAPS = 5
-"""Made anew at most, as long as each explains more echoes."""
-_GROWN = 1.005  # by so much
+
+@dataclass(frozen=True)
+class AlternationSettings:
+    """Constants of the alternation. All of them were chosen by hand."""
+
+    max_maps: int = 5
+    """Maps that are built at most."""
+    later_scale: float = 0.01
+    """Initial scale of the robust loss from the second map on, metres."""
+    min_growth: float = 1.005
+    """Stop when the number of explained echoes grows by less than this factor."""
 
 
-class Round(NamedTuple):
-    """Maps, one for every world, and what settled around them."""
+SETTINGS = AlternationSettings()
 
-    worlds: list[GlobalMap]
-    settled: Settled
+
+class AlternationResult(NamedTuple):
+    """Maps, one per world, and the adjustment of their landmarks."""
+
+    maps: list[GlobalMap]
+    adjustment: AdjustmentResult
 
     @property
-    def used(self) -> int:
-        """Echoes that are explained."""
-        return int(self.settled.used.sum())
+    def explained_count(self) -> int:
+        """Number of echoes that the landmarks explain."""
+        return int(self.adjustment.used.sum())
 
 
-def alternated(
-    state: State,
+def alternate(
+    state: AdjustmentState,
     *,
-    mapped: Callable[[State], list[GlobalMap]],
-    settle: Callable[[State, float], Settled],
-    widest: float,
-    say: Callable[[str], None],
-    maps: int = MAPS,
-    around: Callable[[list[GlobalMap]], Surroundings] | None = None,
-) -> Round | None:
-    """The map so far; echoes to its reflectors and least squares, closer and closer; the same from there.
+    build_maps: Callable[[AdjustmentState], list[GlobalMap]],
+    adjust: Callable[[AdjustmentState, float], AdjustmentResult],
+    initial_scale: float,
+    progress: Callable[[str], None],
+    max_maps: int = SETTINGS.max_maps,
+    landmarks_of: Callable[[list[GlobalMap]], LandmarkMap] | None = None,
+    settings: AlternationSettings = SETTINGS,
+) -> AlternationResult | None:
+    """Build a map from the current poses, adjust poses and landmarks, and repeat while more echoes are explained.
 
     Args:
-        state: where to begin; its reflectors are not looked at.
-        mapped: the maps of a state.
-        settle: lets a state settle, with this scale of the first association (metres).
-        widest: that of the first round.
-        say: told what is being done.
-        maps: made anew so often at most, as long as each explains more echoes.
-        around: makes the reflectors of maps; all scans of a world may hear all of them if left out.
+        state: initial values; its landmarks are ignored.
+        build_maps: the maps at a state, one per world.
+        adjust: adjusts a state, with this initial scale of the robust loss (metres).
+        initial_scale: that scale for the first map.
+        progress: called with a description of each step.
+        max_maps: maps that are built at most.
+        landmarks_of: the landmarks of maps; by default every scan of a world may observe all of its landmarks.
+        settings: constants of the loop.
 
     Returns:
-        The best round, or None where no echo fits the first map.
+        The best result, or None if no echo fits the first map.
     """
-    around = around or (lambda worlds: surroundings(worlds, tied=False))
-    found = None
-    for _ in range(maps):
-        say("building the map")
-        worlds = mapped(state)
-        say("least squares")
-        settled = settle(state._replace(around=around(worlds)), widest if found is None else AGAIN)
-        before = 0 if found is None else found.used
-        if settled.used.sum() <= before:
+    landmarks_of = landmarks_of or (lambda maps: landmark_map_of(maps, tie_corners=False))
+    best, best_count = None, 0
+    for _ in range(max_maps):
+        progress("building the map")
+        maps = build_maps(state)
+        progress("least squares")
+        scale = initial_scale if best is None else settings.later_scale
+        found = AlternationResult(maps, adjust(state._replace(landmark_map=landmarks_of(maps)), scale))
+        if found.explained_count <= best_count:
             break
-        found = Round(worlds, settled)
-        if found.used <= _GROWN * before:
+        growing = found.explained_count > settings.min_growth * best_count
+        best, best_count, state = found, found.explained_count, found.adjustment.state
+        if not growing:
             break
-        state = settled.state
-    return found
+    return best

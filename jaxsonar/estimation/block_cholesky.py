@@ -1,9 +1,9 @@
-"""Sparse normal equations, eliminated block by block (multifrontal Cholesky); covariances of every block.
+"""Multifrontal block Cholesky factorisation of sparse normal equations, and marginal covariances of every block.
 
-A block is a pose, a reflector, or whatever hangs on all of them. A pose hears the few reflectors around it, so in a
-good order of elimination each block has few neighbors left, however many there are in all: time and room grow with the
-length of the path. The same recursion backwards gives the blocks along the diagonal of the inverse (Takahashi), without
-the inverse.
+A block is a pose, a landmark, or a group of parameters on which all terms depend. A pose is connected to the few
+landmarks around it. In a fill-reducing order of elimination each block therefore has few neighbors left, and time and
+memory grow linearly with the length of the trajectory. The same recursion in reverse order yields the blocks along the
+diagonal of the inverse without the inverse itself (Takahashi et al. 1973).
 """
 
 from collections.abc import Sequence
@@ -15,193 +15,213 @@ from scipy.linalg.lapack import dpotrf, dpotri  # pyright: ignore[reportAttribut
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
+MAX_LAPACK_SIZE = 8
+"""Larger blocks are inverted by NumPy: for these SciPy's ``dpotrf`` starts threads, which made a block of 26 rows 100
+times slower (measured on two busy cores)."""
 
-class _Front(NamedTuple):
-    """One block in its turn: itself and those of its neighbors that come later."""
+
+class _FrontalMatrix(NamedTuple):
+    """A block at its elimination: itself and its neighbors of higher elimination rank."""
 
     block: int
-    own: int
-    """Unknowns of the block."""
+    size: int
+    """Number of unknowns of the block."""
     rows: Int[np.ndarray, " front"]
-    """All unknowns of the front, those of the block first."""
+    """Indices of all unknowns of the front, those of the block first."""
     panel: slice
-    """Where the rows of the block begin and end in the stored numbers."""
+    """Storage of the rows of the block in the normal matrix."""
     parent: int
-    """The front that takes over what is left, -1 for none."""
-    into: Int[np.ndarray, " neighbors"]
-    """Place of each unknown that is left in the front of the parent."""
+    """Elimination rank of the front that the Schur complement is added to; -1: none."""
+    parent_index: Int[np.ndarray, " neighbors"]
+    """Row of each neighboring unknown in the parent's front."""
 
 
-class Plan:
-    """In which order blocks are eliminated, and where their numbers stand.
+class SymbolicFactorization:
+    """Order of elimination, and storage of the normal matrix.
 
     Args:
-        sizes: unknowns of every block; the unknowns of all blocks follow each other in their order.
-        pairs: blocks that occur together in a term; in any order, each as often as you like.
+        sizes: number of unknowns of every block; the unknowns are ordered by block.
+        pairs: pairs of blocks that occur in a common term; order and repetitions are irrelevant.
     """
 
     def __init__(self, sizes: Int[np.ndarray, " blocks"], pairs: Int[np.ndarray, "pairs 2"]):
         self.sizes = np.asarray(sizes, dtype=np.int64)
         count = len(self.sizes)
         self.begin: Int[np.ndarray, " ends"] = np.append(0, np.cumsum(self.sizes))
+        """First unknown of every block, and the number of all unknowns."""
+        # 1. The order of elimination.
         low, high = np.divmod(np.unique(pairs.min(axis=1) * count + pairs.max(axis=1)), count)
         pairs = np.stack([low, high], axis=1)[low != high]
-        order = _order(count, pairs)
-        self.turn = np.empty(count, dtype=np.int64)
-        self.turn[order] = np.arange(count)
-        later: list[set[int]] = [set() for _ in range(count)]  # by turn: the turns of the neighbors that come later
-        for one, other in np.sort(self.turn[pairs], axis=1).tolist():
+        order = _minimum_degree_order(count, pairs)
+        self.elimination_rank = np.empty(count, dtype=np.int64)
+        self.elimination_rank[order] = np.arange(count)
+        # 2. The elimination tree: by rank, the ranks of the neighbors that are eliminated later, fill-in included.
+        later: list[set[int]] = [set() for _ in range(count)]
+        for one, other in np.sort(self.elimination_rank[pairs], axis=1).tolist():
             later[one].add(other)
         parent = np.full(count, -1)
-        for turn in range(count):
-            if later[turn]:
-                up = min(later[turn])
-                parent[turn] = up
-                later[up] |= later[turn] - {up}
-        self.fronts: list[_Front] = []
-        self._at: list[dict[int, int]] = []  # by turn: the column at which each later turn's unknowns begin
-        stored, rows_of = 0, [int(self.begin[block]) + np.arange(int(self.sizes[block])) for block in order]
-        for turn in range(count):
-            block, own = int(order[turn]), int(self.sizes[order[turn]])
-            column, at = own, {turn: 0}
-            for other in sorted(later[turn]):
-                at[other] = column
-                column += len(rows_of[other])
-            rows = np.concatenate([rows_of[turn], *(rows_of[other] for other in sorted(later[turn]))])
-            self._at.append(at)
-            panel = slice(stored, stored + own * column)
-            self.fronts.append(_Front(block, own, rows, panel, int(parent[turn]), np.zeros(0, dtype=np.int64)))
-            stored = panel.stop
-        for turn, front in enumerate(self.fronts):
+        for rank in range(count):
+            if later[rank]:
+                parent[rank] = min(later[rank])
+                later[parent[rank]] |= later[rank] - {int(parent[rank])}
+        # 3. The fronts and their storage.
+        self.fronts: list[_FrontalMatrix] = []
+        self._column: list[dict[int, int]] = []  # by rank: first column of each neighbor in the front
+        nnz, rows_of = 0, [int(self.begin[block]) + np.arange(int(self.sizes[block])) for block in order]
+        for rank in range(count):
+            block, size = int(order[rank]), int(self.sizes[order[rank]])
+            width, column = size, {rank: 0}
+            for other in sorted(later[rank]):
+                column[other] = width
+                width += len(rows_of[other])
+            rows = np.concatenate([rows_of[rank], *(rows_of[other] for other in sorted(later[rank]))])
+            self._column.append(column)
+            panel = slice(nnz, nnz + size * width)
+            self.fronts.append(_FrontalMatrix(block, size, rows, panel, int(parent[rank]), np.zeros(0, dtype=np.int64)))
+            nnz = panel.stop
+        for rank, front in enumerate(self.fronts):
             if front.parent >= 0:
-                at = self._at[front.parent]
-                into = [at[other] + np.arange(len(rows_of[other])) for other in sorted(later[turn])]
-                self.fronts[turn] = front._replace(into=np.concatenate(into))
-        self.stored = stored
-        """Numbers that the equations have: a row for each unknown, up to the last one that it meets."""
+                column = self._column[front.parent]
+                index = [column[other] + np.arange(len(rows_of[other])) for other in sorted(later[rank])]
+                self.fronts[rank] = front._replace(parent_index=np.concatenate(index))
+        self.nnz = nnz
+        """Number of stored entries of the normal matrix, fill-in included."""
 
-    def places(
+    def storage(
         self, first: Int[np.ndarray, " terms"], second: Int[np.ndarray, " terms"]
     ) -> tuple[Int[np.ndarray, " terms"], Int[np.ndarray, " terms"], Int[np.ndarray, " terms"]]:
-        """Where the product of unknown i of a first block and k of a second one is stored: at base + i di + k dk.
+        """Storage of the product of two blocks in the normal matrix.
 
-        Of a block with itself this is its whole square; of two blocks one of the two rectangles is stored.
+        Entry (i, k) is stored at base + i * row_stride + k * column_stride.
+
+        The product of a block with itself is stored as a whole square, that of two blocks as one of two rectangles.
 
         Args:
-            first: number of a block, for every term.
-            second: likewise; the two must be a pair of the plan, or the same.
+            first: index of a block, for every term.
+            second: likewise; the two must be one of the pairs, or the same block.
 
         Returns:
-            Base, di, dk of every term.
+            Base, row stride and column stride of every term.
         """
-        code, which = np.unique(first * len(self.sizes) + second, return_inverse=True)
+        code, inverse = np.unique(first * len(self.sizes) + second, return_inverse=True)
         found = np.empty((len(code), 3), dtype=np.int64)
         for k, (one, other) in enumerate(np.stack(np.divmod(code, len(self.sizes)), axis=1).tolist()):
-            a, b = int(self.turn[one]), int(self.turn[other])
+            a, b = int(self.elimination_rank[one]), int(self.elimination_rank[other])
             low, high = min(a, b), max(a, b)
             front = self.fronts[low]
             width = len(front.rows)
-            base = front.panel.start + self._at[low][high]
+            base = front.panel.start + self._column[low][high]
             found[k] = (base, width, 1) if a <= b else (base, 1, width)
-        base, di, dk = found[which].T
-        return base, di, dk
+        base, row_stride, column_stride = found[inverse].T
+        return base, row_stride, column_stride
 
     @property
     def diagonal(self) -> Int[np.ndarray, " unknowns"]:
-        """Where the diagonal is stored, unknown by unknown."""
+        """Storage index of each diagonal entry."""
         out = np.empty(int(self.begin[-1]), dtype=np.int64)
         for front in self.fronts:
-            own = np.arange(front.own)
-            out[front.rows[: front.own]] = front.panel.start + own * (len(front.rows) + 1)
+            row = np.arange(front.size)
+            out[front.rows[: front.size]] = front.panel.start + row * (len(front.rows) + 1)
         return out
 
-    def factor(self, values: Float[np.ndarray, " stored"]) -> "Factor":
-        """Of positive definite equations.
+    def factorize(self, values: Float[np.ndarray, " nnz"]) -> "BlockCholesky":
+        """Factorise a positive definite normal matrix.
 
         Raises:
-            numpy.linalg.LinAlgError: they are singular.
+            numpy.linalg.LinAlgError: the matrix is not positive definite.
         """
-        left: list[np.ndarray | None] = [None] * len(self.fronts)
-        inverse, right = [], []
-        for turn, front in enumerate(self.fronts):
-            own, width = front.own, len(front.rows)
-            whole = left[turn]
-            panel = values[front.panel].reshape(own, width)
-            if whole is not None:
-                panel = panel + whole[:own]
-            block = _inverse(panel[:, :own])
-            beside = panel[:, own:]
-            share = block @ beside
-            inverse.append(block)
-            right.append(share)
-            left[turn] = None
+        pending: list[np.ndarray | None] = [None] * len(self.fronts)  # sums of the children's Schur complements
+        inverse, coupling = [], []
+        for rank, front in enumerate(self.fronts):
+            size, width = front.size, len(front.rows)
+            update = pending[rank]
+            panel = values[front.panel].reshape(size, width)
+            if update is not None:
+                panel = panel + update[:size]
+            block_inverse = _inverse(panel[:, :size])
+            off_diagonal = panel[:, size:]
+            gain = block_inverse @ off_diagonal
+            inverse.append(block_inverse)
+            coupling.append(gain)
+            pending[rank] = None
             if front.parent < 0:
                 continue
-            rest = -(beside.T @ share)
-            if whole is not None:
-                rest += whole[own:, own:]
-            up = left[front.parent]
-            if up is None:
-                size = len(self.fronts[front.parent].rows)
-                up = left[front.parent] = np.zeros((size, size))
-            up[front.into[:, None], front.into] += rest
-        return Factor(self, inverse, right)
+            schur_complement = -(off_diagonal.T @ gain)
+            if update is not None:
+                schur_complement += update[size:, size:]
+            target = pending[front.parent]
+            if target is None:
+                parent_size = len(self.fronts[front.parent].rows)
+                target = pending[front.parent] = np.zeros((parent_size, parent_size))
+            target[front.parent_index[:, None], front.parent_index] += schur_complement
+        return BlockCholesky(self, inverse, coupling)
 
 
-class Factor:
-    """Equations that have been eliminated."""
+class BlockCholesky:
+    """Factorised normal equations.
 
-    def __init__(self, plan: Plan, inverse: Sequence[np.ndarray], right: Sequence[np.ndarray]):
-        self.plan, self._inverse, self._right = plan, inverse, right
+    Args:
+        structure: the symbolic factorisation.
+        inverse: inverse of the pivot block of each front.
+        coupling: inverse of the pivot block times the rest of its rows, for each front.
+    """
 
-    def solve(self, side: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, " unknowns"]:
-        """The solution for a right hand side."""
-        x = np.array(side, dtype=np.float64)
-        fronts = self.plan.fronts
-        for front, right in zip(fronts, self._right, strict=True):
-            x[front.rows[front.own :]] -= x[front.rows[: front.own]] @ right
-        for front, inverse, right in zip(fronts[::-1], self._inverse[::-1], self._right[::-1], strict=True):
-            own, rest = front.rows[: front.own], front.rows[front.own :]
-            x[own] = inverse @ x[own] - right @ x[rest]
+    def __init__(self, structure: SymbolicFactorization, inverse: Sequence[np.ndarray], coupling: Sequence[np.ndarray]):
+        self.structure, self._inverse, self._coupling = structure, inverse, coupling
+
+    def solve(self, right_hand_side: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, " unknowns"]:
+        """The solution of the normal equations."""
+        x = np.array(right_hand_side, dtype=np.float64)
+        fronts = self.structure.fronts
+        for front, coupling in zip(fronts, self._coupling, strict=True):
+            x[front.rows[front.size :]] -= x[front.rows[: front.size]] @ coupling
+        for front, inverse, coupling in zip(fronts[::-1], self._inverse[::-1], self._coupling[::-1], strict=True):
+            own, rest = front.rows[: front.size], front.rows[front.size :]
+            x[own] = inverse @ x[own] - coupling @ x[rest]
         return x
 
     def marginals(self) -> list[Float[np.ndarray, "_ _"]]:
-        """The blocks along the diagonal of the inverse, in the order of the blocks."""
-        fronts = self.plan.fronts
+        """Marginal covariances: the blocks along the diagonal of the inverse, in the order of the blocks."""
+        fronts = self.structure.fronts
         out: list[np.ndarray] = [np.zeros((0, 0))] * len(fronts)
-        known: list[np.ndarray | None] = [None] * len(fronts)
-        waiting = np.bincount([front.parent for front in fronts if front.parent >= 0], minlength=len(fronts))
-        for turn in range(len(fronts) - 1, -1, -1):
-            front, right = fronts[turn], self._right[turn]
-            own, cov = front.own, self._inverse[turn]
+        # Joint covariance of each front, kept until all of its children are done.
+        joint: list[np.ndarray | None] = [None] * len(fronts)
+        children = np.bincount([front.parent for front in fronts if front.parent >= 0], minlength=len(fronts))
+        for rank in range(len(fronts) - 1, -1, -1):
+            front, coupling = fronts[rank], self._coupling[rank]
+            size, cov = front.size, self._inverse[rank]
             whole = np.empty((len(front.rows), len(front.rows)))
             if front.parent >= 0:
-                up = known[front.parent]
-                assert up is not None
-                later = up[front.into[:, None], front.into]
-                cross = -right @ later
-                cov = cov - cross @ right.T
-                whole[:own, own:], whole[own:, :own], whole[own:, own:] = cross, cross.T, later
-                waiting[front.parent] -= 1
-                if not waiting[front.parent]:
-                    known[front.parent] = None
-            whole[:own, :own] = (cov + cov.T) / 2
-            known[turn] = whole if waiting[turn] else None
-            out[front.block] = whole[:own, :own].copy()
+                parent = joint[front.parent]
+                assert parent is not None
+                rest = parent[front.parent_index[:, None], front.parent_index]
+                cross = -coupling @ rest
+                cov = cov - cross @ coupling.T
+                whole[:size, size:], whole[size:, :size], whole[size:, size:] = cross, cross.T, rest
+                children[front.parent] -= 1
+                if not children[front.parent]:
+                    joint[front.parent] = None
+            whole[:size, :size] = (cov + cov.T) / 2
+            joint[rank] = whole if children[rank] else None
+            out[front.block] = whole[:size, :size].copy()
         return out
 
 
 def _inverse(block: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Of a positive definite matrix of a few rows; its upper triangle is looked at."""
-    upper, wrong = dpotrf(block)
-    if wrong:
-        raise np.linalg.LinAlgError("elimination: the equations are not positive definite")
+    """Inverse of a positive definite matrix; only its upper triangle is read."""
+    if len(block) > MAX_LAPACK_SIZE:
+        np.linalg.cholesky(block, upper=True)  # raises for a matrix that is not positive definite
+        upper = np.triu(block)
+        return np.linalg.inv(upper + np.triu(upper, 1).T)
+    upper, failed = dpotrf(block)
+    if failed:
+        raise np.linalg.LinAlgError("the normal matrix is not positive definite")
     half = np.triu(dpotri(upper)[0])
     return half + np.triu(half, 1).T
 
 
-def _order(count: int, pairs: Int[np.ndarray, "pairs 2"]) -> Int[np.ndarray, " blocks"]:
-    """Blocks in an order of least degree."""
+def _minimum_degree_order(count: int, pairs: Int[np.ndarray, "pairs 2"]) -> Int[np.ndarray, " blocks"]:
+    """Blocks in a minimum-degree order, as SuperLU computes it."""
     first, second = pairs.T
     diagonal = np.arange(count)
     rows, columns = np.concatenate([diagonal, first, second]), np.concatenate([diagonal, second, first])

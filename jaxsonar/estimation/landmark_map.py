@@ -10,6 +10,12 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar import kernels
 from jaxsonar.detection.extract import local_models
 from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.geometry.landmarks import (
+    concatenate_landmarks,
+    landmarks_from_points,
+    landmarks_from_segments,
+    pad_landmarks,
+)
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
 from jaxsonar.mapping.build_map import assemble_map, build_map
@@ -27,7 +33,9 @@ _TWICE = 2  # scans that see a point
 _ROOM = 16
 
 
-def map_with_tentative_points(ring: Ring, log: Log, *, window: float | None, models: Sequence[LocalModel] | None = None) -> GlobalMap:
+def map_with_tentative_points(
+    ring: Ring, log: Log, *, window: float | None, models: Sequence[LocalModel] | None = None
+) -> GlobalMap:
     """The map of a log, with every corner and edge that two scans saw, however little they agree where.
 
     A map keeps only points that stand still; before ring and poses are adjusted they do not.
@@ -102,28 +110,25 @@ def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> Landmark
         tied: corners are where two walls meet, so that wall to wall reflections say how far off the walls are; a corner
             is a place of its own otherwise.
     """
-    none = np.zeros((0, 2))
-    kind, parameters, anchor, ends, world = [np.zeros(0, int)], [none], [none], [none], [np.zeros(0, int)]
+    parts: list[kernels.Landmarks] = []
+    world: list[Int[np.ndarray, " landmarks"]] = [np.zeros(0, int)]
     meetings: list[tuple[int, int, int]] = []  # first wall, second wall, world
     for number, map_ in enumerate(maps):
-        meet, own = _wall_intersections(map_)
-        first = sum(len(part) for part in kind)
-        middle = map_.segments.mean(axis=1)
-        half = np.linalg.norm(map_.segments[:, 1] - map_.segments[:, 0], axis=1) / 2
-        normal = unit(map_.theta)
-        kept = ~own if tie_corners else np.ones(len(own), bool)
-        points = map_.points[kept]
-        of_points = np.array([name == "corner" for name in map_.point_kinds], dtype=bool)[kept]
-        kind += [np.full(len(middle), kernels.PLANE), np.where(of_points, kernels.CORNER, kernels.EDGE)]
-        distance = map_.rho - (normal * middle).sum(axis=-1)
-        parameters += [np.stack([distance, map_.theta], axis=-1), np.zeros_like(points)]
-        anchor += [middle, points]
-        ends += [np.stack([-half, half], axis=-1), np.zeros_like(points)]
-        world.append(np.full(len(middle) + len(points), number))
+        pairs, is_intersection = _wall_intersections(map_)
+        first = sum(len(part.kind) for part in parts)
+        kept = np.append(np.ones(len(map_), bool), ~is_intersection | (not tie_corners))
+        parts.append(map_landmarks(map_).take(np.flatnonzero(kept)))
+        world.append(np.full(len(parts[-1].kind), number))
         if tie_corners:
-            meetings += [(first + a, first + b, number) for a, b in meet]
-    scene = kernels.Landmarks(*(np.concatenate(part) for part in (kind, parameters, anchor, ends)))
-    return _padded(scene, np.concatenate(world), meetings)
+            meetings += [(first + a, first + b, number) for a, b in pairs]
+    return _padded(concatenate_landmarks(parts), np.concatenate(world), meetings)
+
+
+def map_landmarks(map_: GlobalMap) -> kernels.Landmarks:
+    """The walls, then the points of a map as landmarks, each anchored at its middle."""
+    kinds = [kernels.CORNER if kind == "corner" else kernels.EDGE for kind in map_.point_kinds]
+    points = landmarks_from_points(np.array(kinds, np.int32), map_.points)
+    return concatenate_landmarks([landmarks_from_segments(map_.rho, map_.theta, map_.segments), points])
 
 
 def _wall_intersections(map_: GlobalMap) -> tuple[list[tuple[int, int]], Bool[np.ndarray, " points"]]:
@@ -151,12 +156,7 @@ def _padded(
     """With room for a power of two of reflectors, and of candidates, so that few shapes are compiled."""
     count = len(world)
     room = next_power_of_two(count, least=_ROOM)
-    scene = kernels.Landmarks(
-        kind=pad_rows(np.asarray(scene.kind, np.int32), room, fill=-1),
-        parameters=pad_rows(np.asarray(scene.parameters, np.float64), room),
-        anchor=pad_rows(np.asarray(scene.anchor, np.float64), room),
-        extent=pad_rows(np.asarray(scene.extent, np.float64), room),
-    )
+    scene = pad_landmarks(scene, room)
     first, second, of_world = np.array(meetings, dtype=np.int32).reshape(-1, 3).T
     pairs = len(first)
     size = next_power_of_two(count + 2 * pairs, least=_ROOM)

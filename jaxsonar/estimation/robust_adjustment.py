@@ -1,168 +1,135 @@
-"""Echoes to reflectors, least squares, and again: ring, poses and reflectors settle while the gate closes.
+"""Robust bundle adjustment by graduated non-convexity (GNC): data association and least squares in turn.
 
-Graduated non-convexity: at first an echo may be centimetres off its reflector and still pull at it, with the weight of
-Geman and McClure's loss; the scale of that loss halves until it is four sigma, where an echo is either right or not.
+At first an echo may be centimetres away from its landmark and still attract it, with the weight of the Geman-McClure
+loss. The scale of the loss is halved in each round until it is four sigma; from there on an echo is an inlier or an
+outlier. Reference: Yang et al., "Graduated Non-Convexity for Robust Spatial Perception", 2020.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
+from jaxsonar.estimation.adjustment_state import AdjustmentResult, AdjustmentState
 from jaxsonar.estimation.batch_data import BatchData
-from jaxsonar.estimation.landmark_map import LandmarkMap
-from jaxsonar.estimation.sparse_lm import adjust as sparsely
+from jaxsonar.estimation.landmark_selection import reclassify_points, remove_misfitting_points
+from jaxsonar.estimation.sparse_adjustment import AdjustmentSolution, adjust
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import ParameterBasis
 
-GATE, DOUBT = 4.0, 5.0
-"""Sigma; how far an echo may be off its reflector, and how near to its range another one's makes it doubtful."""
-LEAST_ECHOES = 3
-"""Echoes that a reflector needs to say anything of the ring."""
-LEAST_SIGMA = 1e-5
-"""Metres; noise-free echoes have some, too: that of their digits."""
-_BESIDE = 0.5  # m; beyond the maximum range, for poses and reflectors that are not yet where they should be
-_HALVINGS = 12
-_LAST_ROUNDS = 3
-_ENOUGH = 0.01  # decrease of half a sum of squares in units of sigma: far less than anything is known to
-_JUDGED, _MISFIT = 8, 1.1  # echoes and share; from there on a point must fit as well as the walls do
-_OTHER_KIND = 0.97  # of the sum of squares; a corner that is an edge, or the other way round
+
+@dataclass(frozen=True)
+class GncSettings:
+    """Constants of the robust adjustment. All of them were chosen by hand."""
+
+    gate_sigmas: float = 4.0
+    """Largest residual of an inlier, standard deviations."""
+    ambiguity_sigmas: float = 5.0
+    """An echo is left out if a second landmark predicts a range this close to that of the first one, standard
+    deviations. Comparing with the measured range instead would bias the residuals."""
+    loss_gate: float = 3.0
+    """Largest residual that has a weight while annealing, in scales of the loss."""
+    min_landmark_echoes: int = 3
+    """Echoes that a landmark needs; with fewer of them its parameters fit anything."""
+    min_sigma: float = 1e-5
+    """Lower bound of the estimated noise, metres: simulated ranges without noise are rounded to about this."""
+    range_margin: float = 0.5
+    """Metres beyond the maximum range within which landmarks are candidates, while poses are inaccurate."""
+    max_annealing_rounds: int = 12
+    """Rounds in which the scale of the loss is halved, at most."""
+    final_rounds: int = 3
+    """Rounds of association and least squares with a fixed gate, in which the noise is estimated."""
+    mad_to_sigma: float = 1.4826
+    """Standard deviation of a normal distribution over its median absolute deviation (exact value)."""
 
 
-class AdjustmentState(NamedTuple):
-    """How far the settling has come; NumPy arrays in double precision."""
-
-    coordinates: Float[np.ndarray, " modes"]
-    """Of the ring along its modes."""
-    poses: Float[np.ndarray, "scans 3"]
-    landmark_map: LandmarkMap
-    """The reflectors, where they are now."""
-
-
-class AdjustmentResult(NamedTuple):
-    """The end of it."""
-
-    state: AdjustmentState
-    problem: kernels.LeastSquaresProblem
-    """The last least squares."""
-    solution: kernels.LeastSquaresSolution
-    used: Bool[np.ndarray, "scans echoes"]
-    """Echoes that a reflector explains, and no other one nearly so."""
-    candidate: Int[np.ndarray, "scans echoes"]
-    """Row of the surroundings' candidates that each of them comes from."""
-    residual: Float[np.ndarray, "scans echoes"]
-    """Reported minus expected, metres; only where used."""
-    sigma: float
-    """Noise of the ranges, metres."""
+SETTINGS = GncSettings()
 
 
 def gnc_adjust(
     ring: Ring,
     data: BatchData,
-    modes: ParameterBasis,
+    basis: ParameterBasis,
     state: AdjustmentState,
     *,
     initial_scale: float,
     poses_free: bool,
     sigma: float | None = None,
+    settings: GncSettings = SETTINGS,
 ) -> AdjustmentResult:
-    """Close the gate around a start, round by round. To be called with 64-bit floats enabled.
+    """Adjust ring parameters, poses and landmarks. To be called with 64-bit floats enabled.
 
     Args:
-        ring: where the modes begin.
-        data: the scans.
-        modes: how the ring may change.
-        state: the start.
-        widest: scale of the first round, metres.
+        ring: the ring at coordinates 0.
+        data: the measurements.
+        basis: basis of the ring parameters.
+        state: initial values.
+        initial_scale: scale of the robust loss in the first round, metres.
         poses_free: whether poses are estimated.
-        sigma: noise of the ranges, metres, if it is known.
+        sigma: standard deviation of the range noise, metres; estimated if left out.
+        settings: constants of the algorithm.
     """
-    state, noise = _anneal(ring, data, modes, state, initial_scale=initial_scale, poses_free=poses_free, sigma=sigma)
-    known = int(np.linalg.matrix_rank(modes.columns)) if modes.columns.any() else 0
-    for _ in range(_LAST_ROUNDS):
-        found = _reassociate(ring, data, modes, state, noise, poses_free)
-        reflectors = len(np.unique(np.asarray(found.problem.factors.reflection.first)[found.used]))
-        left = int(found.used.sum()) - 2 * reflectors - known - 3 * data.scan_count * poses_free
-        if sigma is None and left > 0:
-            noise = max(float(np.sqrt((found.residual**2).sum() / left)), LEAST_SIGMA)
-        state = _without_misfits(_of_better_kind(found, data), found)
-    return _reassociate(ring, data, modes, state, noise, poses_free)
+    job = _GncJob(ring, data, basis, poses_free, settings)
+    # 1. Shrink the scale of the robust loss.
+    state, noise = job.anneal(state, initial_scale, sigma)
+    parameters = int(np.linalg.matrix_rank(basis.columns)) if basis.columns.any() else 0
+    for _ in range(settings.final_rounds):
+        # 2. Associate with a fixed gate and minimise.
+        found = job.reassociate(state, noise)
+        # 3. Estimate the noise from the residuals.
+        landmarks = len(np.unique(np.asarray(found.problem.factors.reflection.first)[found.used]))
+        dof = int(found.used.sum()) - 2 * landmarks - parameters - 3 * data.scan_count * poses_free
+        if sigma is None and dof > 0:
+            noise = max(float(np.sqrt((found.residual**2).sum() / dof)), settings.min_sigma)
+        # 4. Correct the kind of points, and remove those that fit neither kind.
+        state = remove_misfitting_points(reclassify_points(found), found)
+    return job.reassociate(state, noise)
 
 
 def anneal(
     ring: Ring,
     data: BatchData,
-    modes: ParameterBasis,
+    basis: ParameterBasis,
     state: AdjustmentState,
     *,
     initial_scale: float,
     sigma: float | None = None,
+    settings: GncSettings = SETTINGS,
 ) -> AdjustmentState:
-    """Close the gate around a start, as ``settle``, but without its last rounds: a better start, poses free."""
-    return _anneal(ring, data, modes, state, initial_scale=initial_scale, poses_free=True, sigma=sigma)[0]
+    """Only the annealing of ``gnc_adjust``, with free poses: better initial values."""
+    return _GncJob(ring, data, basis, True, settings).anneal(state, initial_scale, sigma)[0]
 
 
-def _anneal(
+def least_squares_problem(
     ring: Ring,
     data: BatchData,
-    modes: ParameterBasis,
-    state: AdjustmentState,
-    *,
-    initial_scale: float,
-    poses_free: bool,
-    sigma: float | None,
-) -> tuple[AdjustmentState, float]:
-    """Round by round with half the scale, down to four sigma; and sigma, from the middle of the residuals."""
-    scale, spread, last = initial_scale, initial_scale / GATE, False
-    for _ in range(_HALVINGS):
-        used, _, reflection = _associated(ring, data, modes, state, gate=3 * scale, doubt=0.0)
-        residual = _residual(ring, data, modes, state, reflection)
-        weight = used / (1 + (residual / scale) ** 2) ** 2 * (GATE / scale) ** 2
-        state, _, _ = _adjusted(ring, data, modes, state, reflection, weight, poses_free)
-        residual = _residual(ring, data, modes, state, reflection)
-        near = np.abs(residual[used & (np.abs(residual) < 3 * scale)])
-        spread = max(1.4826 * float(np.median(near)) if len(near) else scale / GATE, LEAST_SIGMA)
-        if last:
-            break
-        tight = GATE * (spread if sigma is None else sigma)
-        scale, last = max(scale / 2, tight), scale / 2 <= tight
-    return state, spread if sigma is None else sigma
-
-
-def _reassociate(ring: Ring, data: BatchData, modes: ParameterBasis, state: AdjustmentState, noise: float, poses_free: bool) -> AdjustmentResult:
-    """One round in which an echo is right or not: within the gate, and no second reflector near."""
-    used, candidate, reflection = _associated(ring, data, modes, state, gate=GATE * noise, doubt=DOUBT * noise)
-    state, problem, found = _adjusted(ring, data, modes, state, reflection, used / noise**2, poses_free)
-    residual = np.where(used, _residual(ring, data, modes, state, reflection), 0)
-    return AdjustmentResult(state, problem, found, used, candidate, residual, noise)
-
-
-def ring_change(modes: ParameterBasis, state: AdjustmentState) -> Float[np.ndarray, " ring"]:
-    """Change of offsets, log speed of sound and positions so far."""
-    return modes.columns @ state.coordinates
-
-
-def problem_of(
-    ring: Ring,
-    data: BatchData,
-    modes: ParameterBasis,
+    basis: ParameterBasis,
     state: AdjustmentState,
     reflection: kernels.Reflection,
     weight: Float[np.ndarray, "scans echoes"],
 ) -> kernels.LeastSquaresProblem:
-    """The least-squares problem of given associations."""
+    """The least-squares problem of a given data association.
+
+    Args:
+        ring: the ring at coordinates 0.
+        data: the measurements.
+        basis: basis of the ring parameters.
+        state: its landmarks are the prior means.
+        reflection: (scans, echoes) the reflection that each echo is assigned to.
+        weight: inverse variance of each echo, 1 / square metres.
+    """
     return kernels.LeastSquaresProblem(
         sensors=ring.sensors,
-        basis=jnp.asarray(modes.columns),
-        landmarks=_arrays(state.landmark_map.landmarks),
+        basis=jnp.asarray(basis.columns),
+        landmarks=to_jax(state.landmark_map.landmarks),
         factors=kernels.EchoFactors(
             path=jnp.asarray(data.path),
             reported=jnp.asarray(np.nan_to_num(data.reported)),
-            reflection=_arrays(reflection),
+            reflection=to_jax(reflection),
             weight=jnp.asarray(weight),
         ),
         prior_poses=jnp.asarray(data.poses),
@@ -173,145 +140,122 @@ def problem_of(
     )
 
 
-def _associated(
-    ring: Ring, data: BatchData, modes: ParameterBasis, state: AdjustmentState, *, gate: float, doubt: float
-) -> tuple[Bool[np.ndarray, "scans echoes"], Int[np.ndarray, "scans echoes"], kernels.Reflection]:
-    """Which echoes are within the gate of a reflector, with no second one near, and where they come from."""
-    around = state.landmark_map
-    # Scans have very different numbers of echoes: in rows of a few echoes each there is little padding.
-    rows, columns = data.packed_echoes
-    scan = rows[:, 0]
-    near = around.candidates_in_range(state.poses, data.world, float(ring.max_range) + _BESIDE)
-    found = kernels.associate(
-        kernels.apply_parameters(ring.sensors, jnp.asarray(ring_change(modes, state))),
-        _arrays(around.landmarks),
-        _arrays(around.candidates),
-        jnp.asarray(state.poses[scan]),
-        jnp.asarray(data.world[scan]),
-        jnp.asarray(data.path[rows, columns]),
-        jnp.asarray(data.reported[rows, columns]),
-        jnp.asarray(near[scan]),
-    )
-    candidate, residual, rival = np.full(data.path.shape, -1), *np.full((2, *data.path.shape), np.inf)
-    for whole, part in zip((candidate, residual, rival), (found.candidate, found.residual, found.competitor_gap), strict=True):
-        whole[rows, columns] = np.asarray(part)
-    used = (candidate >= 0) & (np.abs(residual) < gate) & (rival > doubt) & np.isfinite(data.reported)
-    candidate = np.where(candidate >= 0, candidate, 0)
-    kind, first, second = (
-        np.asarray(leaf)[candidate]
-        for leaf in (
-            around.candidates.reflection.kind,
-            around.candidates.reflection.first,
-            around.candidates.reflection.second,
-        )
-    )
-    if data.wall_explained is not None:
-        used &= ~(data.wall_explained & np.isin(kind, (kernels.CORNER, kernels.EDGE)))
-    if data.min_echoes_per_landmark > 1:
-        room = len(around.world)
-        group = first + room * np.arange(len(first))[:, None]
-        used &= np.bincount(group[used], minlength=room * len(first))[group] >= data.min_echoes_per_landmark
-    # A reflector that hardly anything comes from fits anything.
-    count = np.bincount(first[used], minlength=len(around.world))
-    used &= (count[first] >= LEAST_ECHOES) | (kind == kernels.SECOND_ORDER)
-    return used, candidate, kernels.Reflection(kind.astype(np.int32), first.astype(np.int32), second.astype(np.int32))
-
-
-def _adjusted(
-    ring: Ring,
-    data: BatchData,
-    modes: ParameterBasis,
-    state: AdjustmentState,
-    reflection: kernels.Reflection,
-    weight: Float[np.ndarray, "scans echoes"],
-    poses_free: bool,
-) -> tuple[AdjustmentState, kernels.LeastSquaresProblem, kernels.LeastSquaresSolution]:
-    problem = problem_of(ring, data, modes, state, reflection, weight)
-    if data.sparse:
-        found = sparsely(problem, _unknowns(state), poses_free=poses_free, most=data.max_iterations, enough=_ENOUGH)
-    else:
-        found = kernels.adjust(problem, _unknowns(state), poses_free=poses_free, most=data.max_iterations)
-    now = found.unknowns
-    scene = eqx.tree_at(lambda s: s.parameters, state.landmark_map.landmarks, np.asarray(now.landmarks))
-    moved = AdjustmentState(np.asarray(now.coordinates), np.asarray(now.poses), state.landmark_map._replace(landmarks=scene))
-    return moved, problem, found
-
-
-def _of_better_kind(found: AdjustmentResult, data: BatchData) -> AdjustmentState:
-    """Corners that fit better as edges, and edges that fit better as corners, become these."""
-    state, problem, used, residual = found.state, found.problem, found.used, found.residual
-    around = state.landmark_map
-    kind = np.asarray(around.landmarks.kind)
-    of_point = kind > kernels.PLANE
-    flipped = np.where(of_point, kernels.CORNER + kernels.EDGE - kind, kind).astype(np.int32)
-    reflection = problem.factors.reflection
-    first = np.asarray(reflection.first)
-    single = np.asarray(reflection.kind) != kernels.SECOND_ORDER
-    other = eqx.tree_at(
-        lambda p: (p.scene.kind, p.heard.reflection.kind, p.modes, p.sensors),
-        problem,
-        (
-            jnp.asarray(flipped),
-            jnp.asarray(np.where(single, flipped[first], np.asarray(reflection.kind)).astype(np.int32)),
-            jnp.zeros_like(problem.basis),
-            kernels.apply_parameters(problem.sensors, problem.basis @ jnp.asarray(state.coordinates)),
-        ),
-    )
-    adjust = sparsely if data.sparse else kernels.adjust
-    fitted = adjust(other, _unknowns(state), poses_free=False).unknowns
-    then = np.where(used, np.asarray(kernels.residuals(other, fitted)), 0)
-    mine = used & single
-    sums = [np.bincount(first[mine], weights=left[mine] ** 2, minlength=len(kind)) for left in (residual, then)]
-    better = of_point & (sums[1] < _OTHER_KIND * sums[0])
-    if not better.any():
-        return state
-    now = np.where(better, flipped, kind).astype(np.int32)
-    places = np.where(better[:, None], np.asarray(fitted.landmarks), np.asarray(around.landmarks.parameters))
-    scene = eqx.tree_at(lambda s: (s.kind, s.parameters), around.landmarks, (now, places))
-    of_candidate = np.asarray(around.candidates.reflection.kind)
-    alone = np.isin(of_candidate, (kernels.CORNER, kernels.EDGE))
-    of_candidate = np.where(alone, now[np.asarray(around.candidates.reflection.first)], of_candidate).astype(np.int32)
-    candidates = eqx.tree_at(lambda c: c.reflection.kind, around.candidates, of_candidate)
-    return state._replace(landmark_map=around._replace(landmarks=scene, candidates=candidates))
-
-
-def _without_misfits(state: AdjustmentState, found: AdjustmentResult) -> AdjustmentState:
-    """The points whose echoes fit neither a corner nor an edge are none: two walls at another angle, for instance.
-
-    Their echoes would be taken for noise, and the gate would open for more of them.
-    """
-    around = state.landmark_map
-    kind = np.asarray(found.problem.factors.reflection.kind)
-    first = np.asarray(found.problem.factors.reflection.first)
-    walls = found.used & (kind == kernels.PLANE)
-    if not walls.any():
-        return state
-    variance = float(np.mean(found.residual[walls] ** 2))
-    points = found.used & ((kind == kernels.CORNER) | (kind == kernels.EDGE))
-    count = np.bincount(first[points], minlength=len(around.world))
-    sums = np.bincount(first[points], weights=found.residual[points] ** 2, minlength=len(around.world))
-    most = _MISFIT * count * variance * (1 + 4 * np.sqrt(2 / np.maximum(count, 1)))
-    bad = (count >= _JUDGED) & (sums > most)
-    of_bad = bad[np.asarray(around.candidates.reflection.first)]
-    now = np.asarray(around.candidates.reflection.kind)
-    now = np.where(of_bad & (now != kernels.SECOND_ORDER), -1, now).astype(np.int32)
-    return state._replace(
-        landmark_map=around._replace(candidates=eqx.tree_at(lambda c: c.reflection.kind, around.candidates, now))
-    )
-
-
-def _residual(
-    ring: Ring, data: BatchData, modes: ParameterBasis, state: AdjustmentState, reflection: kernels.Reflection
-) -> Float[np.ndarray, "scans echoes"]:
-    problem = problem_of(ring, data, modes, state, reflection, np.zeros_like(data.reported))
-    return np.asarray(kernels.residuals(problem, _unknowns(state)))
-
-
-def _unknowns(state: AdjustmentState) -> kernels.Unknowns:
-    return kernels.Unknowns(
-        jnp.asarray(state.coordinates), jnp.asarray(state.poses), jnp.asarray(state.landmark_map.landmarks.parameters)
-    )
-
-
-def _arrays(tree):
+def to_jax(tree):
+    """All arrays of a tree as JAX arrays."""
     return jax.tree.map(jnp.asarray, tree)
+
+
+class _Association(NamedTuple):
+    """Data association of all echoes."""
+
+    used: Bool[np.ndarray, "scans echoes"]
+    candidate: Int[np.ndarray, "scans echoes"]
+    reflection: kernels.Reflection
+
+
+@dataclass(frozen=True)
+class _GncJob:
+    """Measurements and model of one robust adjustment."""
+
+    ring: Ring
+    data: BatchData
+    basis: ParameterBasis
+    poses_free: bool
+    settings: GncSettings
+
+    def anneal(
+        self, state: AdjustmentState, initial_scale: float, sigma: float | None
+    ) -> tuple[AdjustmentState, float]:
+        """Halve the scale of the loss in each round until it is the gate; also returns the standard deviation.
+
+        Unless ``sigma`` is given, it is estimated robustly (median absolute deviation).
+        """
+        settings = self.settings
+        scale, spread, last = initial_scale, initial_scale / settings.gate_sigmas, False
+        for _ in range(settings.max_annealing_rounds):
+            gate = settings.loss_gate * scale
+            used, _, reflection = self._associate(state, gate=gate, ambiguity=0.0)
+            residual = self._residual(state, reflection)
+            # Geman-McClure weights, normalised so that an echo within the scale counts as one within the gate.
+            weight = used / (1 + (residual / scale) ** 2) ** 2 * (settings.gate_sigmas / scale) ** 2
+            state, _, _ = self._adjust(state, reflection, weight)
+            residual = self._residual(state, reflection)
+            inliers = np.abs(residual[used & (np.abs(residual) < gate)])
+            median = float(np.median(inliers)) if len(inliers) else None
+            spread = scale / settings.gate_sigmas if median is None else settings.mad_to_sigma * median
+            spread = max(spread, settings.min_sigma)
+            if last:
+                break
+            tight = settings.gate_sigmas * (spread if sigma is None else sigma)
+            scale, last = max(scale / 2, tight), scale / 2 <= tight
+        return state, spread if sigma is None else sigma
+
+    def reassociate(self, state: AdjustmentState, noise: float) -> AdjustmentResult:
+        """One round of association with a hard gate, and least squares."""
+        gate, ambiguity = self.settings.gate_sigmas * noise, self.settings.ambiguity_sigmas * noise
+        used, candidate, reflection = self._associate(state, gate=gate, ambiguity=ambiguity)
+        state, problem, solution = self._adjust(state, reflection, used / noise**2)
+        residual = np.where(used, self._residual(state, reflection), 0)
+        return AdjustmentResult(state, problem, solution, used, candidate, residual, noise)
+
+    def _associate(self, state: AdjustmentState, *, gate: float, ambiguity: float) -> _Association:
+        """Assign each echo to the closest reflection; use it if within the gate and no second reflection is near."""
+        data, landmark_map, settings = self.data, state.landmark_map, self.settings
+        # 1. The closest reflection of every echo, in rows of a few echoes each.
+        rows, columns = data.packed_echoes
+        scan = rows[:, 0]
+        max_range = float(self.ring.max_range) + settings.range_margin
+        in_range = landmark_map.candidates_in_range(state.poses, data.world, max_range)
+        found = kernels.associate(
+            kernels.apply_parameters(self.ring.sensors, jnp.asarray(self.basis.columns @ state.coordinates)),
+            to_jax(landmark_map.landmarks),
+            to_jax(landmark_map.candidates),
+            jnp.asarray(state.poses[scan]),
+            jnp.asarray(data.world[scan]),
+            jnp.asarray(data.path[rows, columns]),
+            jnp.asarray(data.reported[rows, columns]),
+            jnp.asarray(in_range[scan]),
+        )
+        candidate, residual, competitor_gap = np.full(data.path.shape, -1), *np.full((2, *data.path.shape), np.inf)
+        for whole, part in zip(
+            (candidate, residual, competitor_gap),
+            (found.candidate, found.residual, found.competitor_gap),
+            strict=True,
+        ):
+            whole[rows, columns] = np.asarray(part)
+        # 2. The gates.
+        used = (candidate >= 0) & (np.abs(residual) < gate) & (competitor_gap > ambiguity) & np.isfinite(data.reported)
+        candidate = np.where(candidate >= 0, candidate, 0)
+        of_candidates = landmark_map.candidates.reflection
+        kind, first, second = (
+            np.asarray(leaf)[candidate] for leaf in (of_candidates.kind, of_candidates.first, of_candidates.second)
+        )
+        if data.wall_explained is not None:
+            used &= ~(data.wall_explained & np.isin(kind, (kernels.CORNER, kernels.EDGE)))
+        # 3. Landmarks with too few echoes, in a scan or in all.
+        count = len(landmark_map.world)
+        if data.min_echoes_per_landmark > 1:
+            pair = first + count * np.arange(len(first))[:, None]
+            used &= np.bincount(pair[used], minlength=count * len(first))[pair] >= data.min_echoes_per_landmark
+        echoes = np.bincount(first[used], minlength=count)
+        used &= (echoes[first] >= settings.min_landmark_echoes) | (kind == kernels.SECOND_ORDER)
+        reflection = kernels.Reflection(*(leaf.astype(np.int32) for leaf in (kind, first, second)))
+        return _Association(used, candidate, reflection)
+
+    def _adjust(
+        self, state: AdjustmentState, reflection: kernels.Reflection, weight: Float[np.ndarray, "scans echoes"]
+    ) -> tuple[AdjustmentState, kernels.LeastSquaresProblem, AdjustmentSolution]:
+        problem = least_squares_problem(self.ring, self.data, self.basis, state, reflection, weight)
+        solution = adjust(
+            problem,
+            state.unknowns(),
+            poses_free=self.poses_free,
+            max_iterations=self.data.max_iterations,
+            absolute_tolerance=self.data.cost_tolerance,
+        )
+        return state.with_unknowns(solution.unknowns), problem, solution
+
+    def _residual(self, state: AdjustmentState, reflection: kernels.Reflection) -> Float[np.ndarray, "scans echoes"]:
+        no_weight = np.zeros_like(self.data.reported)
+        problem = least_squares_problem(self.ring, self.data, self.basis, state, reflection, no_weight)
+        return np.asarray(kernels.residuals(problem, state.unknowns()))

@@ -23,7 +23,6 @@ NORM_WITHIN = 1e-3
 _NUMBER = re.compile(DECIMAL)
 
 
-
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses of a robot in the order they were taken; the arrays are read-only.

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxsonar import HoughSettings, Ring, SonarError, kernels, random_pose, random_room, simulate
-from jaxsonar.calibration.autofocus import focus
-from jaxsonar.kernels.autofocus import blurred, ring_focus_measure
+from jaxsonar.calibration.autofocus import autofocus_ring
+from jaxsonar.kernels.autofocus import blur, ring_focus_measure
 
 RING = Ring.circular(count=8, neighbors=1)
 COARSE = HoughSettings(theta_cells=60, rho_cells=64, rho_cell=0.08, point_pitch=float(np.radians(3.0)))
@@ -30,7 +30,7 @@ def packed(log, *, dtype: type = np.float32, frame=(0.0, 0.0, 0.0)):
     x, y, turn = log.pose[log.echo_scan].T
     cos, sin = np.cos(frame[2]), np.sin(frame[2])
     pose = np.stack([frame[0] + cos * x - sin * y, frame[1] + sin * x + cos * y, turn + frame[2]], axis=-1)
-    return kernels.Echoes(
+    return kernels.PackedEchoes(
         jnp.asarray(path[None].astype(np.int32)), jnp.asarray(log.range[None], dtype), jnp.asarray(pose[None], dtype)
     )
 
@@ -101,7 +101,7 @@ def test_order_and_padding_do_not_matter(rng):
     assert echoes.pose is not None
     order = rng.permutation(echoes.path.shape[1])
     mixed = jax.tree.map(lambda x: x[:, order], echoes)
-    more = kernels.Echoes(
+    more = kernels.PackedEchoes(
         jnp.pad(echoes.path, ((0, 0), (0, 9))),
         jnp.pad(echoes.range, ((0, 0), (0, 9)), constant_values=np.nan),
         jnp.pad(echoes.pose, ((0, 0), (0, 9), (0, 0))),
@@ -117,7 +117,7 @@ def test_no_echo_and_lines_beyond_the_accumulator_give_finite_slopes():
     tiny = dataclasses.replace(COARSE, rho_cells=6)
     slope = jax.jit(jax.value_and_grad(lambda s, e: score(s, e, tiny), allow_int=True))
     for reported in ([1.9, np.nan], [np.nan, np.nan]):
-        value, slopes = slope(sensors, kernels.Echoes(path, jnp.asarray([reported], jnp.float32), pose))
+        value, slopes = slope(sensors, kernels.PackedEchoes(path, jnp.asarray([reported], jnp.float32), pose))
         assert np.isfinite(value)
         assert all(np.isfinite(getattr(slopes, name)).all() for name in PARAMETERS)
     assert float(value) == 0
@@ -127,9 +127,9 @@ def test_no_echo_and_lines_beyond_the_accumulator_give_finite_slopes():
 def test_the_low_pass_keeps_votes_across_both_seams(rng):
     votes = np.zeros((COARSE.theta_cells, COARSE.rho_cells), np.float32)
     votes[[0, 17, -1], [0, 2, 1]] = rng.uniform(1, 2, 3)
-    smooth = blurred(jnp.asarray(votes), jnp.asarray(1.0), COARSE)
+    smooth = blur(jnp.asarray(votes), jnp.asarray(1.0), COARSE)
     np.testing.assert_allclose(smooth.sum(), votes.sum(), rtol=1e-5)
-    turned = blurred(jnp.asarray(np.roll(votes, 7, axis=0)), jnp.asarray(1.0), COARSE)
+    turned = blur(jnp.asarray(np.roll(votes, 7, axis=0)), jnp.asarray(1.0), COARSE)
     np.testing.assert_allclose(turned, np.roll(smooth, 7, axis=0), atol=1e-6)
 
 
@@ -145,7 +145,7 @@ def recovered():
     offset[5] += 0.02
     true = dataclasses.replace(given, range_offset=offset, speed_of_sound=given.speed_of_sound * 1.02)
     log = scene(true, rng, sigma=0.001)
-    return given, true, log, focus(given, log, poses=True, speed=True)
+    return given, true, log, autofocus_ring(given, log, poses=True, speed=True)
 
 
 def relative_error(ring, true):
@@ -174,16 +174,16 @@ def test_the_mean_offset_stays_and_nothing_else_changes(recovered):
 def test_a_ring_that_is_right_comes_back_as_it_is_and_so_does_one_in_clutter(recovered):
     """No more is gained by moving than chance gives; the shapes are those of the first call."""
     _, true, log, _ = recovered
-    assert focus(true, log, poses=True, speed=True) is true
+    assert autofocus_ring(true, log, poses=True, speed=True) is true
     rng = np.random.default_rng(3)
     noise = dataclasses.replace(log, range=rng.uniform(0.3, 1.9, len(log.range)))
-    assert np.abs(focus(true, noise, poses=True, speed=True).range_offset - true.range_offset).max() <= 0.05 + 1e-9
+    assert np.abs(autofocus_ring(true, noise, poses=True, speed=True).range_offset - true.range_offset).max() <= 0.05 + 1e-9
 
 
 @pytest.mark.slow
 def test_the_same_log_gives_the_same_ring(recovered):
     given, _, log, found = recovered
-    again = focus(given, log, poses=True, speed=True)
+    again = autofocus_ring(given, log, poses=True, speed=True)
     np.testing.assert_array_equal(again.range_offset, found.range_offset)
     assert again.speed_of_sound == found.speed_of_sound
 
@@ -196,7 +196,7 @@ def test_without_poses_the_speed_is_held_and_a_wrong_sensor_still_found(rng):
     true = dataclasses.replace(given, range_offset=offset)
     log = scene(true, rng, 32, sigma=0.001)  # half as many gain less than the parameters cost
     unknown = dataclasses.replace(log, pose=np.full_like(log.pose, np.nan))
-    found = focus(given, unknown, poses=False, speed=False)
+    found = autofocus_ring(given, unknown, poses=False, speed=False)
     assert found.speed_of_sound == given.speed_of_sound
     assert abs(relative_error(found, true)[3]) < 0.01
     np.testing.assert_allclose(found.range_offset.mean(), 0, atol=1e-12)
@@ -206,8 +206,8 @@ def test_what_cannot_be_used_is_refused(rng):
     log = scene(RING, rng, 2)
     unknown = dataclasses.replace(log, pose=np.full_like(log.pose, np.nan))
     with pytest.raises(SonarError, match="speed=True with poses=False"):
-        focus(RING, log, poses=False, speed=True)
+        autofocus_ring(RING, log, poses=False, speed=True)
     with pytest.raises(SonarError, match="scans = 0"):
-        focus(RING, log, poses=True, speed=False, scans=0)
+        autofocus_ring(RING, log, poses=True, speed=False, scans=0)
     with pytest.raises(SonarError, match="2 scans came, none with an echo of this ring's paths and a pose"):
-        focus(RING, unknown, poses=True, speed=False)
+        autofocus_ring(RING, unknown, poses=True, speed=False)

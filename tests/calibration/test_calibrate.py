@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from jaxsonar import Log, Ring, SonarError, calibrate, load_ring, save_calibration, simulate
-from jaxsonar.calibration.calibrate import Calibration, speed_of_sound
+from jaxsonar.calibration.calibration_result import Calibration
 from jaxsonar.geometry.se2 import compose, inverse, relative, wrap_angle
 from jaxsonar.reports.plot_calibration import calibration_figure
+from jaxsonar.sensors.ring import speed_of_sound
 from jaxsonar.sensors.ring_parameters import PARAMETERS, PRIOR, check_parameters, parameter_basis
 from jaxsonar.simulation.office import load_office
 

@@ -32,9 +32,11 @@ def test_proportional_noise_grows_with_displacement_and_rotation():
     np.testing.assert_allclose(ProportionalNoise(0.02)(walk, np.arange(2)), [[place, place, turn]])
 
 
-@pytest.mark.parametrize("wrong", [{"place": -1.0}, {"heading": float("nan")}, {"standing": (0.0, 0.1)}])
+@pytest.mark.parametrize(
+    "wrong", [{"position_per_meter": -1.0}, {"heading_per_meter": float("nan")}, {"minimum": (0.0, 0.1)}]
+)
 def test_invalid_noise_is_refused(wrong):
-    with pytest.raises(SonarError, match="slip"):
+    with pytest.raises(SonarError, match="odometry_noise"):
         OdometryNoise(**wrong)
 
 

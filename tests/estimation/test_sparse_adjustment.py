@@ -1,101 +1,223 @@
-"""The sparse solver against a dense Hessian, and the odometry residuals of a chain."""
+"""The sparse bundle adjustment against dense solvers, and its invariances."""
 
 from dataclasses import replace
+from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
+from jax.flatten_util import ravel_pytree
+from scipy.optimize import least_squares
+from support.adjustment_problem import (
+    ECHOES,
+    LANDMARK_COUNT,
+    RING,
+    SCANS,
+    SENSORS,
+    assert_same,
+    dense_jacobian,
+    dense_residuals,
+    problem_with_truth,
+)
 
 from jaxsonar import kernels
 from jaxsonar.estimation.sparse_adjustment import adjust, marginal_covariances
-from jaxsonar.geometry.se2 import compose, relative
-from jaxsonar.simulation.office import load_office
-
-SIGMA = 0.005
 
 
-def compose_steps(poses, errors):
-    """Odometry with these errors of its steps."""
-    odometry = [poses[0]]
-    for step in relative(poses[:-1], poses[1:]) + errors:
-        odometry.append(compose(odometry[-1], step))
-    return np.array(odometry)
-
-
-@pytest.mark.slow
-def test_covariances_are_those_of_the_dense_hessian(rng):
-    """Against a dense inverse of the Hessian of the cost, by automatic differentiation."""
-    ring = load_office().ring
-    poses = load_office().poses[:4]
-    odometry = compose_steps(poses, 0.02 * rng.standard_normal((3, 3)))
+@pytest.fixture(autouse=True)
+def double():
+    """Double precision."""
     with jax.enable_x64(True):
-        count, scans = 24, 4
-        kind = np.zeros((scans, count), np.int32)
-        first = rng.integers(0, 3, (scans, count)).astype(np.int32)
-        landmarks = kernels.Landmarks(
-            kind=jnp.asarray(np.zeros(3, np.int32)),
-            parameters=jnp.asarray(np.column_stack([np.zeros(3), [0.1, 1.6, -2.2]])),
-            anchor=jnp.asarray([[1.4, 0.1], [0.0, 1.5], [-0.9, -1.2]]),
-            extent=jnp.asarray(np.tile([-1.0, 1.0], (3, 1))),
-        )
-        columns = np.zeros((3 * ring.count + 3, 2))
-        columns[-2:] = 0.05 * np.eye(2)
-        poses = jnp.asarray(poses)
-        problem = kernels.LeastSquaresProblem(
-            sensors=jax.tree.map(jnp.asarray, ring.sensors),
-            basis=jnp.asarray(columns),
-            landmarks=landmarks,
-            factors=kernels.EchoFactors(
-                path=jnp.asarray(rng.integers(0, len(ring.paths), (scans, count)).astype(np.int32)),
-                reported=jnp.zeros((scans, count)),
-                reflection=kernels.Reflection(*(jnp.asarray(x) for x in (kind, first, first))),
-                weight=jnp.full((scans, count), 1 / SIGMA**2),
-            ),
-            prior_poses=poses,
-            prior_information=jnp.asarray(np.r_[[[1e6] * 3], np.ones((scans - 1, 3))]),
-            odometry=jnp.asarray(np.r_[relative(odometry[: scans - 1], odometry[1:scans]), np.zeros((1, 3))]),
-            odometry_information=jnp.full((scans, 3), 1e4),
-            landmark_prior_sd=5.0,
-        )
-        unknowns = kernels.Unknowns(jnp.zeros(2), poses, jnp.asarray(landmarks.parameters))
-        exact = -kernels.residuals(problem, unknowns)
-        problem = replace(
-            problem, factors=replace(problem.factors, reported=exact)
-        )  # no residual: Gauss-Newton is exact
-        found = adjust(problem, unknowns, poses_free=True, max_iterations=30)
-        problem = replace(problem, factors=replace(problem.factors, reported=exact), prior_poses=found.unknowns.poses)
-        covariances = marginal_covariances(problem, found.unknowns, poses_free=True)
+        yield
 
-        def flat(values):
-            poses, coordinates, landmarks = values[:12].reshape(4, 3), values[12:14], values[14:].reshape(3, 2)
-            return kernels.Unknowns(coordinates, poses, landmarks)
 
-        def squares(values):
-            now = flat(values)
-            out = [jnp.sqrt(problem.factors.weight).ravel() * kernels.residuals(problem, now).ravel()]
-            out += [now.coordinates, (now.landmarks - landmarks.parameters).ravel() / 5.0]
-            out += [(jnp.sqrt(problem.prior_information) * (now.poses - problem.prior_poses)).ravel()]
-            scale = jnp.exp(-0.05 * now.coordinates)
-            for k in range(scans - 1):
-                displacement, heading = (now.poses[k + 1] - now.poses[k])[:2], now.poses[k, 2]
-                cos, sin = jnp.cos(heading), jnp.sin(heading)
-                forward = jnp.stack(
-                    [cos * displacement[0] + sin * displacement[1], cos * displacement[1] - sin * displacement[0]]
-                )
-                turn = now.poses[k + 1, 2] - heading - scale[1] * problem.odometry[k, 2]
-                out.append(100.0 * jnp.append(forward - scale[0] * problem.odometry[k, :2], turn))
-            return jnp.concatenate(out)
+@pytest.fixture(params=[True, False], ids=["odometry", "no odometry"])
+def odometry(request):
+    return request.param
 
-        at = jnp.concatenate(
-            [found.unknowns.poses.ravel(), found.unknowns.coordinates, found.unknowns.landmarks.ravel()]
-        )
-        jacobian = np.asarray(jax.jacfwd(squares)(at))
-        whole = np.linalg.inv(jacobian.T @ jacobian)
-        np.testing.assert_allclose((squares(at) ** 2).sum() / 2, kernels.cost(problem, flat(at)), rtol=1e-9)
-        for k in range(scans):
-            own = slice(3 * k, 3 * k + 3)
-            np.testing.assert_allclose(covariances.poses[k], whole[own, own], rtol=1e-7, atol=1e-14)
-        np.testing.assert_allclose(covariances.coordinates, whole[12:14, 12:14], rtol=1e-7, atol=1e-14)
-        landmarks = [whole[14 + 2 * k : 16 + 2 * k, 14 + 2 * k : 16 + 2 * k] for k in range(3)]
-        np.testing.assert_allclose(covariances.landmarks, landmarks, rtol=1e-7, atol=1e-14)
+
+adjust_all = partial(adjust, poses_free=True)
+adjust_held = partial(adjust, poses_free=False)
+covariances = partial(marginal_covariances, poses_free=True)
+
+
+def dense_covariance(problem, unknowns, *, poses_free=True):
+    """Blocks of the inverse of the dense normal matrix, as ``marginal_covariances`` yields them."""
+    jacobian, size = np.asarray(dense_jacobian(unknowns, problem)), problem.basis.shape[1]
+    poses = slice(size, size + 3 * len(unknowns.poses))
+    if not poses_free:
+        jacobian = np.delete(jacobian, poses, axis=1)
+    cov = np.linalg.inv(jacobian.T @ jacobian)
+    first = poses.stop if poses_free else size
+    rows = [np.arange(size + 3 * k, size + 3 * k + 3) for k in range(len(unknowns.poses)) if poses_free]
+    points = [np.arange(first + 2 * k, first + 2 * k + 2) for k in range(len(unknowns.landmarks))]
+    return cov[:size, :size], [cov[np.ix_(r, r)] for r in rows], [cov[np.ix_(r, r)] for r in points]
+
+
+def assert_covariances(found, expected):
+    """Equal to 1e-5 standard deviations."""
+    coordinates, poses, landmarks = expected
+    for one, other in [(found.coordinates, coordinates), *zip(found.poses, poses, strict=False),
+                       *zip(found.landmarks, landmarks, strict=True)]:  # fmt: skip
+        scale = np.sqrt(np.outer(np.diag(other), np.diag(other)))
+        np.testing.assert_allclose(one / scale, other / scale, atol=1e-5)
+
+
+@pytest.mark.parametrize("odometry_scale", [False, True])
+def test_dense_solvers_find_the_same(rng, odometry, odometry_scale):
+    problem, start, _ = problem_with_truth(rng, odometry=odometry, odometry_scale=odometry_scale)
+    found = adjust_all(problem, start)
+    solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
+    expected = optx.least_squares(dense_residuals, solver, start, problem, max_steps=100).value
+    assert_same(found.unknowns, expected, atol=1e-6)
+    flat, unravel = ravel_pytree(start)
+    by_scipy = least_squares(
+        lambda x: np.asarray(dense_residuals(unravel(jnp.asarray(x)), problem)),
+        np.asarray(flat),
+        jac=lambda x: np.asarray(dense_jacobian(unravel(jnp.asarray(x)), problem)),
+        xtol=1e-12,
+    )
+    assert_same(found.unknowns, unravel(jnp.asarray(by_scipy.x)), atol=1e-6)
+    assert found.cost <= (1 + 1e-9) * kernels.cost(problem, expected)
+    assert found.cost < 1e-2 * found.initial_cost
+    np.testing.assert_allclose(found.initial_cost, kernels.cost(problem, start), rtol=1e-12)
+    np.testing.assert_allclose(found.cost, kernels.cost(problem, found.unknowns), rtol=1e-12)
+
+
+@pytest.mark.parametrize("odometry_scale", [False, True])
+def test_the_covariances_are_those_of_the_dense_equations(rng, odometry, odometry_scale):
+    problem, start, _ = problem_with_truth(rng, odometry=odometry, odometry_scale=odometry_scale)
+    unknowns = adjust_all(problem, start).unknowns
+    assert_covariances(covariances(problem, unknowns), dense_covariance(problem, unknowns))
+    jacobian = np.asarray(dense_jacobian(unknowns, problem))
+    sd = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    gradient = jacobian.T @ np.asarray(dense_residuals(unknowns, problem))
+    assert np.abs(gradient * sd).max() < 1e-3  # standard deviations from the minimum
+
+
+def test_held_poses_keep_their_values_and_reduce_the_covariances(rng):
+    problem, start, true = problem_with_truth(rng)
+    start = replace(start, poses=true.poses)
+    unknowns = adjust_held(problem, start).unknowns
+    np.testing.assert_array_equal(unknowns.poses, true.poses)
+    held = marginal_covariances(problem, unknowns, poses_free=False)
+    assert_covariances(held, dense_covariance(problem, unknowns, poses_free=False))
+    assert not held.poses.any()
+    jacobian, size = np.asarray(dense_jacobian(unknowns, problem)), problem.basis.shape[1]
+    gradient = jacobian.T @ np.asarray(dense_residuals(unknowns, problem))
+    gradient = np.delete(gradient, slice(size, size + 3 * SCANS))
+    sd = np.sqrt(np.concatenate([np.diag(held.coordinates), *(np.diag(cov) for cov in held.landmarks)]))
+    assert np.abs(gradient * sd).max() < 1e-3
+    free = covariances(problem, adjust_all(problem, start).unknowns)
+    assert (np.diag(free.coordinates) >= np.diag(held.coordinates) * (1 - 1e-9)).all()
+
+
+def test_the_errors_agree_with_the_standard_deviations(rng):
+    problem, start, true = problem_with_truth(rng)
+    unknowns = adjust_all(problem, start).unknowns
+    cov = covariances(problem, unknowns)
+    sd = np.sqrt(np.concatenate([np.diag(cov.coordinates), *(np.diag(block) for block in cov.landmarks)]))
+    values = [np.concatenate([np.asarray(u.coordinates), np.asarray(u.landmarks).ravel()]) for u in (unknowns, true)]
+    observed = sd < 0.5
+    assert observed.sum() > 15
+    assert np.abs((values[0] - values[1]) / sd)[observed].max() < 4
+
+
+# Invariances
+
+
+def test_the_order_of_scans_is_irrelevant_without_odometry(rng):
+    problem, start, _ = problem_with_truth(rng, odometry=False)
+    order = np.array([3, 0, 4, 2, 1])
+    per_scan = [problem.factors, problem.prior_poses, problem.prior_information, problem.odometry]
+    permuted = [jax.tree.map(lambda x: x[order], tree) for tree in per_scan]
+    other = eqx.tree_at(lambda p: [p.factors, p.prior_poses, p.prior_information, p.odometry], problem, permuted)
+    found = adjust_all(problem, start).unknowns
+    again = adjust_all(other, replace(start, poses=start.poses[order])).unknowns
+    assert_same((again.coordinates, again.landmarks), (found.coordinates, found.landmarks), 1e-7)
+    np.testing.assert_allclose(again.poses, found.poses[order], atol=1e-7)
+    assert_same(covariances(other, again).coordinates, covariances(problem, found).coordinates, 1e-7)
+
+
+def test_the_order_of_echoes_and_of_transmitter_and_receiver_are_irrelevant(rng):
+    """(tx, rx) and (rx, tx) have the same geometry; for echoes of second order the walls swap as well."""
+    problem, start, _ = problem_with_truth(rng)
+    order = rng.permutation(ECHOES)
+    factors = jax.tree.map(lambda x: x[:, order], problem.factors)
+    reverse_path = RING.path_index[RING.paths[:, 1], RING.paths[:, 0]].astype(np.int32)
+    reflection = factors.reflection
+    reversed_factors = eqx.tree_at(
+        lambda f: (f.path, f.reflection.first, f.reflection.second),
+        factors,
+        (jnp.asarray(reverse_path)[factors.path], reflection.second, reflection.first),
+    )
+    other = replace(problem, factors=reversed_factors)
+    found, again = adjust_all(problem, start).unknowns, adjust_all(other, start).unknowns
+    assert_same(again, found, 1e-7)
+    assert_same(covariances(other, again), covariances(problem, found), 1e-7)
+
+
+def test_echoes_of_weight_0_are_ignored(rng):
+    problem, start, _ = problem_with_truth(rng)
+    ignored = problem.factors.weight == 0
+    path = jnp.where(ignored, 0, problem.factors.path)
+    reported = jnp.where(ignored, 1e6, problem.factors.reported)
+    kind = jnp.where(ignored, -1, problem.factors.reflection.kind)
+    other = eqx.tree_at(
+        lambda p: (p.factors.path, p.factors.reported, p.factors.reflection.kind), problem, (path, reported, kind)
+    )
+    found, again = adjust_all(problem, start).unknowns, adjust_all(other, start).unknowns
+    assert_same(again, found)
+    assert_same(covariances(other, again), covariances(problem, found))
+
+
+def test_padding_is_irrelevant(rng):
+    """Scans and landmarks without echoes keep their initial values and prior covariances."""
+    problem, start, _ = problem_with_truth(rng)
+
+    def grow(tree, rows):
+        return jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros((rows, *x.shape[1:]), x.dtype)]), tree)
+
+    grown = replace(
+        problem,
+        landmarks=grow(problem.landmarks, 2),
+        factors=grow(problem.factors, 3),
+        prior_poses=grow(problem.prior_poses, 3),
+        odometry=grow(problem.odometry, 3),
+        prior_information=grow(problem.prior_information, 3).at[SCANS:].set(1.0),
+        # The row of the last scan was not used; now it must be 0.
+        odometry_information=grow(problem.odometry_information.at[-1].set(0), 3),
+    )
+    found = adjust_all(problem, start).unknowns
+    again = adjust_all(grown, replace(start, poses=grow(start.poses, 3), landmarks=grow(start.landmarks, 2))).unknowns
+    kept = replace(again, poses=again.poses[:SCANS], landmarks=again.landmarks[:LANDMARK_COUNT])
+    assert_same(kept, found, 1e-7)
+    np.testing.assert_array_equal(again.poses[SCANS:], 0)
+    np.testing.assert_array_equal(again.landmarks[LANDMARK_COUNT:], 0)
+    cov, grown_cov = covariances(problem, found), covariances(grown, again)
+    np.testing.assert_allclose(grown_cov.coordinates, cov.coordinates, atol=1e-7)
+    np.testing.assert_allclose(grown_cov.poses, np.concatenate([cov.poses, np.tile(np.eye(3), (3, 1, 1))]), atol=1e-7)
+    np.testing.assert_allclose(grown_cov.landmarks[LANDMARK_COUNT:], np.tile(np.eye(2), (2, 1, 1)), atol=1e-12)
+
+
+def test_a_parameter_without_a_column_stays_at_its_prior(rng):
+    problem, start, _ = problem_with_truth(rng)
+    problem = replace(problem, basis=problem.basis.at[:, SENSORS].set(0))
+    found = adjust_all(problem, start).unknowns
+    assert found.coordinates[SENSORS] == 0
+    row = covariances(problem, found).coordinates[SENSORS]
+    np.testing.assert_allclose(row, np.eye(len(row))[SENSORS], atol=1e-12)
+    changed = kernels.apply_parameters(problem.sensors, problem.basis @ found.coordinates)
+    assert changed.range_scale == problem.sensors.range_scale
+
+
+def test_the_minimum_is_a_fixed_point(rng):
+    problem, start, _ = problem_with_truth(rng)
+    found = adjust_all(problem, start)
+    again = adjust_all(problem, found.unknowns)
+    assert again.iterations <= 2
+    assert_same(again.unknowns, found.unknowns, 1e-6)
+    assert found.iterations < 20
