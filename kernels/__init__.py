@@ -1,7 +1,7 @@
 """Pure JAX kernels: from the ranges of echoes to votes, occupied cells and lines. Arrays in, arrays out."""
 
 from .array_geometry import EchoPaths as EchoPaths
-from .array_geometry import Sensors as Sensors
+from .array_geometry import SensorArray as SensorArray
 from .array_geometry import echo_paths as echo_paths
 from .array_geometry import transform_path as transform_path
 from .beam_pattern import BeamPattern as BeamPattern
@@ -16,13 +16,13 @@ from .bundle_adjustment import cost as cost
 from .bundle_adjustment import linearize as linearize
 from .bundle_adjustment import odometry_residuals as odometry_residuals
 from .bundle_adjustment import residuals as residuals
-from .data_association import Association as Association
 from .data_association import CandidateReflections as CandidateReflections
+from .data_association import EchoAssociation as EchoAssociation
 from .data_association import associate as associate
 from .detection_settings import DetectionSettings as DetectionSettings
 from .geometry import fold_line as fold_line
-from .geometry import segment_endpoints as segment_endpoints
 from .geometry import normal as normal
+from .geometry import segment_endpoints as segment_endpoints
 from .geometry import tangent as tangent
 from .geometry import wrap_angle as wrap_angle
 from .hough_accumulator import HoughSettings as HoughSettings
@@ -32,15 +32,15 @@ from .hough_accumulator import full_wall_votes as full_wall_votes
 from .hough_accumulator import lowpass as lowpass
 from .hough_accumulator import soft_accumulate as soft_accumulate
 from .hough_accumulator import theta_row as theta_row
-from .hough_voting import PIECE as PIECE
-from .hough_voting import Echoes as Echoes
+from .hough_voting import PIECE_POINTS as PIECE_POINTS
+from .hough_voting import PackedEchoes as PackedEchoes
 from .hough_voting import RingArcs as RingArcs
-from .hough_voting import Voted as Voted
+from .hough_voting import Votes as Votes
 from .hough_voting import accumulators as accumulators
-from .hough_voting import lines_of_scan as lines_of_scan
-from .hough_voting import moved_arcs as moved_arcs
 from .hough_voting import points_of_widest_arc as points_of_widest_arc
 from .hough_voting import ring_arcs as ring_arcs
+from .hough_voting import tangent_lines as tangent_lines
+from .hough_voting import transform_arcs as transform_arcs
 from .hough_voting import vote as vote
 from .hough_voting import vote_lines as vote_lines
 from .isorange_arcs import Arc as Arc

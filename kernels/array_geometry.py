@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from .geometry import normal, rotate, wrap_angle
 
 
-class Sensors(eqx.Module):
+class SensorArray(eqx.Module):
     """What the kernels know of a ring. Every field is a leaf: change a pose and nothing is compiled anew."""
 
     position: Float[Array, "sensors 2"]
@@ -73,7 +73,7 @@ def transform_path(path: EchoPaths, pose: Float[Array, "3"]) -> EchoPaths:
 
 
 @jax.jit
-def echo_paths(sensors: Sensors) -> EchoPaths:
+def echo_paths(sensors: SensorArray) -> EchoPaths:
     """Geometry of every echo path of a ring, in the order of ``sensors.tx``."""
 
     def one_path(tx: Int[Array, ""], rx: Int[Array, ""]) -> EchoPaths:

@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from . import hough_accumulator as hough
 from . import isorange_arcs as arcs
-from .array_geometry import Sensors, echo_paths
+from .array_geometry import SensorArray, echo_paths
 from .hough_accumulator import HoughSettings
-from .hough_voting import Echoes
+from .hough_voting import PackedEchoes
 from .measurement_model import corrected_range
 
-BLUR_REACH = 6
+BLUR_RADIUS = 6
 """Cells on each side that the low pass along rho takes in: three standard deviations of two cells."""
 _NORM = 4  # of the occupancies along an arc: near their maximum, yet smooth
 _LEAST = 1e-12  # keeps the logarithm finite where all lines of an echo lie beyond the accumulator
@@ -38,7 +38,7 @@ def focus_measure(occupancy: Float[Array, "echoes points"], counts: Bool[Array, 
     return jnp.sum(jnp.where(heard, jnp.log(jnp.where(heard, power, 1) + _LEAST) / _NORM, 0))
 
 
-def blurred(
+def blur(
     votes: Float[Array, "theta rho"], width: Float[Array, ""], settings: HoughSettings
 ) -> Float[Array, "theta rho"]:
     """Low pass of any width along rho, binomial along theta; both seams kept, any floating-point type.
@@ -49,16 +49,16 @@ def blurred(
         settings: of the accumulator; at least ``BLUR_REACH`` columns.
     """
     columns = settings.rho_cells
-    before = jnp.roll(votes[:, :BLUR_REACH][:, ::-1], settings.theta_cells // 2, axis=0)
+    before = jnp.roll(votes[:, :BLUR_RADIUS][:, ::-1], settings.theta_cells // 2, axis=0)
     wide = jnp.concatenate([before, votes, jnp.zeros_like(before)], axis=1)
-    steps = jnp.arange(-BLUR_REACH, BLUR_REACH + 1, dtype=votes.dtype)
+    steps = jnp.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, dtype=votes.dtype)
     taps = jax.nn.softmax(-((steps / width) ** 2) / 2)
     smooth = sum((taps[k] * wide[:, k : k + columns] for k in range(len(steps))), start=jnp.zeros_like(votes))
     return (jnp.roll(smooth, 1, axis=0) + 2 * smooth + jnp.roll(smooth, -1, axis=0)) / 4
 
 
-def lines_of_echoes(
-    sensors: Sensors, echoes: Echoes, *, settings: HoughSettings, points: int
+def tangent_lines_of_echoes(
+    sensors: SensorArray, echoes: PackedEchoes, *, settings: HoughSettings, points: int
 ) -> tuple[Float[Array, "echoes points"], Float[Array, "echoes points"], Bool[Array, "echoes points"]]:
     """Tangent lines (rho, theta) at equidistant points of every echo's arc, and which of them exist.
 
@@ -93,7 +93,7 @@ def lines_of_echoes(
 
 @partial(jax.jit, static_argnames=("settings", "points"))
 def ring_focus_measure(
-    sensors: Sensors, echoes: Echoes, width: Float[Array, ""], *, settings: HoughSettings, points: int
+    sensors: SensorArray, echoes: PackedEchoes, width: Float[Array, ""], *, settings: HoughSettings, points: int
 ) -> Float[Array, ""]:
     """How well the echoes agree on where walls are, in nats: the sum over echoes, one accumulator a row.
 
@@ -109,11 +109,11 @@ def ring_focus_measure(
         points: room for this many points on an arc (``points_of_widest_arc``).
     """
 
-    def one_row(row: Echoes) -> Float[Array, ""]:
-        rho, theta, counts = lines_of_echoes(sensors, row, settings=settings, points=points)
+    def one_row(row: PackedEchoes) -> Float[Array, ""]:
+        rho, theta, counts = tangent_lines_of_echoes(sensors, row, settings=settings, points=points)
         vote = partial(hough.soft_accumulate, rho, theta, settings=settings)
         votes, read = jax.vjp(vote, counts.astype(rho.dtype))
-        (occupancy,) = read(blurred(votes, width, settings))  # reading between cells is the transpose of voting
+        (occupancy,) = read(blur(votes, width, settings))  # reading between cells is the transpose of voting
         return focus_measure(occupancy, counts)
 
     return jax.lax.map(one_row, echoes).sum()

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .array_geometry import EchoPaths, Sensors, echo_paths, widen_cones
+from .array_geometry import EchoPaths, SensorArray, echo_paths, widen_cones
 from .landmarks import AnyArray, Landmarks, Reflection, predict_reflection
 from .measurement_model import SETTINGS, reported_range
 
@@ -21,7 +21,7 @@ class CandidateReflections(eqx.Module):
     """Candidates of one group do not compete with each other: second order reflections at two walls in either order."""
 
 
-class Association(eqx.Module):
+class EchoAssociation(eqx.Module):
     """The nearest candidate of every echo."""
 
     candidate: Int[Array, "scans echoes"]
@@ -35,7 +35,7 @@ class Association(eqx.Module):
 
 @jax.jit
 def associate(
-    sensors: Sensors,
+    sensors: SensorArray,
     landmarks: Landmarks,
     candidates: CandidateReflections,
     poses: Float[Array, "scans 3"],
@@ -43,7 +43,7 @@ def associate(
     path: Int[Array, "scans echoes"],
     reported: Float[Array, "scans echoes"],
     near: Int[Array, "scans near"],
-) -> Association:
+) -> EchoAssociation:
     """Associate every echo with the candidate of the nearest range that its path can receive.
 
     Args:
@@ -88,4 +88,4 @@ def associate(
         competitor_gap = jnp.where(competes, gap, jnp.inf).min(axis=0)
         return jnp.where(found, near[best], -1), jnp.where(found, reported - nearest, jnp.inf), competitor_gap
 
-    return Association(*jax.lax.map(associate_scan, (poses, world, path, reported, near)))
+    return EchoAssociation(*jax.lax.map(associate_scan, (poses, world, path, reported, near)))

@@ -163,7 +163,7 @@ def _before(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "theta
     return jnp.roll(cells[:, :width][:, ::-1], len(cells) // 2, axis=0)
 
 
-def bordered(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "rows columns"]:
+def extend_across_seams(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "rows columns"]:
     """An accumulator with this many more cells on every side: what touches across both seams; 0 beyond the last column.
 
     One array in memory, so that what reads it with all its neighbors is one loop.
@@ -182,10 +182,10 @@ def full_wall_votes(paths: EchoPaths, settings: HoughSettings) -> Float[Array, "
     The paths that hear it times the points that an arc has in one cell. So the threshold depends neither on the point
     pitch nor on the ring.
     """
-    return votes_of(full_wall_paths(paths), settings)
+    return votes_of_paths(full_wall_paths(paths), settings)
 
 
-def votes_of(paths: Float[Array, ""], settings: HoughSettings) -> Float[Array, ""]:
+def votes_of_paths(paths: Float[Array, ""], settings: HoughSettings) -> Float[Array, ""]:
     """Points that so many paths put into the cell of a wall that all of them hear."""
     return paths * settings.theta_cell / settings.point_pitch
 
@@ -214,7 +214,7 @@ def peaks(
         rho, theta: centres of gravity of the occupancy around each maximum, metres and radians.
     """
     rows, columns = smooth.shape
-    wide = bordered(smooth, 1)
+    wide = extend_across_seams(smooth, 1)
     steps = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
     around = [wide[1 + down : 1 + down + rows, 1 + right : 1 + right + columns] for down, right in steps]
     earlier, later = (reduce(jnp.maximum, neighbors) for neighbors in (around[:4], around[5:]))

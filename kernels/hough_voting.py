@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from . import hough_accumulator as hough
 from . import isorange_arcs as arcs
-from .array_geometry import EchoPaths, Sensors, echo_paths, transform_path
+from .array_geometry import EchoPaths, SensorArray, echo_paths, transform_path
 from .hough_accumulator import HoughSettings
 from .measurement_model import corrected_range
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     AnyArray = Array  # what kernels see
 else:
     AnyArray = np.ndarray | Array  # a compiled step takes NumPy arrays to where it runs
-PIECE = 16
+PIECE_POINTS = 16
 """Points in a piece of an arc."""
 
 
-class Echoes(NamedTuple):
+class PackedEchoes(NamedTuple):
     """Echoes of scans, packed: real ones first, then padding. A tuple, which JAX takes apart without Python's help."""
 
     path: Int[AnyArray, "*scans echoes"]
@@ -34,7 +34,7 @@ class Echoes(NamedTuple):
     pose: Float[AnyArray, "*scans echoes 3"] | None = None
     """model_from_robot: where the robot stood when each echo was taken, in the frame of the lines: x, y (metres), theta
     (radians). None: all were taken where that frame is."""
-    gathered: Float[AnyArray, "*scans"] | None = None
+    scan_count: Float[AnyArray, "*scans"] | None = None
     """How many scans were gathered, the measure of the votes that a wall can collect. None: one."""
     piece: Int[AnyArray, "*scans pieces"] | None = None
     """Arcs in pieces of ``PIECE`` points: which piece of its arc each is; -1 where there is none. So arcs of narrow
@@ -50,20 +50,20 @@ class RingArcs(eqx.Module):
     """Geometry of every echo path."""
     arcs: arcs.Arc
     """Equidistant normals of every path."""
-    rows: Int[Array, "paths points"]
+    theta_rows: Int[Array, "paths points"]
     """Row of the accumulator that each normal belongs to."""
-    level: Float[Array, ""]
+    vote_threshold: Float[Array, ""]
     """Occupancy that a cell must exceed, points."""
     range_scale: Float[Array, ""]
     """Speed of sound over the speed that the reported ranges assume."""
     max_range: Float[Array, ""]
     """Half path length up to which an echo counts, metres."""
-    full_wall: Float[Array, ""]
+    full_wall_paths: Float[Array, ""]
     """Number of paths that hear a wide wall."""
 
 
 @partial(jax.jit, static_argnames=("settings", "points"))
-def ring_arcs(sensors: Sensors, *, settings: HoughSettings, points: int) -> RingArcs:
+def ring_arcs(sensors: SensorArray, *, settings: HoughSettings, points: int) -> RingArcs:
     """Equidistant points on the arcs of every path of a ring, and the threshold for its scans.
 
     Args:
@@ -76,16 +76,16 @@ def ring_arcs(sensors: Sensors, *, settings: HoughSettings, points: int) -> Ring
     return RingArcs(
         paths=paths,
         arcs=arcs_of_paths,
-        rows=hough.theta_row(arcs_of_paths.theta, settings),
-        level=settings.threshold * hough.full_wall_votes(paths, settings),
+        theta_rows=hough.theta_row(arcs_of_paths.theta, settings),
+        vote_threshold=settings.threshold * hough.full_wall_votes(paths, settings),
         range_scale=sensors.range_scale,
         max_range=sensors.max_range,
-        full_wall=hough.full_wall_paths(paths),
+        full_wall_paths=hough.full_wall_paths(paths),
     )
 
 
 @partial(jax.jit, static_argnames="settings")
-def moved_arcs(ring: RingArcs, pose: Float[Array, "paths 3"], *, settings: HoughSettings) -> RingArcs:
+def transform_arcs(ring: RingArcs, pose: Float[Array, "paths 3"], *, settings: HoughSettings) -> RingArcs:
     """The arcs of a ring that moved while its groups fired, one after the other.
 
     Args:
@@ -97,12 +97,12 @@ def moved_arcs(ring: RingArcs, pose: Float[Array, "paths 3"], *, settings: Hough
     points = ring.arcs.theta.shape[-1]
     arcs_of_paths = jax.vmap(partial(arcs.arc, pitch=settings.point_pitch, points=points))(paths)
     rows = hough.theta_row(arcs_of_paths.theta, settings)
-    return eqx.tree_at(lambda r: (r.paths, r.arcs, r.rows), ring, (paths, arcs_of_paths, rows))
+    return eqx.tree_at(lambda r: (r.paths, r.arcs, r.theta_rows), ring, (paths, arcs_of_paths, rows))
 
 
 def points_of_widest_arc(beam: Float[np.ndarray, " sensors"], settings: HoughSettings) -> int:
     """Room for the widest arc of a ring, that of the direct path of the sensor with the widest cone: whole pieces."""
-    return PIECE * max(1, int(np.ceil((np.max(beam) / settings.point_pitch - 1e-6) / PIECE)))
+    return PIECE_POINTS * max(1, int(np.ceil((np.max(beam) / settings.point_pitch - 1e-6) / PIECE_POINTS)))
 
 
 class TangentLines(eqx.Module):
@@ -118,7 +118,7 @@ class TangentLines(eqx.Module):
     """Cells of the accumulator (``hough.cell_of``)."""
 
 
-def lines_of_scan(ring: RingArcs, echoes: Echoes, settings: HoughSettings) -> TangentLines:
+def tangent_lines(ring: RingArcs, echoes: PackedEchoes, settings: HoughSettings) -> TangentLines:
     """The tangent line at every point of every echo's arc, for ONE scan, or several gathered in one frame."""
 
     def one_arc(arc: arcs.Arc, row: Int[Array, " points"], path: Int[Array, ""], echo: Int[Array, ""]) -> TangentLines:
@@ -136,29 +136,29 @@ def lines_of_scan(ring: RingArcs, echoes: Echoes, settings: HoughSettings) -> Ta
 
     def whole(echo: Int[Array, ""]) -> TangentLines:
         path = echoes.path[echo]
-        arc, row = jax.tree.map(lambda leaf: leaf[path], (ring.arcs, ring.rows))
+        arc, row = jax.tree.map(lambda leaf: leaf[path], (ring.arcs, ring.theta_rows))
         return one_arc(arc, row, path, echo)
 
     if echoes.piece is None or echoes.owner is None:
         return jax.vmap(whole)(jnp.arange(len(echoes.path)))
-    pieces = ring.rows.shape[-1] // PIECE
+    pieces = ring.theta_rows.shape[-1] // PIECE_POINTS
 
     def cut(leaf: Array) -> Array:
-        return leaf if leaf.ndim == 1 else leaf.reshape(-1, PIECE)
+        return leaf if leaf.ndim == 1 else leaf.reshape(-1, PIECE_POINTS)
 
-    of_pieces = jax.tree.map(cut, (ring.arcs, ring.rows))
+    of_pieces = jax.tree.map(cut, (ring.arcs, ring.theta_rows))
 
     def part(piece: Int[Array, ""], echo: Int[Array, ""]) -> TangentLines:
         path = echoes.path[echo]
         at = path * pieces + jnp.maximum(piece, 0)
         arc, row = jax.tree.map(lambda leaf: leaf[path if leaf.ndim == 1 else at], of_pieces)
-        arc = eqx.tree_at(lambda a: a.counts, arc, arc.counts & (piece >= 0))
+        arc = eqx.tree_at(lambda a: a.exists, arc, arc.exists & (piece >= 0))
         return one_arc(arc, row, path, echo)
 
     return jax.vmap(part)(echoes.piece, echoes.owner)
 
 
-def over_scans(one_scan: Callable, *scans):
+def map_scans(one_scan: Callable, *scans):
     """One scan after the other where caches are small (CPU), all at once where cores are many (GPU)."""
 
     def in_turn(*scans):
@@ -169,7 +169,7 @@ def over_scans(one_scan: Callable, *scans):
     return jax.lax.platform_dependent(*scans, cpu=in_turn, default=jax.vmap(one_scan))
 
 
-class Voted(NamedTuple):
+class Votes(NamedTuple):
     """What a batch of scans voted for (paper, section 4, up to the threshold)."""
 
     occupied: Bool[Array, "*scans theta rho"]
@@ -181,7 +181,7 @@ class Voted(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="settings")
-def vote(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -> Voted:
+def vote(ring: RingArcs, echoes: PackedEchoes, *, settings: HoughSettings) -> Votes:
     """The paper's section 4 up to the threshold, for a batch of scans in one compiled step.
 
     Args:
@@ -190,28 +190,28 @@ def vote(ring: RingArcs, echoes: Echoes, *, settings: HoughSettings) -> Voted:
         settings: accumulator and low pass.
     """
     # Arcs -> equidistant points -> tangent lines: no sums, so all scans at once.
-    lines = jax.vmap(lambda scan: lines_of_scan(ring, scan, settings))(echoes)
-    gathered = jnp.ones(len(lines.cell)) if echoes.gathered is None else echoes.gathered
+    lines = jax.vmap(lambda scan: tangent_lines(ring, scan, settings))(echoes)
+    gathered = jnp.ones(len(lines.cell)) if echoes.scan_count is None else echoes.scan_count
 
     def one_scan(cell: Int[Array, "arcs points"], level: Float[Array, ""]) -> Bool[Array, "theta rho"]:
         votes = hough.accumulate(cell, settings)  # points per cell
         smooth = hough.lowpass(votes, settings)  # balance between neighbor cells
         return smooth > level  # highly occupied cells
 
-    return Voted(over_scans(one_scan, lines.cell, ring.level * gathered), lines.cell, lines.rho)
+    return Votes(map_scans(one_scan, lines.cell, ring.vote_threshold * gathered), lines.cell, lines.rho)
 
 
 @partial(jax.jit, static_argnames="settings")
 def accumulators(
-    ring: RingArcs, echoes: Echoes, *, settings: HoughSettings
+    ring: RingArcs, echoes: PackedEchoes, *, settings: HoughSettings
 ) -> tuple[Int[Array, "scans theta rho"], Float[Array, "scans theta rho"]]:
     """Votes before and after the low pass, to look at; arguments as ``vote``."""
 
-    def one_scan(scan: Echoes):
-        votes = hough.accumulate(lines_of_scan(ring, scan, settings).cell, settings)
+    def one_scan(scan: PackedEchoes):
+        votes = hough.accumulate(tangent_lines(ring, scan, settings).cell, settings)
         return votes, hough.lowpass(votes, settings)
 
-    return over_scans(one_scan, echoes)
+    return map_scans(one_scan, echoes)
 
 
 @partial(jax.jit, static_argnames="settings")

@@ -26,13 +26,13 @@ class Arc(eqx.Module):
     """Cosines of the normals."""
     normal_y: Float[Array, "*paths points"]
     """Sines of the normals."""
-    along: Float[Array, "*paths points"]
+    midpoint_normal: Float[Array, "*paths points"]
     """The virtual sensor's coordinate along each normal, m . n, metres."""
-    across_squared: Float[Array, "*paths points"]
+    baseline_tangent_squared: Float[Array, "*paths points"]
     """Square of the half baseline across each normal, (d . t)^2, square metres."""
     half_baseline_squared: Float[Array, "*paths"]
     """Square of the half baseline, square metres."""
-    counts: Bool[Array, "*paths points"]
+    exists: Bool[Array, "*paths points"]
     """Which of the points exist: a narrow detection range has fewer than the widest."""
 
 
@@ -53,10 +53,10 @@ def arc(path: EchoPaths, *, pitch: float, points: int) -> Arc:
         theta=theta,
         normal_x=normals[:, 0],
         normal_y=normals[:, 1],
-        along=normals @ path.midpoint,
-        across_squared=(tangent(theta) @ path.half_baseline) ** 2,
+        midpoint_normal=normals @ path.midpoint,
+        baseline_tangent_squared=(tangent(theta) @ path.half_baseline) ** 2,
         half_baseline_squared=path.half_baseline @ path.half_baseline,
-        counts=(index < whole) & (path.width > 0),
+        exists=(index < whole) & (path.width > 0),
     )
 
 
@@ -79,8 +79,8 @@ def tangent_rho(
     """
     heard = (reach < max_range) & (reach * reach > arc.half_baseline_squared) & (reach > 0)  # False for NaN
     reach = jnp.where(heard, reach, 1)  # before the arithmetic, so that no gradient is NaN
-    rho = arc.along + safe_sqrt(reach * reach - arc.across_squared)
-    counts = arc.counts & heard
+    rho = arc.midpoint_normal + safe_sqrt(reach * reach - arc.baseline_tangent_squared)
+    counts = arc.exists & heard
     return jnp.where(counts, rho, 0), counts
 
 

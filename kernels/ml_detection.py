@@ -34,7 +34,7 @@ from .detection_settings import DetectionSettings
 from .detection_state import Hypotheses, ScanData, SceneEstimate, Selection, count, determinant
 from .geometry import fold_line, segment_endpoints, wrap_angle
 from .hough_accumulator import HoughSettings
-from .hough_voting import Echoes, RingArcs, lines_of_scan, over_scans
+from .hough_voting import PackedEchoes, RingArcs, map_scans, tangent_lines
 from .measurement_model import PLANE, plane_echo, point_echo, visibility
 from .robust_fit import edge, fit_reflector, paths_and_ranges, plane, start_of_point
 
@@ -65,7 +65,7 @@ class Detections(eqx.Module):
 @partial(jax.jit, static_argnames=("hough_settings", "settings"))
 def detect_ml(
     ring: RingArcs,
-    echoes: Echoes,
+    echoes: PackedEchoes,
     sigma: Float[Array, ""],
     *,
     hough_settings: HoughSettings,
@@ -81,7 +81,7 @@ def detect_ml(
         settings: prior and weights.
     """
 
-    def one_scan(packed: Echoes) -> Detections:
+    def one_scan(packed: PackedEchoes) -> Detections:
         # Padding costs nothing where scans are processed one after the other.
         return jax.lax.cond(
             jnp.isfinite(packed.range).any(),
@@ -90,20 +90,20 @@ def detect_ml(
             packed,
         )
 
-    return over_scans(one_scan, echoes)
+    return map_scans(one_scan, echoes)
 
 
 def detect_in_scan(
     ring: RingArcs,
-    packed: Echoes,
+    packed: PackedEchoes,
     sigma: Float[Array, ""],
     hough_settings: HoughSettings,
     settings: DetectionSettings,
 ) -> Detections:
     """Find the reflectors that explain ONE scan; arguments as ``detect_ml``."""
     # Candidates: maxima of the accumulator (paper, section 4).
-    votes = hough.accumulate(lines_of_scan(ring, packed, hough_settings).cell, hough_settings)
-    level = settings.peak_threshold * hough.votes_of(ring.full_wall, hough_settings)
+    votes = hough.accumulate(tangent_lines(ring, packed, hough_settings).cell, hough_settings)
+    level = settings.peak_threshold * hough.votes_of_paths(ring.full_wall_paths, hough_settings)
     smooth = hough.lowpass(votes, hough_settings)
     rho, theta = hough.peaks(smooth, level, size=settings.candidates, settings=hough_settings)
 
@@ -115,7 +115,7 @@ def detect_in_scan(
 
     # Passes over the whole scan: evaluate all hypotheses, select the best ones, update the estimate of the scene.
     paths, own_paths = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (ring.paths, echo_paths))
-    scan = ScanData(paths, own_paths, packed.path, ranges, ranges > 0, ring.max_range, ring.full_wall)
+    scan = ScanData(paths, own_paths, packed.path, ranges, ranges > 0, ring.max_range, ring.full_wall_paths)
 
     def one_pass(state: tuple[SceneEstimate, Float[Array, "3 k 2"]], _: None):
         scene, parameters = state
@@ -150,7 +150,7 @@ def detect_in_scan(
     )
 
 
-def _no_detections(packed: Echoes, sigma: Float[Array, ""], settings: DetectionSettings) -> Detections:
+def _no_detections(packed: PackedEchoes, sigma: Float[Array, ""], settings: DetectionSettings) -> Detections:
     size, dtype = settings.reflectors, packed.range.dtype
     return Detections(
         kind=jnp.full(size, -1),

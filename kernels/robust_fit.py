@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from .array_geometry import EchoPaths, transform_path
 from .geometry import dot, fold_line, length_and_direction, normal, tangent
-from .hough_voting import Echoes, RingArcs
+from .hough_voting import PackedEchoes, RingArcs
 from .measurement_model import corner_echo, corrected_range, edge_echo, image_source, plane_coordinates
 
 
@@ -69,7 +69,7 @@ class CandidateFits(eqx.Module):
     """The same for the better one of a corner and an edge."""
 
 
-def paths_and_ranges(ring: RingArcs, echoes: Echoes) -> tuple[EchoPaths, Float[Array, " echoes"]]:
+def paths_and_ranges(ring: RingArcs, echoes: PackedEchoes) -> tuple[EchoPaths, Float[Array, " echoes"]]:
     """Geometry of the path of every echo of ONE scan, in the frame of its poses, and the corrected ranges.
 
     Returns:
@@ -169,7 +169,7 @@ def start_of_point(
 @partial(jax.jit, static_argnames="tolerance")
 def fit_candidates(
     ring: RingArcs,
-    echoes: Echoes,
+    echoes: PackedEchoes,
     rho: Float[Array, "scans lines"],
     theta: Float[Array, "scans lines"],
     *,
@@ -185,7 +185,7 @@ def fit_candidates(
         tolerance: largest residual of an explained echo, metres.
     """
 
-    def one_scan(scan: Echoes, rho: Float[Array, " lines"], theta: Float[Array, " lines"]) -> CandidateFits:
+    def one_scan(scan: PackedEchoes, rho: Float[Array, " lines"], theta: Float[Array, " lines"]) -> CandidateFits:
         paths, ranges = paths_and_ranges(ring, scan)
 
         def one_candidate(rho: Float[Array, ""], theta: Float[Array, ""]) -> CandidateFits:

@@ -54,6 +54,6 @@ def arc_tables(ring: Ring, settings: kernels.HoughSettings) -> ArcTables:
     if key not in ring.cache:
         points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
         arcs = kernels.ring_arcs(ring.sensors, settings=settings, points=points)
-        pieces = -(-np.asarray(arcs.arcs.counts).sum(axis=1) // kernels.PIECE_POINTS)
+        pieces = -(-np.asarray(arcs.arcs.exists).sum(axis=1) // kernels.PIECE_POINTS)
         ring.cache[key] = ArcTables(arcs, pieces)
     return ring.cache[key]

@@ -140,7 +140,7 @@ def test_no_echo_no_vote(faw_ring, reach):
 def test_points_are_equidistant_and_their_pitch_is_what_was_asked_for(faw_ring):
     for path, wanted in [(0, 60), (24, 45), (72, 30), (120, 15)]:
         arc = kernels.arc(one_path(faw_ring, path), pitch=np.radians(1), points=60)
-        theta = np.asarray(arc.theta)[np.asarray(arc.counts)]
+        theta = np.asarray(arc.theta)[np.asarray(arc.exists)]
         assert len(theta) == wanted
         np.testing.assert_allclose(np.diff(theta), np.radians(1), atol=1e-5)
 
@@ -148,7 +148,7 @@ def test_points_are_equidistant_and_their_pitch_is_what_was_asked_for(faw_ring):
 def test_cones_that_do_not_overlap_have_no_arc():
     ring = Ring.circular(neighbors=5)
     arc = kernels.arc(one_path(ring, len(ring.paths) - 1), pitch=0.02, points=60)
-    assert not np.asarray(arc.counts).any()
+    assert not np.asarray(arc.exists).any()
 
 
 # accumulator

@@ -50,7 +50,7 @@ def explained(scans, sigma=math.nan, arcs=None):
         for row, echoes in enumerate(some):
             if len(echoes):
                 path[row, : len(echoes)], reported[row, : len(echoes)] = zip(*echoes, strict=True)
-        echoes = kernels.Echoes(jnp.asarray(path), jnp.asarray(reported))
+        echoes = kernels.PackedEchoes(jnp.asarray(path), jnp.asarray(reported))
         found = kernels.detect_ml(arcs, echoes, jnp.float32(sigma), hough_settings=SETTINGS, settings=EXPECTED)
         real = slice(0, len(some))
         parts.append(jax.tree.map(lambda leaf, rows=real: np.asarray(leaf)[rows], found))
@@ -487,7 +487,7 @@ def test_deaf_paths_are_deaf():
     ring = dataclasses.replace(RING, neighbors=2)
     scans = scans_of_rooms(16, ring=ring, **PLAIN)
     alone = kernels.ring_arcs(ring.sensors, settings=SETTINGS, points=POINTS)
-    assert float(roomy(ring).level) == pytest.approx(float(alone.level))
-    assert float(roomy(ring).full_wall) == pytest.approx(float(alone.full_wall))
+    assert float(roomy(ring).vote_threshold) == pytest.approx(float(alone.vote_threshold))
+    assert float(roomy(ring).full_wall_paths) == pytest.approx(float(alone.full_wall_paths))
     found = explained(scans, 0.001, roomy(ring))
     assert (decided(found) == kernels.PLANE).any(axis=1).mean() > 0.8

@@ -33,7 +33,7 @@ def packed(echoes):
     pose = np.zeros((1, ROOM, 3), np.float32)
     for k, (stood, row, reach) in enumerate(echoes):
         path[0, k], reported[0, k], pose[0, k] = row, reach, stood
-    return kernels.Echoes(jnp.asarray(path), jnp.asarray(reported), jnp.asarray(pose))
+    return kernels.PackedEchoes(jnp.asarray(path), jnp.asarray(reported), jnp.asarray(pose))
 
 
 def fits_of(echoes, *lines):
@@ -287,7 +287,7 @@ def test_echoes_that_are_none_are_not_explained():
     rows = np.array([np.nan, np.inf, 2.5, RING.max_range, 1e6])
     poses, paths = np.zeros((1, ROOM, 3), np.float32), np.zeros((1, ROOM), np.int32)
     reported = np.resize(rows, (1, ROOM)).astype(np.float32)
-    echoes = kernels.Echoes(jnp.asarray(paths), jnp.asarray(reported), jnp.asarray(poses))
+    echoes = kernels.PackedEchoes(jnp.asarray(paths), jnp.asarray(reported), jnp.asarray(poses))
     rho, theta = (jnp.full((1, LINES), value, jnp.float32) for value in (1.0, 0.1))
     fits = kernels.fit_candidates(ARCS, echoes, rho, theta, tolerance=SETTINGS.window_tolerance)
     assert not fits.explained.any()
@@ -299,7 +299,7 @@ def test_echoes_that_are_none_are_not_explained():
 
 def test_echoes_without_poses_were_all_taken_at_the_origin():
     echoes = packed(echoes_of_plane(np.zeros((1, 3)), (0.9, 1.0)))
-    plain = kernels.Echoes(echoes.path, echoes.range)
+    plain = kernels.PackedEchoes(echoes.path, echoes.range)
     jax.tree.map(np.testing.assert_array_equal, paths_and_ranges(echoes), paths_and_ranges(plain))
 
 
