@@ -1,4 +1,4 @@
-"""Maps that grow scan by scan: the robot keeps what the walls amount to, and forgets the scans (paper, section 5)."""
+"""Incremental mapping: a map that grows scan by scan, from evidence that adds up (paper, section 5)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,59 +27,62 @@ from jaxsonar.sensors.ring import Ring
 
 @dataclass(frozen=True, eq=False)
 class MapState:
-    """What a robot remembers between two scans; grows with the walls and the floor, not with the scans."""
+    """The memory of a mapper between two scans; it grows with walls and floor area, not with the number of scans."""
 
     evidence: MapEvidence
-    """What all scans so far say of the walls."""
+    """Evidence of all scans so far."""
     window_buffer: WindowBuffer
-    """The path of the window that is being gathered; empty without windows."""
-    waiting: tuple[Scan, ...]
-    """Scans of that window that are not in the evidence yet."""
+    """The trajectory of the unfinished window; empty without windows."""
+    pending_scans: tuple[Scan, ...]
+    """Scans of that window, which are not in the evidence yet."""
     submap_evidence: SubmapEvidence | None = None
-    """Where poses are estimated: the scans by submap; their evidence is gathered when a map is asked for."""
+    """With pose estimation: the scans by submap; their evidence is gathered when a map is requested."""
 
 
 @dataclass(frozen=True, eq=False)
 class StepInfo:
-    """What one scan came to."""
+    """The result of one scan."""
 
     model: LocalModel | None
-    """The local model; None while a window is being gathered."""
+    """The local model; None while a window is unfinished."""
     segments: Float[np.ndarray, "segments 2 2"]
-    """Its segments in the world frame, metres."""
+    """Its walls in the world frame, metres."""
     ignored: str
-    """Why the scan is not in the map; empty if it is."""
+    """Reason why the scan is not in the map; empty if it is."""
     pose: Float[np.ndarray, "3"] | None = None
-    """Where poses are estimated: world_from_robot, metres and radians."""
+    """With pose estimation: world_from_robot, metres and radians."""
     covariance: Float[np.ndarray, "3 3"] | None = None
-    """Of that pose, with respect to the first one."""
+    """Covariance of that pose with respect to the first one."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mapper:
     """Builds a map scan by scan: ``state, info = mapper.step(state, scan)``; ``mapper.map(state)`` is the map so far.
 
-    With ``odometry_noise`` the poses of the scans are odometry, and the robot's own are estimated step by step (``slam``); the
-    scans are kept then, because closing a loop moves them.
+    With ``odometry_noise`` the poses of the scans are odometry, and the mapper estimates the poses (``Tracker``). It
+    then keeps all scans, because loop closures move them. Otherwise the poses of the scans are used as they are.
 
-    The evidence adds up, so the order of the scans does not matter, and the map is that of ``build_map`` on the same
-    scans (to rounding, 1e-6 m and rad; only the latest ``SCANS_KEPT`` scans of a piece are listed). With windows the
-    scans must come along the path.
+    Evidence adds up: the order of the scans does not matter, and the map equals that of ``build_map`` for the same
+    scans (up to rounding, 1e-6 m and rad; only the latest scans of each wall are listed). With windows the scans must
+    come in the order of the trajectory.
 
     Raises:
-        SonarError: arguments as for ``build_map``.
+        SonarError: invalid arguments, as for ``build_map``.
     """
 
     ring: Ring
     method: str = "ml"
+    """Detection method."""
     settings: kernels.HoughSettings | None = None
+    """Of the accumulator."""
     sigma: float | None = None
     """Standard deviation of the ranges, metres; None: estimated for each scan."""
     window: float | None = None
-    """Metres of path gathered into one local model; None: every scan is one."""
+    """Metres of trajectory gathered into one local model; None: every scan has one."""
     merging: str = "fused"
+    """Merging method, as for ``build_map``."""
     odometry_noise: OdometryNoise | None = None
-    """How wrong the poses of the scans are, as odometry; None: they are right."""
+    """Noise of the poses of the scans if they are odometry; None: they are exact."""
 
     def __post_init__(self):
         check_method(self.method)
@@ -87,15 +90,15 @@ class Mapper:
         check_merging(self.merging)
         check_window(self.window)
         if self.odometry_noise is not None and (self.window is not None or self.merging == "paper"):
-            raise SonarError("mapper: odometry_noise came with a window or the paper's merging; allowed is either")
+            raise SonarError(
+                "mapper: odometry_noise with a window or the paper's merging; allowed is one of them"
+            )
         object.__setattr__(self, "settings", hough_settings(self.ring, self.settings, window=self.window))
 
     def start(self) -> MapState:
-        """A state that knows nothing."""
-        nothing = MapEvidence.empty()
-        return MapState(
-            nothing, WindowBuffer(), (), None if self._tracker is None else SubmapEvidence(self._tracker.start())
-        )
+        """The state before the first scan."""
+        submap_evidence = None if self._tracker is None else SubmapEvidence(self._tracker.start())
+        return MapState(MapEvidence.empty(), WindowBuffer(), (), submap_evidence)
 
     def step(
         self,
@@ -105,69 +108,71 @@ class Mapper:
         model: LocalModel | None = None,
         path_pose: Float[np.ndarray, "paths 3"] | None = None,
     ) -> tuple[MapState, StepInfo]:
-        """Take in one scan; the state given is left as it was.
+        """Add one scan; the given state is not changed.
 
         Args:
-            state: so far.
-            scan: its pose is right, or odometry (``odometry_noise``).
+            state: after the scan before.
+            scan: its pose is exact, or odometry (``odometry_noise``).
             model: its local model, if it is known already; not with windows.
-            path_pose: of a robot that moved during the scan, as ``local_model`` takes it; not with windows.
+            path_pose: pose of the robot when each path fired, as ``local_model`` takes it; not with windows.
 
         Raises:
             SonarError: a sensor number that the ring does not have.
         """
         if state.submap_evidence is not None and self._tracker is not None:
-            journey, step = state.submap_evidence.step(self._tracker, scan, model=model, path_pose=path_pose)
+            evidence, step = state.submap_evidence.step(self._tracker, scan, model=model, path_pose=path_pose)
             segments = [transform_points(step.pose, line.segment) for line in step.model.lines]
             info = StepInfo(step.model, np.array(segments).reshape(-1, 2, 2), "", step.pose, step.covariance)
-            return replace(state, submap_evidence=journey), info
-        if self.window is None:
-            if not np.isfinite(scan.pose).all():
-                return state, _nothing("no pose")
-            if model is None:
-                choices = {"method": self.method, "settings": self.settings, "sigma": self.sigma}
-                model = local_model(self.ring, scan, **choices, path_pose=path_pose)
-            return self._with(state, model, Log.from_scans([scan]))
+            return replace(state, submap_evidence=evidence), info
+        if self.window is not None:
+            return self._step_of_window(state, scan, self.window)
         if not np.isfinite(scan.pose).all():
-            state, info = self._closed(state)
-            window_buffer, _ = state.window_buffer.add(scan, length=self.window)
-            return replace(state, window_buffer=window_buffer), replace(info, ignored="no pose")
-        window_buffer, ends = state.window_buffer.add(scan, length=self.window)
-        state = replace(state, window_buffer=window_buffer, waiting=(*state.waiting, scan))
-        return self._closed(state) if ends else (state, _nothing(""))
+            return state, _without_model("no pose")
+        if model is None:
+            options = {"method": self.method, "settings": self.settings, "sigma": self.sigma}
+            model = local_model(self.ring, scan, **options, path_pose=path_pose)
+        return self._with_model(state, model, Log.from_scans([scan]))
 
-    def including(self, state: MapState, scans: Sequence[Scan], models: Sequence[LocalModel]) -> MapState:
-        """Take in scans whose local models are known, in one step; those without a pose are left out. Not for windows.
+    def _step_of_window(self, state: MapState, scan: Scan, length: float) -> tuple[MapState, StepInfo]:
+        """Add a scan to the unfinished window; a scan without a pose ends the window."""
+        if not np.isfinite(scan.pose).all():
+            state, info = self._end_window(state)
+            window_buffer, _ = state.window_buffer.add(scan, length=length)
+            return replace(state, window_buffer=window_buffer), replace(info, ignored="no pose")
+        window_buffer, ends = state.window_buffer.add(scan, length=length)
+        state = replace(state, window_buffer=window_buffer, pending_scans=(*state.pending_scans, scan))
+        return self._end_window(state) if ends else (state, _without_model(""))
+
+    def add_scans(self, state: MapState, scans: Sequence[Scan], models: Sequence[LocalModel]) -> MapState:
+        """Add scans with known local models in one step; scans without a pose are ignored. Not for windows.
 
         Args:
-            state: is left as it was.
-            scans: with different numbers.
-            models: of these scans, in the same order.
+            state: before; it is not changed.
+            scans: with different scan numbers.
+            models: the local model of each of them.
 
         Raises:
             SonarError: a sensor number that the ring does not have.
         """
-        placed = [(s, m) for s, m in zip(scans, models, strict=True) if np.isfinite(s.pose).all()]
-        if not placed:
+        with_pose = [(s, m) for s, m in zip(scans, models, strict=True) if np.isfinite(s.pose).all()]
+        if not with_pose:
             return state
-        log = Log.from_scans([scan for scan, _ in placed])
-        return self._joined(state, gather_evidence(self.ring, log, [model for _, model in placed]))
+        log = Log.from_scans([scan for scan, _ in with_pose])
+        return self._add_evidence(state, gather_evidence(self.ring, log, [model for _, model in with_pose]))
 
     def finish(self, state: MapState) -> MapState:
-        """Take in what is left of the last window."""
-        return self._closed(state)[0]
+        """Add the unfinished window."""
+        return self._end_window(state)[0]
 
     def map(self, state: MapState) -> GlobalMap:
         """The map so far."""
-        evidence = (
-            state.evidence
-            if state.submap_evidence is None
-            else state.submap_evidence.evidence(self.ring) or state.evidence
-        )
+        evidence = state.evidence
+        if state.submap_evidence is not None:
+            evidence = state.submap_evidence.evidence(self.ring) or evidence
         return assemble_map(evidence, merging=self.merging, min_scans=required_scans(self.window))
 
     def trajectory(self, state: MapState) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:
-        """Where poses are estimated: those of all scans so far, and their covariances with respect to the first one."""
+        """With pose estimation: poses of all scans so far, and their covariances with respect to the first one."""
         if state.submap_evidence is None or self._tracker is None:
             raise SonarError("mapper: no poses are estimated; allowed is a mapper with odometry_noise")
         return self._tracker.poses(state.submap_evidence.tracker_state)
@@ -184,25 +189,25 @@ class Mapper:
             odometry_noise=self.odometry_noise,
         )
 
-    def _closed(self, state: MapState) -> tuple[MapState, StepInfo]:
-        """The window ends here."""
-        if self.window is None or not state.waiting:
-            return state, _nothing("")
+    def _end_window(self, state: MapState) -> tuple[MapState, StepInfo]:
+        """Make the local model of the unfinished window, and add its evidence."""
+        if self.window is None or not state.pending_scans:
+            return state, _without_model("")
         assert self.settings is not None
         log, windows = state.window_buffer.window(self.ring, length=self.window)
         model = next(hough_models(self.ring, log, windows, self.settings))
-        return self._with(replace(state, waiting=()), model, Log.from_scans(state.waiting))
+        return self._with_model(replace(state, pending_scans=()), model, Log.from_scans(state.pending_scans))
 
-    def _with(self, state: MapState, model: LocalModel, log: Log) -> tuple[MapState, StepInfo]:
+    def _with_model(self, state: MapState, model: LocalModel, log: Log) -> tuple[MapState, StepInfo]:
         new = gather_evidence(self.ring, log, [model])
-        return self._joined(state, new), StepInfo(model, new.segments.endpoints, "")
+        return self._add_evidence(state, new), StepInfo(model, new.segments.endpoints, "")
 
-    def _joined(self, state: MapState, new: MapEvidence) -> MapState:
+    def _add_evidence(self, state: MapState, new: MapEvidence) -> MapState:
         evidence = state.evidence.union(new)
         if self.merging != "paper":
             evidence = evidence.condensed()
         return replace(state, evidence=evidence)
 
 
-def _nothing(why: str) -> StepInfo:
-    return StepInfo(None, np.zeros((0, 2, 2)), why)
+def _without_model(ignored: str) -> StepInfo:
+    return StepInfo(None, np.zeros((0, 2, 2)), ignored)

@@ -1,65 +1,85 @@
-"""A map that grows while the poses are estimated, too: the evidence of each submap stands where its submap lies."""
+"""The map evidence of a run whose poses are estimated scan by scan, kept for each submap.
+
+Free space has directions and cannot be rotated. So the scans are kept, and the evidence of a submap is gathered again
+when a loop closure has moved the submap.
+"""
 
 from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxsonar.detection.local_map import LocalModel
-from jaxsonar.geometry.se2 import compose, wrap_angle
+from jaxsonar.geometry.se2 import compose, subtract_poses
 from jaxsonar.graph_slam.tracker import Tracker, TrackerState, TrackerStep
 from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
-MOVED = (0.005, float(np.radians(0.1)))
-"""Metres and radians; a submap that has moved by more is looked at again."""
+MAX_POSITION_CHANGE = 0.005
+"""Metres; evidence of a submap that moved farther is gathered again. Chosen by hand."""
+MAX_HEADING_CHANGE = float(np.radians(0.1))
+"""Radians; the same for rotations."""
 
-Part = tuple[tuple[Scan, LocalModel], ...]
+SubmapScans = tuple[tuple[Scan, LocalModel], ...]
 """Scans that were first taken in one submap, with their local models."""
+
+
+class CachedEvidence(NamedTuple):
+    """The evidence of one submap."""
+
+    world_from_submap: Float[np.ndarray, "3"]
+    """Pose of the submap when it was gathered."""
+    scan_count: int
+    """Number of scans then."""
+    evidence: MapEvidence
 
 
 @dataclass(frozen=True, eq=False)
 class SubmapEvidence:
-    """Scans so far, by submap, and where these lie."""
+    """The scans of a run, by submap."""
 
     tracker_state: TrackerState
-    scans: tuple[Part, ...] = ((),)
-    """The last one is of the submap that is being made."""
-    cache: dict[int, tuple[Float[np.ndarray, "3"], int, MapEvidence]] = field(default_factory=dict)
-    """What submaps amounted to when they were last looked at: their pose and number of scans then; only a memory."""
+    """Poses of the scans and the submaps."""
+    scans: tuple[SubmapScans, ...] = ((),)
+    """Of every submap; the last one is the submap around the robot."""
+    cache: dict[int, CachedEvidence] = field(default_factory=dict)
+    """Evidence by number of the submap; shared by all states of a run."""
 
-    def step(self, tracker: Tracker, scan: Scan, **given) -> tuple["SubmapEvidence", TrackerStep]:
-        """The journey with one scan more (``Tracker.step``, whose arguments these are)."""
-        tracked, step = tracker.step(self.tracker_state, scan, **given)
-        parts = (*self.scans[:-1], (*self.scans[-1], (scan, step.model)))
-        if len(tracked.graph.submaps) > len(self.tracker_state.graph.submaps):
-            parts = (*parts, ())
-        return SubmapEvidence(tracked, parts, self.cache), step
+    def step(self, tracker: Tracker, scan: Scan, **options: Any) -> tuple["SubmapEvidence", TrackerStep]:
+        """Add one scan; arguments as for ``Tracker.step``."""
+        state, step = tracker.step(self.tracker_state, scan, **options)
+        scans = (*self.scans[:-1], (*self.scans[-1], (scan, step.model)))
+        if len(state.graph.submaps) > len(self.tracker_state.graph.submaps):
+            scans = (*scans, ())
+        return SubmapEvidence(state, scans, self.cache), step
 
     def evidence(self, ring: Ring) -> MapEvidence | None:
-        """What all scans say of the walls, from where they were taken as far as that is known now; None without any."""
-        whole = None
-        for number, part in enumerate(self.scans):
-            if not part:
+        """Evidence of all scans at their current poses; None without scans."""
+        union = None
+        for number, scans in enumerate(self.scans):
+            if not scans:
                 continue
-            base = compose(self.tracker_state.world_from_first, self.tracker_state.graph.poses[number])
-            known = self.cache.get(number)
-            if known is None or known[1] != len(part) or _apart(base, known[0]):
-                known = (base, len(part), self._of(ring, number, base))
-                self.cache[number] = known
-            whole = known[2] if whole is None else whole.union(known[2])
-        return whole
+            world_from_submap = compose(self.tracker_state.world_from_first, self.tracker_state.graph.poses[number])
+            cached = self.cache.get(number)
+            is_current = cached is not None and cached.scan_count == len(scans)
+            if cached is None or not is_current or _has_moved(world_from_submap, cached.world_from_submap):
+                evidence = self._gather(ring, number, world_from_submap)
+                cached = self.cache[number] = CachedEvidence(world_from_submap, len(scans), evidence)
+            union = cached.evidence if union is None else union.union(cached.evidence)
+        return union
 
-    def _of(self, ring: Ring, number: int, base: Float[np.ndarray, "3"]) -> MapEvidence:
-        submaps, part = self.tracker_state.graph.submaps, self.scans[number]
+    def _gather(self, ring: Ring, number: int, world_from_submap: Float[np.ndarray, "3"]) -> MapEvidence:
+        """Evidence of one submap."""
+        submaps, pairs = self.tracker_state.graph.submaps, self.scans[number]
         poses = submaps[number].poses if number < len(submaps) else np.array(self.tracker_state.submap.poses)
-        # A submap begins with the scan that the one before ends with.
-        world = compose(base, poses[-len(part) :])
-        scans = [replace(scan, pose=pose) for (scan, _), pose in zip(part, world, strict=True)]
-        return gather_evidence(ring, Log.from_scans(scans), [model for _, model in part])
+        # A submap starts with the last scan of the submap before, which has that scan already.
+        world_from_robot = compose(world_from_submap, poses[-len(pairs) :])
+        scans = [replace(scan, pose=pose) for (scan, _), pose in zip(pairs, world_from_robot, strict=True)]
+        return gather_evidence(ring, Log.from_scans(scans), [model for _, model in pairs])
 
 
-def _apart(pose: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> bool:
-    turn = abs(float(wrap_angle(float(pose[2] - other[2]))))
-    return bool(np.hypot(*(pose - other)[:2]) > MOVED[0] or turn > MOVED[1])
+def _has_moved(pose: Float[np.ndarray, "3"], before: Float[np.ndarray, "3"]) -> bool:
+    x, y, heading = subtract_poses(pose, before)
+    return bool(np.hypot(x, y) > MAX_POSITION_CHANGE or abs(heading) > MAX_HEADING_CHANGE)

@@ -1,4 +1,4 @@
-"""From raw scans to lines and a growing map, as they come: the step between a device and what a robot steers by."""
+"""``LiveMap``: raw scans of a device to lines at once, and to a map that grows."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,30 +21,40 @@ from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring, speed_of_sound
 
-AT_ONCE = 64
-"""Scans taken together where so many wait."""
-FEW = 4
-"""Scans; fewer are faster one by one."""
-STILL = 1e-4
-"""Metres and radians; a robot that moves less than this during a scan stands still."""
-DEGREE = 0.1
-"""Kelvin; a change of the air's temperature that is worth a new speed of sound."""
-_WARM = {"ml": (1,), "hough": (1, FEW, AT_ONCE)}  # numbers of scans that are taken together
-_ECHOES = (60, 90, 120)  # of a scan, each in a room of its own (``kernels.shape_buckets.bucket_size``)
+
+@dataclass(frozen=True)
+class LiveMapSettings:
+    """Batching and thresholds of live processing. All values are chosen by hand."""
+
+    max_batch: int = 64
+    """Maximum number of scans that are processed together."""
+    min_batch: int = 4
+    """Minimum number of scans that are processed together (hough); fewer are faster one by one."""
+    standing_threshold: float = 1e-4
+    """Metres and radians. A robot that moves less than this during a scan counts as standing."""
+    temperature_step: float = 0.1
+    """Kelvin. A smaller change of the air temperature does not change the speed of sound."""
+
+
+SETTINGS = LiveMapSettings()
+_WARM_UP_BATCHES = {"ml": (1,), "hough": (1, SETTINGS.min_batch, SETTINGS.max_batch)}
+"""Numbers of scans that are processed together, by method. Each has its own compiled program."""
+_WARM_UP_ECHOES = (60, 90, 120)
+"""Numbers of echoes in a scan. Each has its own bucket size (``kernels.shape_buckets.bucket_size``)."""
 
 
 @dataclass(frozen=True, eq=False)
 class LiveScan:
-    """One scan with what it tells."""
+    """One scan with its local model."""
 
     scan: Scan
-    """As a log has it."""
+    """The scan as in a log."""
     model: LocalModel
-    """Its walls, in the frame of the pose of its last group."""
+    """Local model in the robot frame at the last firing group."""
 
 
 class LiveMap:
-    """Takes raw scans, gives lines at once and a map when asked; for one thread."""
+    """Processes raw scans: lines at once, the map on request. Not thread-safe."""
 
     def __init__(
         self,
@@ -56,116 +66,123 @@ class LiveMap:
         mapping: bool = True,
         odometry_noise: OdometryNoise | None = None,
     ):
-        """Nothing is known yet.
+        """An empty map.
 
         Args:
             ring: the sensors; a measured temperature replaces its speed of sound.
-            method: "ml" or "hough", as ``local_models``.
-            settings: as ``local_models``.
-            sigma: as ``local_models``.
-            mapping: False: lines only, at a fraction of the work.
-            slip: how wrong the device's poses are: they are odometry then, and the robot's own are estimated, for the
-                map and in what ``take`` gives. They are right if left out.
+            method: "ml" or "hough", as in ``local_models``.
+            settings: as in ``local_models``.
+            sigma: as in ``local_models``.
+            mapping: False: detect lines only, at a fraction of the computing time.
+            odometry_noise: noise of the device's poses. If given, they are odometry, and the poses of the robot are
+                estimated for the map and for the scans that ``process`` returns. By default they are exact.
 
         Raises:
-            SonarError: as ``local_models``.
+            SonarError: as in ``local_models``.
         """
         check_method(method)
         check_sigma(sigma)
         self.ring = ring
         self.left_out = 0
-        """Echoes of pairs of sensors that the ring does not listen to."""
-        self.unplaced = 0
-        """Scans without a pose, which are not in the map."""
-        self._choices = {"method": method, "settings": hough_settings(ring, settings), "sigma": sigma}
+        """Number of echoes left out: their sensor pairs are not echo paths of the ring."""
+        self.without_pose = 0
+        """Number of scans without a pose; they are not in the map."""
+        self._options = {"method": method, "settings": hough_settings(ring, settings), "sigma": sigma}
         self.slam = odometry_noise is not None
-        self._mapper = Mapper(ring=ring, **self._choices, odometry_noise=odometry_noise) if mapping or self.slam else None
+        self._mapper: Mapper | None = None
+        if mapping or self.slam:
+            self._mapper = Mapper(ring=ring, **self._options, odometry_noise=odometry_noise)
         self._state = self._mapper.start() if self._mapper is not None else None
-        self._waiting: list[LiveScan] = []
+        self._pending: list[LiveScan] = []
         self._stamps: list[float] = []
         self._temperature = float("nan")
         self._paths, self._path_index = ring.paths, ring.path_index
-        self._firing: Int[np.ndarray, " sensors"] = np.full(ring.count, -1)
+        self._group_of_sensor: Int[np.ndarray, " sensors"] = np.full(ring.count, -1)
         for group, sensors in enumerate(ring.firing_groups):
-            self._firing[sensors] = group
+            self._group_of_sensor[sensors] = group
 
     def warm_up(self) -> None:
-        """Compile what the first scans need."""
-        method = str(self._choices["method"])
+        """Compile the programs that the first scans need, by processing synthetic scans."""
+        method = str(self._options["method"])
         rng = np.random.default_rng(0)
-        settings = self._choices["settings"]
-        heard = np.repeat(self.ring.paths, arc_tables(self.ring, settings).pieces, axis=0)  # wide paths hear more often
+        settings = self._options["settings"]
+        paths = np.repeat(
+            self.ring.paths, arc_tables(self.ring, settings).pieces, axis=0
+        )  # wide paths have more echoes
 
-        def one(echoes: int) -> LiveScan:
-            path = heard[rng.integers(len(heard), size=echoes)]
-            reach = rng.uniform(0.3, 0.9, echoes) * self.ring.max_range
-            pose, nothing = np.zeros(3), np.full(echoes, np.nan)
-            scans = [Scan(k, 0.0, pose, path[:, 0], path[:, 1], reach, nothing) for k in range(max(_WARM[method]))]
-            for number in _WARM[method]:
-                list(local_models(self.ring, Log.from_scans(scans[:number]), **self._choices))
-            model = local_model(self.ring, scans[0], path_pose=np.zeros((len(self.ring.paths), 3)), **self._choices)
-            return LiveScan(scans[0], model)
+        def synthetic_scan(echoes: int) -> LiveScan:
+            path = paths[rng.integers(len(paths), size=echoes)]
+            ranges = rng.uniform(0.3, 0.9, echoes) * self.ring.max_range
+            pose, amplitude = np.zeros(3), np.full(echoes, np.nan)
+            scan = Scan(0, 0.0, pose, path[:, 0], path[:, 1], ranges, amplitude)
+            scans = [replace(scan, scan=k) for k in range(max(_WARM_UP_BATCHES[method]))]
+            for number in _WARM_UP_BATCHES[method]:
+                list(local_models(self.ring, Log.from_scans(scans[:number]), **self._options))
+            model = local_model(self.ring, scan, path_pose=np.zeros((len(self.ring.paths), 3)), **self._options)
+            return LiveScan(scan, model)
 
-        sizes = _ECHOES if method == "hough" else (_ECHOES[0], _ECHOES[-1])  # ml has rooms of powers of two
+        # The bucket sizes of ml are powers of two, so the middle size has no program of its own.
+        sizes = _WARM_UP_ECHOES if method == "hough" else (_WARM_UP_ECHOES[0], _WARM_UP_ECHOES[-1])
         with ThreadPoolExecutor(len(sizes)) as pool:
-            warm = list(pool.map(one, sizes))
+            warm = list(pool.map(synthetic_scan, sizes))
         if self._mapper is None:
             return
         if not self.slam:
-            self._mapper.map(self._mapper.including(self._mapper.start(), [warm[0].scan], [warm[0].model]))
+            self._mapper.map(self._mapper.add_scans(self._mapper.start(), [warm[0].scan], [warm[0].model]))
             return
         state = self._mapper.start()
-        for number, taken in enumerate((*warm, *warm)):
-            state, _ = self._mapper.step(state, replace(taken.scan, scan=number), model=taken.model)
+        for number, live in enumerate((*warm, *warm)):
+            state, _ = self._mapper.step(state, replace(live.scan, scan=number), model=live.model)
         self._mapper.map(state)
 
-    def take(self, raws: Sequence[RawScan]) -> list[LiveScan]:
-        """The lines of some scans.
+    def process(self, raw_scans: Sequence[RawScan]) -> list[LiveScan]:
+        """Detect the lines of some scans.
 
         Args:
-            raws: in the order in which they came.
+            raw_scans: scans in order of arrival.
 
         Raises:
             SonarError: a sensor number that the ring does not have.
         """
-        scans = [self.scan_of(raw) for raw in raws]
-        poses = [self.path_poses(raw) for raw in raws]
-        self._follow_temperature(raws)
-        if len(scans) >= FEW and self._choices["method"] == "hough" and all(pose is None for pose in poses):
-            models = list(local_models(self.ring, Log.from_scans(scans), **self._choices))
+        scans = [self.as_scan(raw) for raw in raw_scans]
+        poses = [self.path_poses(raw) for raw in raw_scans]
+        self._follow_temperature(raw_scans)
+        robot_stood = all(pose is None for pose in poses)
+        if len(scans) >= SETTINGS.min_batch and self._options["method"] == "hough" and robot_stood:
+            models = list(local_models(self.ring, Log.from_scans(scans), **self._options))
         else:
             pairs = zip(scans, poses, strict=True)
-            models = [local_model(self.ring, scan, path_pose=pose, **self._choices) for scan, pose in pairs]
+            models = [local_model(self.ring, scan, path_pose=pose, **self._options) for scan, pose in pairs]
         if self.slam:
             return [self._tracked(*one) for one in zip(scans, models, poses, strict=True)]
-        taken = [LiveScan(scan, model) for scan, model in zip(scans, models, strict=True)]
-        self.unplaced += sum(not np.isfinite(scan.pose).all() for scan in scans)
+        live_scans = [LiveScan(scan, model) for scan, model in zip(scans, models, strict=True)]
+        self.without_pose += sum(not np.isfinite(scan.pose).all() for scan in scans)
         if self._mapper is not None:
-            self._waiting += taken
-        return taken
+            self._pending += live_scans
+        return live_scans
 
     @property
-    def waiting(self) -> int:
-        """Scans that were taken but are not in the map yet."""
-        return len(self._waiting)
+    def pending(self) -> int:
+        """Number of processed scans that are not in the map yet."""
+        return len(self._pending)
 
-    def absorb(self) -> None:
-        """Put what was taken into the map: dearer than the lines, cheaper for several scans at once."""
-        if self._mapper is None or self._state is None or not self._waiting:
+    def update_map(self) -> None:
+        """Add the pending scans to the map. Costs more than detection; cheaper for several scans together."""
+        if self._mapper is None or self._state is None or not self._pending:
             return
-        scans, models = [live.scan for live in self._waiting], [live.model for live in self._waiting]
-        self._waiting = []
-        self._state = self._mapper.including(self._state, scans, models)
+        scans, models = [live.scan for live in self._pending], [live.model for live in self._pending]
+        self._pending = []
+        self._state = self._mapper.add_scans(self._state, scans, models)
 
     def map(self) -> GlobalMap:
-        """The map of all scans that were taken."""
-        self.absorb()
+        """The map of all processed scans."""
+        self.update_map()
         assert self._mapper is not None, "lines only"
         assert self._state is not None
         return self._mapper.map(self._state)
 
     def _tracked(self, scan: Scan, model: LocalModel, path_pose: Float[np.ndarray, "paths 3"] | None) -> LiveScan:
-        """A scan where the robot seems to have been; at once in the map."""
+        """The scan at its estimated pose; it is added to the map at once."""
         assert self._mapper is not None
         assert self._state is not None
         self._state, info = self._mapper.step(self._state, scan, model=model, path_pose=path_pose)
@@ -174,14 +191,14 @@ class LiveMap:
         return LiveScan(replace(scan, pose=info.pose), model)
 
     def trajectory(self) -> Trajectory:
-        """The robot's poses as they are known now, with their covariances; only where they are estimated."""
+        """The current estimates of all poses with their covariances. Only with ``odometry_noise``."""
         assert self._mapper is not None
         assert self._state is not None
         poses, covariances = self._mapper.trajectory(self._state)
         return Trajectory(np.array(self._stamps), poses, covariances)
 
-    def scan_of(self, raw: RawScan) -> Scan:
-        """A raw scan as a log has it: times of flight as ranges."""
+    def as_scan(self, raw: RawScan) -> Scan:
+        """Convert a raw scan to a scan of a log: times of flight to ranges."""
         echoes = raw.echoes
         tx, rx = echoes["tx"].astype(np.int64), echoes["rx"].astype(np.int64)
         self.left_out += int((self._path_index[tx, rx] < 0).sum())
@@ -196,22 +213,22 @@ class LiveMap:
         )
 
     def path_poses(self, raw: RawScan) -> Float[np.ndarray, "paths 3"] | None:
-        """Where the robot was when each path fired, seen from where it was at the end; None if it stood still.
+        """Pose of the robot when each path fired, relative to its pose at the end of the scan; None if it stood still.
 
-        A group without a pose is taken to have fired at the end.
+        A group without a pose counts as fired at the end.
         """
         moved = relative(np.broadcast_to(raw.pose, raw.group_pose.shape), raw.group_pose)
         moved = np.where(np.isfinite(moved), moved, 0.0)
-        if np.abs(moved).max(initial=0.0) < STILL:
+        if np.abs(moved).max(initial=0.0) < SETTINGS.standing_threshold:
             return None
-        # A transmitter fires in the group in which it was last heard to, else where the ring's geometry has it.
-        self._firing[raw.echoes["tx"]] = raw.group
-        group = self._firing[self._paths[:, 0]]
+        # The group of a transmitter is the one of its latest echo; before the first one, the ring's firing order.
+        self._group_of_sensor[raw.echoes["tx"]] = raw.group
+        group = self._group_of_sensor[self._paths[:, 0]]
         return np.where((group < len(moved))[:, None], moved[np.minimum(group, len(moved) - 1)], 0.0)
 
-    def _follow_temperature(self, raws: Sequence[RawScan]) -> None:
-        measured = [raw.temperature for raw in raws if not np.isnan(raw.temperature)]
-        if not measured or abs(measured[-1] - self._temperature) < DEGREE:
+    def _follow_temperature(self, raw_scans: Sequence[RawScan]) -> None:
+        measured = [raw.temperature for raw in raw_scans if not np.isnan(raw.temperature)]
+        if not measured or abs(measured[-1] - self._temperature) < SETTINGS.temperature_step:
             return
         self._temperature = measured[-1]
         self.ring = replace(self.ring, speed_of_sound=speed_of_sound(self._temperature))
