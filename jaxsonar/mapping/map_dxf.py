@@ -10,24 +10,24 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.global_map import GlobalMap
 
 LAYER = "WALLS"
-"""The layer that holds the segments."""
-_METRES = 6  # $INSUNITS
+"""Name of the layer that contains the walls."""
+_METRES = 6  # code of metres in $INSUNITS
 
 
-def save_dxf(world: GlobalMap, path: str | os.PathLike[str]) -> None:
-    """Write the segments of a map as a drawing: a LINE each on the layer WALLS, in metres, world frame.
+def save_dxf(world: GlobalMap, filename: str | os.PathLike[str]) -> None:
+    """Write the walls of a map as a drawing: a LINE for each wall on the layer WALLS, in metres, world frame.
 
-    The same map gives the same bytes: the drawing carries fixed dates and no random identity.
+    The same map gives the same bytes: the drawing has fixed dates and no random identifiers.
 
     Args:
-        world: the segments.
-        path: the file, replaced only once all is written.
+        world: the map.
+        filename: the file; it is replaced only after everything is written.
 
     Raises:
-        SonarError: the place cannot be written, or the extra is missing.
+        SonarError: the file cannot be written, or the extra is missing.
     """
-    ezdxf = load_ezdxf(path)
-    with _fixed_dates(ezdxf), atomic_write(path) as file:
+    ezdxf = load_ezdxf(filename)
+    with _fixed_dates(ezdxf), atomic_write(filename) as file:
         drawing = ezdxf.new("R2010", units=_METRES)
         drawing.layers.add(LAYER)
         space = drawing.modelspace()
@@ -35,14 +35,14 @@ def save_dxf(world: GlobalMap, path: str | os.PathLike[str]) -> None:
             space.add_line(start, end, dxfattribs={"layer": LAYER})
         if len(world):
             low, high = world.segments.min(axis=(0, 1)), world.segments.max(axis=(0, 1))
-            # What a program shows on opening: all of it, and a little air.
+            # The initial view shows the whole map with a margin.
             drawing.set_modelspace_vport(height=1.1 * float((high - low).max()), center=((low + high) / 2).tolist())
         drawing.write(file)
 
 
 @contextmanager
 def _fixed_dates(ezdxf: Any) -> Iterator[None]:
-    """The only switch for dates that ezdxf has is one for the process; put it back."""
+    """Fix the dates that ezdxf writes. Its only switch is global, so it is restored afterwards."""
     before = ezdxf.options.write_fixed_meta_data_for_testing
     ezdxf.options.write_fixed_meta_data_for_testing = True
     try:
@@ -51,11 +51,11 @@ def _fixed_dates(ezdxf: Any) -> Iterator[None]:
         ezdxf.options.write_fixed_meta_data_for_testing = before
 
 
-def load_ezdxf(path: str | os.PathLike[str]) -> Any:
-    """The library behind this file, or an error that says which extra it comes with."""
+def load_ezdxf(filename: str | os.PathLike[str]) -> Any:
+    """Import ezdxf, or raise an error that names the extra."""
     try:
         import ezdxf
     except ImportError:
         extra = "pip install 'jaxsonar[cad]'"
-        raise SonarError(f"{shown(path)}: DXF needs the cad extra: {extra}") from None
+        raise SonarError(f"{shown(filename)}: DXF needs the cad extra: {extra}") from None
     return ezdxf

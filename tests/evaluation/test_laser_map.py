@@ -8,7 +8,7 @@ from support.recordings import recorded
 
 from jaxsonar import random_pose, random_room
 from jaxsonar.evaluation.laser_map import reference_map
-from jaxsonar.evaluation.laser_segments import fitted, polygonal_model
+from jaxsonar.evaluation.laser_segments import fit_segment, polygonal_model
 from jaxsonar.evaluation.map_accuracy import evaluate
 from jaxsonar.geometry.se2 import rotation, transform_points
 from jaxsonar.hardware.errors import SonarError
@@ -98,10 +98,10 @@ def test_nothing_to_see_is_no_model(ranges):
 
 def test_the_fit_is_total_least_squares(rng):
     points = np.stack([np.linspace(-1, 1, 50), rng.normal(0, 0.01, 50)], axis=-1)
-    start, end = fitted(points)
+    start, end = fit_segment(points)
     for angle in (0.3, 1.57, 2.9):
         turn = rotation(angle)
-        np.testing.assert_allclose(fitted(points @ turn.T), np.stack([start, end]) @ turn.T, atol=1e-9)
+        np.testing.assert_allclose(fit_segment(points @ turn.T), np.stack([start, end]) @ turn.T, atol=1e-9)
     normal = np.array([-(end - start)[1], (end - start)[0]]) / np.linalg.norm(end - start)
     best = ((points - start) @ normal).std()
     for angle in np.radians([-0.1, 0.1]):

@@ -13,9 +13,11 @@ from scipy.optimize import least_squares
 from support import oracles
 
 from jaxsonar import Line, LocalModel, Ring, Room, kernels, simulate
-from jaxsonar.evaluation.line_accuracy import CLEAR_ECHOES, GATE_RHO, GATE_THETA, compare, line_bound, match, pooled
+from jaxsonar.evaluation.line_accuracy import cramer_rao_bound, line_accuracy, match_lines, pool
+from jaxsonar.evaluation.settings import SETTINGS
 from jaxsonar.simulation.traced_echoes import EchoKind
 
+GATES = SETTINGS.lines
 RECTANGLE = Room(
     np.array([[[-1, -1.2], [2.5, -1.2]], [[2.5, -1.2], [2.5, 1.6]], [[2.5, 1.6], [-1, 1.6]], [[-1, 1.6], [-1, -1.2]]])
 )
@@ -24,8 +26,8 @@ POSES = np.array([[0.3, 0.1, 0.2], [0.0, 0.2, -2.9], [1.3, -0.1, 1.0], [0.4, 0.6
 
 def distance(line, wall):
     """In gates; infinite beyond them. One pair at a time, as one would say it."""
-    turn = abs(oracles.wrap(line[1] - wall[1])) / GATE_THETA
-    apart = abs(line[0] - wall[0]) / GATE_RHO
+    turn = abs(oracles.wrap(line[1] - wall[1])) / GATES.gate_theta
+    apart = abs(line[0] - wall[0]) / GATES.gate_rho
     return float(np.hypot(turn, apart)) if turn <= 1 and apart <= 1 else np.inf
 
 
@@ -46,7 +48,7 @@ def test_matches_are_as_many_then_as_near_as_can_be(seed, lines, walls):
     # Close together and around the seam of theta, so that gates overlap and lines compete.
     truth = np.stack([rng.uniform(1, 1.2, walls), oracles.wrap(np.pi + rng.uniform(-0.4, 0.4, walls))], axis=-1)
     found = np.stack([rng.uniform(1, 1.2, lines), oracles.wrap(np.pi + rng.uniform(-0.4, 0.4, lines))], axis=-1)
-    line_index, wall_index = match(found, truth)
+    line_index, wall_index = match_lines(found, truth)
     assert len(set(line_index)) == len(line_index) == len(set(wall_index)) == len(wall_index)
     costs = [distance(found[k], truth[wall]) for k, wall in zip(line_index, wall_index, strict=True)]
     count, cost = best_by_trying(found, truth)
@@ -55,7 +57,7 @@ def test_matches_are_as_many_then_as_near_as_can_be(seed, lines, walls):
 
 
 def matches(found, truth):
-    return [tuple(map(int, pair)) for pair in zip(*match(np.array(found), np.array(truth)), strict=True)]
+    return [tuple(map(int, pair)) for pair in zip(*match_lines(np.array(found), np.array(truth)), strict=True)]
 
 
 def test_two_far_pairs_win_over_one_near_pair():
@@ -64,11 +66,11 @@ def test_two_far_pairs_win_over_one_near_pair():
 
 def test_gates():
     wall = [(1.0, 3.1)]
-    assert matches([(1.0 + 0.999 * GATE_RHO, 3.1)], wall) == [(0, 0)]
-    assert matches([(1.0 + 1.001 * GATE_RHO, 3.1)], wall) == []
+    assert matches([(1.0 + 0.999 * GATES.gate_rho, 3.1)], wall) == [(0, 0)]
+    assert matches([(1.0 + 1.001 * GATES.gate_rho, 3.1)], wall) == []
     for sign in (-1, 1):
-        assert matches([(1.0, oracles.wrap(3.1 + sign * 0.999 * GATE_THETA))], wall) == [(0, 0)]
-        assert matches([(1.0, oracles.wrap(3.1 + sign * 1.001 * GATE_THETA))], wall) == []
+        assert matches([(1.0, oracles.wrap(3.1 + sign * 0.999 * GATES.gate_theta))], wall) == [(0, 0)]
+        assert matches([(1.0, oracles.wrap(3.1 + sign * 1.001 * GATES.gate_theta))], wall) == []
     assert matches([(1.0, oracles.wrap(3.1 + np.pi))], wall) == []
 
 
@@ -106,7 +108,7 @@ def test_bound_is_the_inverse_of_the_information(faw_ring, rho, theta):
         (image_ranges(line + step * e, tx, rx) - image_ranges(line - step * e, tx, rx)) / (2 * step) for e in np.eye(2)
     ]
     information = sum(np.outer(slope, slope) for slope in np.stack(slopes, axis=-1)) / sigma**2
-    bound = line_bound(line, tx, rx, sigma)
+    bound = cramer_rao_bound(line, tx, rx, sigma)
     np.testing.assert_allclose(bound, np.sqrt(np.diag(np.linalg.inv(information))), rtol=1e-6)
 
 
@@ -122,7 +124,7 @@ def test_bound_is_that_of_the_kernels_geometry(faw_ring):
     )
     jacobian = np.asarray(jax.vmap(jax.jacfwd(kernels.plane_range), in_axes=over_echoes)(*arguments), float)
     wanted = sigma * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
-    np.testing.assert_allclose(line_bound(line, tx, rx, sigma), wanted, rtol=1e-4)
+    np.testing.assert_allclose(cramer_rao_bound(line, tx, rx, sigma), wanted, rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -135,7 +137,7 @@ def test_least_squares_over_noisy_echoes_scatters_as_the_bound_says(faw_ring, rn
         for r in exact + rng.normal(0, sigma, (trials, len(exact)))
     ]
     scatter = np.std(fits, axis=0)
-    np.testing.assert_allclose(scatter, line_bound(truth, tx, rx, sigma), rtol=4 / np.sqrt(2 * trials))  # 4 sigma
+    np.testing.assert_allclose(scatter, cramer_rao_bound(truth, tx, rx, sigma), rtol=4 / np.sqrt(2 * trials))  # 4 sigma
 
 
 @pytest.mark.parametrize(
@@ -146,7 +148,8 @@ def test_bounds_are_those_of_an_independent_simulation(neighbors, beam_deg, rho_
     """Figures from elsewhere for a wall at about 1 m and sigma 1 mm; what echoes it had is known only roughly."""
     ring = Ring.circular(radius=0.31, neighbors=neighbors, beam=np.radians(beam_deg))
     bounds = [
-        line_bound(np.array([1.0, theta]), *wall_seen_by(ring, 1.0, theta), 0.001) for theta in np.linspace(-3, 3, 31)
+        cramer_rao_bound(np.array([1.0, theta]), *wall_seen_by(ring, 1.0, theta), 0.001)
+        for theta in np.linspace(-3, 3, 31)
     ]
     mean = np.mean(bounds, axis=0) * [1e3, np.degrees(1)]
     np.testing.assert_allclose(mean, [rho_mm, theta_deg], rtol=0.2)
@@ -155,10 +158,10 @@ def test_bounds_are_those_of_an_independent_simulation(neighbors, beam_deg, rho_
 def test_bound_grows_with_noise_and_falls_with_echoes(faw_ring):
     line = np.array([1.0, 0.3])
     tx, rx = wall_seen_by(faw_ring, *line)
-    once = line_bound(line, tx, rx, 0.001)
-    np.testing.assert_allclose(line_bound(line, tx, rx, 0.005), 5 * once)
-    np.testing.assert_allclose(line_bound(line, np.tile(tx, (4, 1)), np.tile(rx, (4, 1)), 0.001), once / 2)
-    np.testing.assert_allclose(line_bound(line, rx, tx, 0.001), once)  # both ways measure one geometry
+    once = cramer_rao_bound(line, tx, rx, 0.001)
+    np.testing.assert_allclose(cramer_rao_bound(line, tx, rx, 0.005), 5 * once)
+    np.testing.assert_allclose(cramer_rao_bound(line, np.tile(tx, (4, 1)), np.tile(rx, (4, 1)), 0.001), once / 2)
+    np.testing.assert_allclose(cramer_rao_bound(line, rx, tx, 0.001), once)  # both ways measure one geometry
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 20))
@@ -166,7 +169,7 @@ def test_echoes_from_one_place_determine_no_line(seed, echoes):
     rng = np.random.default_rng(seed)
     place = np.repeat(rng.uniform(-0.3, 0.3, (1, 2)), echoes, axis=0)
     line = np.array([rng.uniform(0.6, 2), rng.uniform(-np.pi, np.pi)])
-    assert np.isinf(line_bound(line, place, place, 0.001)).all()
+    assert np.isinf(cramer_rao_bound(line, place, place, 0.001)).all()
 
 
 # Comparison with a room
@@ -205,7 +208,7 @@ def plane_echoes(simulation, scan, wall):
 def judged(ring, lines_of_pose, poses=POSES, **more):
     simulation = simulate(ring, RECTANGLE, poses)
     models = [a_model(k, lines_of_pose(k, simulation)) for k in range(len(poses))]
-    return simulation, compare(ring, models, simulation, RECTANGLE, poses, sigma=0.001, **more)
+    return simulation, line_accuracy(ring, models, simulation, RECTANGLE, poses, sigma=0.001, **more)
 
 
 def heard_walls(simulation, scan):
@@ -217,13 +220,13 @@ def test_perfect_lines(faw_ring):
     heard = [plane_echoes(simulation, k, wall) for k in range(len(POSES)) for wall in range(4)]
     assert result.scans == len(POSES)
     assert result.echoes == len(simulation.scan)
-    assert result.walls == result.found == sum(count >= CLEAR_ECHOES for count in heard) > 0
-    assert result.lines == len(result.rho) == sum(count > 0 for count in heard) > result.walls / 2
+    assert result.walls == result.found == sum(count >= GATES.min_echoes for count in heard) > 0
+    assert result.lines == len(result.rho_error) == sum(count > 0 for count in heard) > result.walls / 2
     assert result.recall == 1
     assert result.false == result.false_at_corners == result.false_per_scan == 0
-    np.testing.assert_allclose(result.rho, 0, atol=1e-12)
-    np.testing.assert_allclose(result.theta, 0, atol=1e-12)
-    assert (result.bound_rho > 0).all()
+    np.testing.assert_allclose(result.rho_error, 0, atol=1e-12)
+    np.testing.assert_allclose(result.theta_error, 0, atol=1e-12)
+    assert (result.rho_bound > 0).all()
 
 
 def test_deviations_have_their_sign_and_bound(faw_ring):
@@ -231,24 +234,24 @@ def test_deviations_have_their_sign_and_bound(faw_ring):
         return [(rho + 0.02, theta - 0.03) for rho, theta in heard_walls(simulation, k)]
 
     simulation, result = judged(faw_ring, off)
-    np.testing.assert_allclose(result.rho, 0.02, atol=1e-12)
-    np.testing.assert_allclose(result.theta, -0.03, atol=1e-12)
+    np.testing.assert_allclose(result.rho_error, 0.02, atol=1e-12)
+    np.testing.assert_allclose(result.theta_error, -0.03, atol=1e-12)
     wanted = []
     for scan in range(len(POSES)):
         for wall, line in enumerate(walls_from(POSES[scan])):
             mine = (simulation.scan == scan) & (simulation.kind == EchoKind.PLANE) & (simulation.reflector == wall)
             if mine.any():
                 tx, rx = np.asarray(faw_ring.position)[faw_ring.paths[simulation.path[mine]].T]
-                wanted.append(line_bound(np.array(line), tx, rx, 0.001))
-    np.testing.assert_allclose(np.sort(result.bound_rho), np.sort([rho for rho, _ in wanted]))
-    np.testing.assert_allclose(np.sort(result.bound_theta), np.sort([theta for _, theta in wanted]))
+                wanted.append(cramer_rao_bound(np.array(line), tx, rx, 0.001))
+    np.testing.assert_allclose(np.sort(result.rho_bound), np.sort([rho for rho, _ in wanted]))
+    np.testing.assert_allclose(np.sort(result.theta_bound), np.sort([theta for _, theta in wanted]))
 
 
 def test_no_lines(faw_ring):
     _, result = judged(faw_ring, lambda k, s: [])
     assert result.walls > 0
     assert (result.found, result.lines, result.false, result.recall) == (0, 0, 0, 0)
-    assert len(result.rho) == 0
+    assert len(result.rho_error) == 0
 
 
 def test_a_line_nowhere_is_false_but_no_corner(faw_ring):
@@ -267,7 +270,7 @@ def test_a_line_at_a_corner_is_counted_as_such(faw_ring, corner):
     assert np.isinf(gaps).all(), "this pose cannot tell the corner from a wall"
     _, result = judged(faw_ring, lambda k, s: [*heard_walls(s, k), line], poses)
     assert (result.false, result.false_at_corners) == (1, 1)
-    turned = (line[0], oracles.wrap(line[1] + 1.2 * GATE_THETA))
+    turned = (line[0], oracles.wrap(line[1] + 1.2 * GATES.gate_theta))
     _, result = judged(faw_ring, lambda k, s: [*heard_walls(s, k), turned], poses)
     assert (result.false, result.false_at_corners) == (1, 0)
 
@@ -280,7 +283,7 @@ def test_of_a_line_and_its_duplicate_the_nearer_is_the_wall(faw_ring):
     _, result = judged(faw_ring, twice)
     assert result.lines == 2 * len(POSES)
     assert result.false == len(POSES)
-    np.testing.assert_allclose(result.rho, -0.01, atol=1e-12)
+    np.testing.assert_allclose(result.rho_error, -0.01, atol=1e-12)
 
 
 def test_a_wall_without_an_echo_is_no_excuse_for_a_line(faw_ring):
@@ -291,7 +294,7 @@ def test_a_wall_without_an_echo_is_no_excuse_for_a_line(faw_ring):
         pose = POSES[scan : scan + 1]
         alone = simulate(faw_ring, RECTANGLE, pose)
         model = a_model(0, [walls_from(pose[0])[wall]])
-        assert compare(faw_ring, [model], alone, RECTANGLE, pose, sigma=0.001).false == 1
+        assert line_accuracy(faw_ring, [model], alone, RECTANGLE, pose, sigma=0.001).false == 1
 
 
 def test_another_ring_may_say_which_walls_are_to_be_found(faw_ring):
@@ -315,10 +318,10 @@ def test_pooled_is_all_scans_at_once(faw_ring):
     for k in range(len(POSES)):
         _, part = judged(faw_ring, lambda _, s, k=k: some(POSES[k]), POSES[k : k + 1])
         parts.append(part)
-    one = pooled(parts)
+    one = pool(parts)
     for field in fields(one):
         np.testing.assert_allclose(getattr(one, field.name), getattr(together, field.name), rtol=1e-9, atol=1e-12)
     assert one.lines == 4 * len(POSES)
-    again = pooled([pooled(parts[:2]), pooled(parts[2:])])
-    np.testing.assert_array_equal(again.rho, one.rho)
+    again = pool([pool(parts[:2]), pool(parts[2:])])
+    np.testing.assert_array_equal(again.rho_error, one.rho_error)
     assert (again.walls, again.false) == (one.walls, one.false)

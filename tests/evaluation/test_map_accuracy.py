@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from jaxsonar.evaluation.map_accuracy import evaluate, union
+from jaxsonar.evaluation.map_accuracy import evaluate, union_length
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.reports.terminal_tables_evaluation import evaluation_table
+from jaxsonar.reports.terminal_tables import evaluation_table
 
 NONE = np.zeros((0, 2, 2))
 seeds = st.integers(0, 2**32 - 1)
@@ -142,8 +142,8 @@ def test_the_nearest_reference_is_the_one_that_deviates():
 
 
 def test_union():
-    assert union(np.array([[3.0, 4.0], [0.0, 2.0], [1.0, 1.5], [1.0, 2.5]])) == 3.5
-    assert union(np.zeros((0, 2))) == 0
+    assert union_length(np.array([[3.0, 4.0], [0.0, 2.0], [1.0, 1.5], [1.0, 2.5]])) == 3.5
+    assert union_length(np.zeros((0, 2))) == 0
 
 
 def test_nothing_on_one_side():

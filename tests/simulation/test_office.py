@@ -14,8 +14,9 @@ from jaxsonar import LocalModel, Ring, load_log, load_ring, load_room, local_mod
 from jaxsonar.cli import app as cli
 from jaxsonar.demo import run_demo as demo
 from jaxsonar.detection.settings_toml import load_settings
-from jaxsonar.evaluation.line_accuracy import GATE_RHO, GATE_THETA, compare
+from jaxsonar.evaluation.line_accuracy import line_accuracy
 from jaxsonar.evaluation.map_accuracy import evaluate
+from jaxsonar.evaluation.settings import SETTINGS
 from jaxsonar.fileio.atomic_files import make_folder
 from jaxsonar.mapping.map_geojson import load_map
 from jaxsonar.simulation.office import load_office
@@ -63,7 +64,7 @@ def seen_line(pose, wall):
     return np.hypot(*foot), math.atan2(foot[1], foot[0])
 
 
-def is_line(line, rho, theta, *, rho_gate=GATE_RHO, theta_gate=GATE_THETA):
+def is_line(line, rho, theta, *, rho_gate=SETTINGS.lines.gate_rho, theta_gate=SETTINGS.lines.gate_theta):
     return abs(line.rho - rho) <= rho_gate and abs(oracles.wrap(line.theta - theta)) <= theta_gate
 
 
@@ -163,12 +164,12 @@ def test_three_walls_at_the_first_pose_as_near_as_in_the_paper(office, noisy):
 
 def test_most_clear_walls_of_all_poses_are_found(office, noisy):
     for heard, models in noisy:
-        result = compare(office.ring, models, heard, office.room, office.poses, sigma=SIGMA)
+        result = line_accuracy(office.ring, models, heard, office.room, office.poses, sigma=SIGMA)
         assert result.walls >= 2 * 17
         assert result.recall >= 0.9
         assert result.false_per_scan <= 2
-        assert np.sqrt(np.mean(result.rho**2)) < PAPER_RHO
-        assert np.sqrt(np.mean(result.theta**2)) < PAPER_THETA
+        assert np.sqrt(np.mean(result.rho_error**2)) < PAPER_RHO
+        assert np.sqrt(np.mean(result.theta_error**2)) < PAPER_THETA
 
 
 def test_segments_of_true_walls_lie_on_them(office, noisy):
@@ -224,15 +225,15 @@ def test_the_table_holds_numbers(written):
         for key, value in row.items():
             if key == "what":
                 continue
-            missing = not len(result.rho) or not np.isfinite(result.bound_rho).any()
+            missing = not len(result.rho_error) or not np.isfinite(result.rho_bound).any()
             assert missing or (isinstance(value, int | float) and math.isfinite(value)), key
         assert 0 <= row["recall"] <= 1
         assert row["walls"] > 0
         assert row["lines"] >= row["false_per_scan"] * row["scans"]
-        assert len(result.rho) == result.lines - result.false
-        if len(result.rho):
+        assert len(result.rho_error) == result.lines - result.false
+        if len(result.rho_error):
             assert row["rho_max_mm"] >= row["rho_rms_mm"]
-            assert row["theta_max_deg"] == pytest.approx(np.degrees(np.abs(result.theta)).max())
+            assert row["theta_max_deg"] == pytest.approx(np.degrees(np.abs(result.theta_error)).max())
     first = table[0]
     assert (first["walls"], first["recall"]) == (3, 1.0)
     # Both methods and both rings are asked for the same walls; the paper's ring finds more of them.
@@ -303,7 +304,7 @@ def test_the_demos_files_give_its_log_again(written, tmp_path, office, capsys):
     poses = np.column_stack([office.stamps, office.poses]).tolist()
     path.write_text("\n".join(["stamp,x,y,theta", *(",".join(map(repr, row)) for row in poses)]))
     room, ring = str(folder / "office.geojson"), str(folder / "ring.toml")
-    call = ["simulate", room, "--ring", ring, "--path", str(path), "--sigma", str(demo.SIGMA), "--seed", "1"]
+    call = ["simulate", room, "--ring", ring, "--path", str(path), "--sigma", str(demo.SETTINGS.sigma), "--seed", "1"]
     assert cli.main([*call, "-o", str(tmp_path / "again.csv")]) == 0
     assert load_log(tmp_path / "again.csv") == load_log(folder / "office.csv")
     capsys.readouterr()
@@ -333,7 +334,7 @@ def test_the_demo_command_prints_the_table(tmp_path, capsys, monkeypatch):
     """With the work itself left out: rows in, tables to standard output, the rest to standard error."""
     rows = []
     some = np.array([[[0.0, 0.0], [1.0, 0.0]]])
-    nothing = demo.map_summary(evaluate(np.zeros((0, 2, 2)), some), np.ones(1, dtype=bool))
+    nothing = demo.map_summary(evaluate(np.zeros((0, 2, 2)), some), np.ones(1, dtype=bool), sigma=SIGMA)
 
     def quick(output, *, seed, on_step, on_room):
         on_step(f"seed {seed}")
@@ -344,7 +345,7 @@ def test_the_demo_command_prints_the_table(tmp_path, capsys, monkeypatch):
     rows.append(
         (
             "no line at all",
-            compare(empty.ring, [LocalModel(0, 0.0, ())], heard, empty.room, empty.poses[:1], sigma=SIGMA),
+            line_accuracy(empty.ring, [LocalModel(0, 0.0, ())], heard, empty.room, empty.poses[:1], sigma=SIGMA),
         )
     )
     monkeypatch.setattr(demo, "run_demo", quick)

@@ -1,0 +1,69 @@
+"""Numeric settings of the evaluation. Unless a field says otherwise, its value was chosen by hand."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class LineMatchSettings:
+    """Matching of extracted lines with true walls."""
+
+    gate_rho: float = 0.10
+    """Largest deviation in rho of a match, metres; three times the paper's largest deviation."""
+    gate_theta: float = float(np.radians(15.0))
+    """Largest deviation in theta of a match, radians; twice the paper's largest deviation."""
+    min_echoes: int = 8
+    """First-order echoes from which on a wall should be found."""
+
+
+@dataclass(frozen=True)
+class MapMatchSettings:
+    """Matching of the segments of a map with those of a reference."""
+
+    gate_distance: float = 0.15
+    """Largest distance between a piece of the map and its reference, metres."""
+    gate_angle: float = math.radians(10.0)
+    """Largest angle between them, radians."""
+    min_overlap: float = 0.05
+    """Shorter overlaps give no deviation, metres."""
+
+
+@dataclass(frozen=True)
+class LaserSettings:
+    """Walls from laser scans."""
+
+    corner_gate: float = 0.2
+    """Walls whose ends are closer than this to the crossing of their lines meet there, metres."""
+    min_corner_angle: float = float(np.radians(15.0))
+    """Lines with a smaller angle between them have no well-defined crossing, radians."""
+    min_incidence: float = float(np.radians(10.0))
+    """Smallest angle of incidence at which a wall is expected to give connected returns, radians (Borges and Aldon,
+    2004)."""
+    range_noise: float = 0.03
+    """Three standard deviations of common laser range finders, metres."""
+    cell: float = 0.05
+    """Size of the cells that vote for lines, and sampling of a wall's profile, metres."""
+    band: float = 0.15
+    """Returns within this distance of a line are analysed together, metres: a wall and its recesses."""
+    max_extent: float = 1000.0
+    """Largest extent of one reference map, metres."""
+    window_cells: int = 4
+    """Cells on each side of a step that determine its height, and of a cell that determine how many scans saw it."""
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """All settings of the evaluation."""
+
+    lines: LineMatchSettings = field(default_factory=LineMatchSettings)
+    """Matching of lines."""
+    maps: MapMatchSettings = field(default_factory=MapMatchSettings)
+    """Matching of maps."""
+    laser: LaserSettings = field(default_factory=LaserSettings)
+    """Walls from laser scans."""
+
+
+SETTINGS = EvaluationSettings()
+"""The settings in use."""
