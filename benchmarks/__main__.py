@@ -1,11 +1,11 @@
-"""How fast, and against what: all workloads, their figures, pages and gate.
+"""Speed compared with other implementations: runs the workloads, writes figures and pages, checks the gate.
 
     python -m benchmarks                      everything, some minutes
     python -m benchmarks --quick              a minute, once everything is compiled
-    python -m benchmarks --gate               the ratios that CI holds against benchmarks/baseline.json
-    python -m benchmarks --update-baseline    the same, to be the baseline from now on
+    python -m benchmarks --gate               compare the ratios with benchmarks/baseline.json, as CI does
+    python -m benchmarks --update-baseline    measure as the gate does and write a new baseline
     python -m benchmarks --only device        on a machine with a GPU
-    python -m benchmarks --write docs/speed.md README.md
+    python -m benchmarks --write docs/speed.md
 
 Compiled programs are kept in JAX_COMPILATION_CACHE_DIR, or in a folder of the user's cache.
 """
@@ -109,15 +109,15 @@ def shown(results: Results) -> Table:
 
 def write_pages(pages: list[Path], results: Results) -> None:
     """Tables of each page, and the figures that it shows as ``speed_NAME.svg``."""
-    from benchmarks import markdown_tables as page
-    from benchmarks import plots as suite_figures
+    from benchmarks import markdown_tables, plots
+    from jaxsonar.reports import plot_style
 
     for path in pages:
-        page.write(path, results)
+        markdown_tables.write(path, results)
         text = path.read_text(encoding="utf-8")
-        for name, figure in suite_figures.all_of(results).items():
+        for name, figure in plots.all_of(results).items():
             if f"speed_{name}.svg" in text:
-                suite_figures.figures.save(figure, path.parent / f"speed_{name}.svg")
+                plot_style.save_figure(figure, path.parent / f"speed_{name}.svg")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -179,10 +179,10 @@ def run(options: argparse.Namespace) -> int:
         save_baseline(results, options.baseline)
     PRINTED.print(shown(results))
     if not options.gate:
-        from benchmarks import plots as suite_figures
+        from benchmarks import plots
 
         make_folder(options.output)
-        suite_figures.write(results, options.output)
+        plots.write(results, options.output)
     write_pages(options.write, results)
     if wrong:
         SAID.print(f"worse than {options.baseline}, {TRIES} times:\n" + "\n".join(wrong))

@@ -9,7 +9,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from benchmarks.markdown_tables import GROWTH
 from benchmarks.metrics import Results
-from jaxsonar.reports import plot_style as figures
+from jaxsonar.reports import plot_style
 
 BARS = {
     "throughput.hough:numba": "fused Numba loop, complete",
@@ -22,22 +22,22 @@ BARS = {
 BACKED = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
 """So that no line runs through a text."""
 WHOLES = {"hough": "hough, batch", "ml": "ml, batch", "single": "hough, one scan"}
-LINES = {"hough": figures.PALETTE[0], "ml": figures.PALETTE[1]}
+LINES = {"hough": plot_style.PALETTE[0], "ml": plot_style.PALETTE[1]}
 
 
 def peers_figure(results: Results) -> Figure:
     """How many times as fast as each peer the batched hough is, and the targets."""
     rows = [results.metrics[key] for key in BARS if key in results.metrics]
-    with figures.styled():
+    with plot_style.figure_style():
         figure = Figure(figsize=(7.6, 0.5 * len(rows) + 1.3), layout="constrained")
         axes = figure.subplots()
         place = np.arange(len(rows))[::-1]
         values = np.array([one.value for one in rows])
         goals = np.array([np.nan if one.target is None else one.target for one in rows])
-        axes.barh(place, values, left=0, height=0.55, color=figures.PALETTE[0])
+        axes.barh(place, values, left=0, height=0.55, color=plot_style.PALETTE[0])
         axes.set_xscale("log")
-        axes.axvline(1, color=figures.WALL, lw=1, ls="--")
-        axes.plot(goals, place, ls="", marker="|", ms=16, mew=2.5, color=figures.PALETTE[5], label="target")
+        axes.axvline(1, color=plot_style.WALL_COLOR, lw=1, ls="--")
+        axes.plot(goals, place, ls="", marker="|", ms=16, mew=2.5, color=plot_style.PALETTE[5], label="target")
         both = np.append(values, goals[np.isfinite(goals)])
         axes.set_xlim(min(0.5, float(np.nanmin(both)) / 2), float(np.nanmax(both)) * 3)
         beyond = np.fmax(values, np.where(goals > values, np.where(goals < 2.5 * values, goals, 0), 0))
@@ -56,13 +56,13 @@ def stages_figure(results: Results) -> Figure:
     """Shares of the stages of a batch and of one scan; what is left over is what happens between them."""
     rows = {name: dict(_shares(results, name)) for name in WHOLES}
     rows = {name: shares for name, shares in rows.items() if shares}
-    with figures.styled():
+    with plot_style.figure_style():
         figure = Figure(figsize=(7.6, 0.95 * len(rows) + 1.0), layout="constrained")
         axes = figure.subplots()
         for y, (_, shares) in enumerate(reversed(rows.items())):
             left, above = 0.0, 0
             for k, (stage, share) in enumerate(shares.items()):
-                axes.barh(y, share, left=left, height=0.4, color=figures.PALETTE[k % 6], edgecolor="white")
+                axes.barh(y, share, left=left, height=0.4, color=plot_style.PALETTE[k % 6], edgecolor="white")
                 label = f"{stage} {share:.0f} %"
                 wide = share >= 1.3 * len(label)
                 if wide:
@@ -72,7 +72,7 @@ def stages_figure(results: Results) -> Figure:
                     axes.text(left, y + (0.24 if up else -0.24), label, ha="left", va="bottom" if up else "top")
                     above += 1
                 left += share
-        axes.axvline(100, color=figures.WALL, lw=1, ls="--")
+        axes.axvline(100, color=plot_style.WALL_COLOR, lw=1, ls="--")
         names = [f"{WHOLES[name]}\n{results.value(f'stages.{name}.whole'):,.0f} us a scan" for name in rows]
         axes.set_yticks(range(len(rows)), names[::-1])
         axes.tick_params(axis="y", length=0)
@@ -87,7 +87,7 @@ def growth_figure(results: Results) -> Figure:
     curves = {axis: lines for axis, lines in curves.items() if lines}
     across = min(3, max(1, len(curves)))
     down = -(-len(curves) // across)
-    with figures.styled():
+    with plot_style.figure_style():
         figure = Figure(figsize=(3.1 * across, 2.7 * max(1, down)), layout="constrained")
         grid = figure.subplots(max(1, down), across, squeeze=False).ravel()
         for axes in grid[len(curves) :]:
@@ -155,5 +155,5 @@ def write(
     for name, figure in all_of(results).items():
         for suffix in suffixes:
             paths.append(folder / f"{prefix}{name}{suffix}")
-            figures.save(figure, paths[-1])
+            plot_style.save_figure(figure, paths[-1])
     return paths

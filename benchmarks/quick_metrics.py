@@ -5,8 +5,13 @@ import time
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from benchmarks.calibration import accuracy as calibration
-from benchmarks.detection import accuracy
+from benchmarks.calibration.accuracy import outcome, timed
+from benchmarks.calibration.summary import growth, measures
+from benchmarks.calibration.trials import CONDITIONS
+from benchmarks.detection.conditions import BASE
+from benchmarks.detection.methods import METHODS
+from benchmarks.detection.scenarios import POSES, random_scans
+from benchmarks.detection.scoring import score
 from benchmarks.mapping import segment_merging as merging
 from benchmarks.metrics import RATIO, Metric, Options
 from benchmarks.speed import timing
@@ -50,13 +55,13 @@ def of_merging(options: Options) -> list[Metric]:
 
 def of_calibration(options: Options) -> list[Metric]:
     """``benchmarks.calibration.accuracy``: time of 25 scans, in the full run of 100, and deviations over the bound."""
-    known = calibration.CONDITIONS[0]
-    rows = [calibration.timed(scans, known) for scans in ((25,) if options.size != "full" else (25, 100))]
+    known = CONDITIONS[0]
+    rows = [timed(scans, known) for scans in ((25,) if options.size != "full" else (25, 100))]
     metrics = [Metric("calibration.first:again", rows[0]["first"] / rows[0]["again"], RATIO)]
     if len(rows) > 1:
-        metrics.append(Metric("calibration.exponent", calibration.growth(rows)[0], ""))
+        metrics.append(Metric("calibration.exponent", growth(rows)[0], ""))
     if options.size == "full":
-        found = calibration.measures([calibration.outcome(known, seed, "random rooms") for seed in range(4)])
+        found = measures([outcome(known, seed, "random rooms") for seed in range(4)])
         metrics.append(Metric("calibration.rms:bound", float(found["per_bound"]), RATIO))
     return metrics + [Metric(f"calibration.again@{int(row['scans'])}", row["again"], "s") for row in rows]
 
@@ -81,11 +86,11 @@ def of_streaming(options: Options) -> list[Metric]:
 def of_accuracy(options: Options) -> list[Metric]:
     """``benchmarks.detection.accuracy``: that what is fast is right; recall, false lines, and deviations over the bound."""
     rooms = options.pick(gate=2, quick=8, full=64)
-    scans = accuracy.random_scans(accuracy.BASE, rooms, accuracy.POSES, seed=options.seed)
+    scans = random_scans(BASE, rooms, POSES, seed=options.seed)
     metrics = []
     for method, name in {"hough": "hough (paper)", "ml": "ml"}.items():
-        said = list(accuracy.METHODS[name](scans.ring, scans.log, accuracy.BASE.sigma))
-        found = accuracy.score(scans.truth, said).measures()
+        said = list(METHODS[name](scans.ring, scans.log, BASE.sigma))
+        found = score(scans.truth, said).measures()
         for what in ("rho_mm", "theta_deg"):
             key = f"accuracy.{method}.{what.partition('_')[0]}:bound"
             metrics.append(Metric(key, found[f"rmse_{what}_per_crb"], RATIO))

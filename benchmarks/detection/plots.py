@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from rich.table import Table
 
-from jaxsonar.reports import plot_style as figures
+from jaxsonar.reports import plot_style
 
 KINDS = ("plane", "corner", "edge")
 """Kinds of reflectors; poles are told like edges."""
@@ -24,14 +24,14 @@ WIDE = 15.0
 
 def crb_figure(rows: dict[str, Series]) -> Figure:
     """Root mean square errors over the bound against the noise, a row for each kind of scans."""
-    with figures.styled():
+    with plot_style.figure_style():
         figure = Figure(figsize=(7.6, 2.9 * len(rows) + 0.7), layout="constrained")
         grid = figure.subplots(len(rows), 2, sharex=True, sharey="col", squeeze=False)
         for (title, series), row in zip(rows.items(), grid, strict=True):
             for axes, (name, key) in zip(
                 row, {"distance ρ": "rho_mm", "direction θ": "theta_deg"}.items(), strict=True
             ):
-                axes.axhline(1.0, color=figures.WALL, lw=1.0, ls="--")
+                axes.axhline(1.0, color=plot_style.WALL_COLOR, lw=1.0, ls="--")
                 _lines(axes, series, f"rmse_{key}_per_crb", across=1e3)
                 axes.set_yscale("log")
                 axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -46,7 +46,7 @@ def crb_figure(rows: dict[str, Series]) -> Figure:
 
 def robustness_figure(columns: dict[str, Series]) -> Figure:
     """Recall and false lines against what goes wrong, a column for each."""
-    with figures.styled():
+    with plot_style.figure_style():
         figure = Figure(figsize=(7.6, 5.6), layout="constrained")
         grid = figure.subplots(2, len(columns), sharex="col", sharey="row", squeeze=False)
         for (name, series), (top, bottom) in zip(columns.items(), grid.T, strict=True):
@@ -64,7 +64,7 @@ def confusion_figure(tables: dict[str, Int[np.ndarray, "4 5"]]) -> Figure:
     """Shares of each kind's reflectors by what was told of them, and how many reports are of nothing."""
     across = 3
     down = -(-len(tables) // across)
-    with figures.styled():
+    with plot_style.figure_style():
         figure = Figure(figsize=(9.4, 2.7 * down + 0.4), layout="constrained")
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
         for axes in grid.ravel()[len(tables) :]:
@@ -78,7 +78,7 @@ def confusion_figure(tables: dict[str, Int[np.ndarray, "4 5"]]) -> Figure:
                     percent = f"\n{100 * share[row, column]:.0f} %" if row < 3 else ""
                     if not count:
                         continue
-                    color = "white" if share[row, column] > 0.5 else figures.ROBOT
+                    color = "white" if share[row, column] > 0.5 else plot_style.ROBOT_COLOR
                     axes.text(column, row, f"{count}{percent}", ha="center", va="center", fontsize=7, color=color)
             axes.set_title(name)
             axes.set_xticks(range(len(ANSWERS)), ANSWERS, rotation=30, ha="right", rotation_mode="anchor")
@@ -93,7 +93,7 @@ def confusion_figure(tables: dict[str, Int[np.ndarray, "4 5"]]) -> Figure:
 def nees_figure(values: dict[str, Float[np.ndarray, " walls"]]) -> Figure:
     """Squared errors in units of the reported covariance, against the chi-squared density of two degrees of freedom."""
     values = {name: some for name, some in values.items() if len(some)}
-    with figures.styled():
+    with plot_style.figure_style():
         figure = Figure(figsize=(3.0 * max(len(values), 1) + 0.6, 3.0), layout="constrained")
         if not values:
             figure.text(0.5, 0.5, "no method reports a covariance", ha="center")
@@ -104,8 +104,8 @@ def nees_figure(values: dict[str, Float[np.ndarray, " walls"]]) -> Figure:
             inside = some[some < WIDE]
             bins = np.linspace(0, WIDE, 31)
             weight = np.full(len(inside), 1 / (len(some) * (bins[1] - bins[0])))
-            axes.hist(inside, bins, weights=weight, color=figures.PALETTE[4], label=f"{len(some)} walls")
-            axes.plot(x, np.exp(-x / 2) / 2, color=figures.ROBOT, lw=1.2, label="χ², 2 degrees of freedom")
+            axes.hist(inside, bins, weights=weight, color=plot_style.PALETTE[4], label=f"{len(some)} walls")
+            axes.plot(x, np.exp(-x / 2) / 2, color=plot_style.ROBOT_COLOR, lw=1.2, label="χ², 2 degrees of freedom")
             beyond = f"{100 * np.mean(some >= WIDE):.2f} % beyond {WIDE:g} (χ²: {100 * np.exp(-WIDE / 2):.2f} %)"
             axes.plot([], [], " ", label=f"mean {some.mean():.2f}, 2 is right\n{beyond}")
             axes.set_title(name)
@@ -195,7 +195,7 @@ def _lines(axes: Axes, series: Series, key: str, *, across: float = 1.0, up: flo
         y, error = (
             np.array([up * row[name][f"{key}{of}"] for row in series.values()], dtype=float) for of in ("", "_se")
         )
-        style = {"color": figures.PALETTE[k % 6], "marker": MARKERS[k % 6], "ms": 4.5, "lw": 1.3, "label": name}
+        style = {"color": plot_style.PALETTE[k % 6], "marker": MARKERS[k % 6], "ms": 4.5, "lw": 1.3, "label": name}
         axes.errorbar(x, y, error, capsize=2, **style)
     axes.grid(axis="y", color="#F0F0F0", lw=0.6)
     axes.set_axisbelow(True)

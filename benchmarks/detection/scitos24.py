@@ -20,8 +20,7 @@ from rich.table import Table
 
 from jaxsonar import LocalModel, Log, load_ring, local_models
 from jaxsonar.geometry.se2 import wrap_angle
-from jaxsonar.reports import plot_scan as figures_scan
-from jaxsonar.reports import plot_style as figures
+from jaxsonar.reports import plot_scan, plot_style
 from jaxsonar.scans.convert import read_scans
 
 DIRECTIONS = {"front": (12, 0), "left": (18, 1), "right": (6, 2)}
@@ -103,11 +102,11 @@ def heard_off_axis(ranges: Float[np.ndarray, "scans sensors"], radius: float) ->
 
 def deviation_figure(found: dict[str, Agreement]) -> Figure:
     """Histograms of the lines' distances against the recording's own minima."""
-    with figures.styled():
+    with plot_style.figure_style():
         figure = Figure(figsize=(8.4, 2.8), layout="constrained")
         for axes, (name, row) in zip(figure.subplots(1, 3, sharex=True), found.items(), strict=True):
-            axes.hist(row.rho * 1e3, bins=np.arange(-40, 41, 2), color=figures.DIRECT)
-            axes.axvline(0, color=figures.ROBOT, lw=0.8)
+            axes.hist(row.rho * 1e3, bins=np.arange(-40, 41, 2), color=plot_style.DIRECT_COLOR)
+            axes.axvline(0, color=plot_style.ROBOT_COLOR, lw=0.8)
             axes.set_title(f"{name}: {len(row.rho)} of {row.square} square walls")
             axes.set_xlabel("line less own minimum (mm)")
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))
@@ -159,12 +158,12 @@ def main() -> None:
             why = "".join(f"; {count} scans: {reason}" for reason, count in reasons.most_common())
             console.print(f"{what}: {scans:.1%} of {len(log)} scans with lines, {lines:.2f} lines a scan{why}")
         if ring is shipped:
-            figures.save(deviation_figure(found), options.output / "deviations.svg")
-            figures.save(deviation_figure(found), options.output / "deviations.png")
+            plot_style.save_figure(deviation_figure(found), options.output / "deviations.svg")
+            plot_style.save_figure(deviation_figure(found), options.output / "deviations.png")
             best = max(range(len(models)), key=lambda k: sum(line.echoes for line in models[k].lines[:3]))
             for suffix in ("svg", "png"):
-                figure = figures_scan.lines_figure(ring, log[best], models[best])
-                figures.save(figure, options.output / f"lines.{suffix}")
+                figure = plot_scan.lines_figure(ring, log[best], models[best])
+                plot_style.save_figure(figure, options.output / f"lines.{suffix}")
     for degrees, (share, chance) in heard_off_axis(ranges, radius).items():
         console.print(
             f"a square wall is heard {degrees} deg off its normal in {share:.1%} of the cases; chance {chance:.1%}"

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from jaxsonar import Ring, local_models, random_pose, random_room, simulate
 from jaxsonar.detection.settings import hough_settings
-from jaxsonar.evaluation.line_accuracy import compare, pooled
+from jaxsonar.evaluation.line_accuracy import line_accuracy, pool
 
 SIGMA = 0.003
 
@@ -34,9 +34,9 @@ def main() -> None:
         table.add_column(column, justify="right")
     for threshold in (0.10, 0.15, 0.20, 0.25, 0.30, 0.40):
         settings = replace(hough_settings(ring, None), threshold=threshold)
-        row = pooled(
+        row = pool(
             [
-                compare(
+                line_accuracy(
                     ring,
                     list(local_models(ring, heard.as_log(ring, poses), method="hough", settings=settings)),
                     heard,
@@ -51,8 +51,8 @@ def main() -> None:
             f"{threshold:.2f}",
             f"{row.recall:.3f}",
             f"{row.false_per_scan:.2f}",
-            f"{np.sqrt(np.mean(row.rho**2)) * 1e3:.1f}",
-            f"{np.degrees(np.sqrt(np.mean(row.theta**2))):.2f}",
+            f"{np.sqrt(np.mean(row.rho_error**2)) * 1e3:.1f}",
+            f"{np.degrees(np.sqrt(np.mean(row.theta_error**2))):.2f}",
         )
     Console(width=110).print(table)
 

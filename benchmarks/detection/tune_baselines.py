@@ -12,7 +12,10 @@ from benchmarks.detection.baselines import TUNING, PairConsensus, PointHough, ar
 
 def main() -> None:
     """Sweep what decides between walls and false lines; of F1 within 0.01 of the best, the smallest errors won."""
-    from benchmarks.detection.accuracy import Condition, Reported, random_scans, score
+    from benchmarks.detection.conditions import Condition
+    from benchmarks.detection.methods import Reported
+    from benchmarks.detection.scenarios import random_scans
+    from benchmarks.detection.scoring import score
 
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--rooms", type=int, default=10)

@@ -33,6 +33,7 @@ from benchmarks.slam.scenarios import (
     one_scan,
     twins,
 )
+from benchmarks.slam.summary import Outcome, _rms, measures, table
 from jaxsonar import GlobalMap, SonarError
 from jaxsonar.estimation.trajectory import Trajectory
 from jaxsonar.evaluation.map_accuracy import evaluate

@@ -1,6 +1,6 @@
 """What no unbiased estimate of poses and walls goes below: the Cramer-Rao bound of a simulated run.
 
-The association is known from the simulator, its noise is white, and odometry is as wrong as ``drifted`` makes it. The
+The association is known from the simulator, its noise is white, and odometry is as wrong as ``simulate_odometry`` makes it. The
 formulas are those of ``benchmarks.calibration.accuracy``, their slopes central differences: nothing is shared with the kernels.
 Echoes of second order are no part of it, nor is that corners lie where walls meet or that walls go on behind a door, so
 that it is a little too large where the library uses that. The first pose is known; it is the frame.
@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import solveh_banded
 
-from benchmarks.calibration.accuracy import LOOSE, NUDGE, reports
-from benchmarks.calibration.accuracy import scene as reflectors_of
+from benchmarks.calibration.cramer_rao import LOOSE, NUDGE, reports
+from benchmarks.calibration.cramer_rao import scene as reflectors_of
 from benchmarks.slam.scenarios import DISTANCE, TURN, Scene
 from jaxsonar.geometry.se2 import relative, wrap_angle
 from jaxsonar.simulation.traced_echoes import EchoKind
@@ -52,7 +52,7 @@ def bound(scene: Scene, *, distance: float = DISTANCE, turn: float = TURN) -> Bo
 
     Args:
         scene: the truth and what was heard.
-        distance: what odometry is wrong by, as ``drifted`` takes it.
+        distance: what odometry is wrong by, as ``simulate_odometry`` takes it.
         turn: likewise.
     """
     slopes = _Slopes.of(scene)

@@ -27,7 +27,7 @@ from jaxsonar.simulation.wheel_odometry import simulate_odometry
 SIGMA = 0.001
 """Metres; noise of the ranges."""
 DISTANCE, TURN = 0.02, float(np.radians(1.0))
-"""Odometry: m and rad (standard deviations) after one metre, as ``drifted`` takes them."""
+"""Odometry: m and rad (standard deviations) after one metre, as ``simulate_odometry`` takes them."""
 STEP = 0.1, 0.2
 """Metres between scans."""
 TURNING = float(np.radians(15.0))

@@ -28,7 +28,8 @@ from jaxsonar import simulate
 from jaxsonar.hardware.device_emulator import emulate
 from jaxsonar.hardware.messages import Group, Message
 from jaxsonar.hardware.transport_servers import listen
-from jaxsonar.live.stream import Status, stream
+from jaxsonar.live.status import Status
+from jaxsonar.live.stream import stream
 from jaxsonar.simulation.device_messages import log_messages
 from jaxsonar.simulation.office import load_office
 
@@ -91,11 +92,11 @@ def run(
     def sample(status: Status) -> None:
         nonlocal longest
         now = time.monotonic()
-        longest = max(longest, status.waiting)
+        longest = max(longest, status.queued)
         if status.warm and (not samples or now - samples[-1][0] >= 1.0):
             samples.append((now, memory(), status.scans))
             if len(samples) % 10 == 0:
-                print(f"{status.line()}, {samples[-1][1]:.0f} MB", file=sys.stderr, flush=True)
+                print(f"{status.text()}, {samples[-1][1]:.0f} MB", file=sys.stderr, flush=True)
 
     office = load_office()
     with tempfile.TemporaryDirectory() as folder:
@@ -103,7 +104,7 @@ def run(
             url,
             office.ring,
             method=method,
-            map_path=Path(folder) / "map.geojson" if mapping else None,
+            map_filename=Path(folder) / "map.geojson" if mapping else None,
             record=None if record is None else Path(folder) / f"record{record}",
             on_status=sample,
             stop=threading.Event(),

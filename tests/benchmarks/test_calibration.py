@@ -7,17 +7,10 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration import accuracy as calibration
-from benchmarks.calibration.accuracy import (
-    CONDITIONS,
-    Outcome,
-    bound,
-    measures,
-    path_in,
-    reports,
-    scene,
-    slipped,
-    trial,
-)
+from benchmarks.calibration import trials
+from benchmarks.calibration.cramer_rao import bound, reports, scene
+from benchmarks.calibration.summary import Outcome, measures
+from benchmarks.calibration.trials import CONDITIONS, path_in, slipped, trial
 from jaxsonar import random_room, simulate
 from jaxsonar.geometry.se2 import relative, wrap_angle
 from jaxsonar.geometry.segments import point_to_segments
@@ -76,10 +69,10 @@ def test_the_bound_does_not_hang_on_the_frame(office):
 def test_paths_keep_clear_and_steps_are_as_said(rng):
     room = random_room(rng)
     poses = path_in(room, rng, 40)
-    assert (point_to_segments(poses[:, :2], room.walls) >= calibration.CLEARANCE).all()
+    assert (point_to_segments(poses[:, :2], room.walls) >= trials.CLEARANCE).all()
     way = np.hypot(*relative(poses[:-1], poses[1:])[:, :2].T)
-    assert (way >= calibration.STEP[0]).all()
-    assert (way <= calibration.STEP[1]).all()
+    assert (way >= trials.STEP[0]).all()
+    assert (way <= trials.STEP[1]).all()
     np.testing.assert_allclose(slipped(poses, 0.0, rng)[:, :2], poses[:, :2], atol=1e-12)
     off = relative(*(p[1:] for p in (poses, slipped(poses, 0.02, rng))))
     assert 0 < np.hypot(off[:, 0], off[:, 1]).max() < 1

@@ -5,9 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.detection import accuracy
-from benchmarks.detection.accuracy import ANSWERS, BASE, KINDS, Condition, Reported, Score, Truth, score
+from benchmarks.detection import accuracy, plots, scenarios, scoring
 from benchmarks.detection.baselines import PairConsensus, PointHough, arcs_of_scans, distinct
+from benchmarks.detection.conditions import BASE, CONDITIONS, HARD, ISOLATED, Condition
+from benchmarks.detection.methods import METHODS, Reported
+from benchmarks.detection.plots import ANSWERS, KINDS
+from benchmarks.detection.scenarios import Truth
+from benchmarks.detection.scoring import Score, score
 from jaxsonar import Ring
 from jaxsonar.geometry.se2 import wrap_angle
 
@@ -17,7 +21,7 @@ EXACT = Condition("", sigma=0.0, lost=0.0, false=0.0)
 @pytest.fixture(scope="module")
 def walls():
     """Scans of one wall each."""
-    return accuracy.single_reflectors(EXACT, "plane", 40, seed=1)
+    return scenarios.single_reflectors(EXACT, "plane", 40, seed=1)
 
 
 def worst(walls, peer):
@@ -95,7 +99,7 @@ def test_standard_errors_are_those_of_groups(rng):
     values = []
     for _ in range(300):
         top = np.repeat(rng.random(50) < 0.4, 20).astype(float)  # all rows of a group alike
-        values.append(accuracy.ratio(top, np.ones(1000), group))
+        values.append(scoring.ratio(top, np.ones(1000), group))
     value, error = np.array(values).T
     assert error.mean() == pytest.approx(value.std(), rel=0.15)
     assert error.mean() == pytest.approx(np.sqrt(0.4 * 0.6 / 50), rel=0.05)
@@ -138,13 +142,13 @@ def test_walls_are_counted_once_and_kinds_by_place():
         ("none", "plane"): 1,
         ("none", "corner"): 1,
     }
-    assert accuracy.answers(got.confusion) == pytest.approx(
+    assert scoring.answers(got.confusion) == pytest.approx(
         {"reflectors": 5, "right": 2 / 3, "right_se": np.sqrt(2 / 27), "undecided": 0.2, "nothing": 0.2}
     )
 
 
 def test_what_finds_everything_has_full_marks():
-    scans = accuracy.random_scans(BASE, 3, 3, seed=2)
+    scans = scenarios.random_scans(BASE, 3, 3, seed=2)
     perfect = []
     for true in scans.truth:
         plane = true.kind == 0
@@ -158,14 +162,14 @@ def test_what_finds_everything_has_full_marks():
 
 
 def test_rooms_and_poses_are_the_same_in_every_condition():
-    some = [accuracy.random_scans(c, 2, 2, seed=3) for c in (BASE, Condition("", sensors=32), accuracy.HARD)]
+    some = [scenarios.random_scans(c, 2, 2, seed=3) for c in (BASE, Condition("", sensors=32), HARD)]
     places = [{tuple(np.round(place, 9)) for true in scans.truth for place in true.place} for scans in some]
     assert all(len(places[0] & other) > 0.6 * min(len(places[0]), len(other)) for other in places[1:])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_single_reflectors_answer_where_they_are(kind):
-    scans = accuracy.single_reflectors(EXACT, kind, 20, seed=4)
+    scans = scenarios.single_reflectors(EXACT, kind, 20, seed=4)
     position, log = np.asarray(scans.ring.position), scans.log
     for k, true in enumerate(scans.truth):
         assert true.kind.tolist() == [KINDS.index(kind)]
@@ -185,13 +189,13 @@ def test_single_reflectors_answer_where_they_are(kind):
 
 
 def test_three_walls_are_three_and_apart():
-    scans = accuracy.three_walls(accuracy.THREE_WALLS, 10, seed=5)
+    scans = scenarios.three_walls(accuracy.THREE_WALLS, 10, seed=5)
     for true in scans.truth:
         assert len(true.place) == 3
         turn = np.abs(wrap_angle(true.place[:, None, 1] - true.place[:, 1]))[np.triu_indices(3, 1)]
         assert (turn > np.radians(59.9)).all()
     found = score(scans.truth, [Reported.of_lines(true.place + np.array([0.001, 0.01])) for true in scans.truth])
-    got = accuracy.worst_of_three(found)
+    got = scoring.worst_of_three(found)
     assert got["all_found"] == 1
     assert got["rho_mm_p50"] == pytest.approx(1.0)
     assert got["theta_deg_p90"] == pytest.approx(np.degrees(0.01))
@@ -202,17 +206,17 @@ def test_rings_of_conditions():
     assert Condition("", cone_deg=120).ring.neighbors == 7
     assert Condition("", sensors=32).ring.neighbors == 4
     assert isinstance(BASE.ring, Ring)
-    names = [c.name for c in accuracy.CONDITIONS]
+    names = [c.name for c in CONDITIONS]
     assert len(set(names)) == len(names)
 
 
 @pytest.mark.slow
 def test_a_tiny_run_makes_every_file(tmp_path):
-    methods = {name: way for name, way in accuracy.METHODS.items() if not name.startswith("ml")}
+    methods = {name: way for name, way in METHODS.items() if not name.startswith("ml")}
     noise = np.random.default_rng(0)
 
     def nearly(ring, log, sigma):  # something with a covariance, kinds, and what is undecided
-        for said in accuracy.METHODS["consensus of pairs"](ring, log, sigma):
+        for said in METHODS["consensus of pairs"](ring, log, sigma):
             cov = np.zeros((len(said.lines), 2, 2)) + np.diag([1e-6, 1e-4])
             other = noise.uniform(0.5, 1.5, (2, 2))
             yield Reported(said.lines, cov, other, np.array([1, 3]))
@@ -220,9 +224,7 @@ def test_a_tiny_run_makes_every_file(tmp_path):
     settings = {"rooms": 1, "poses": 2, "single": 3, "seed": 0}
     said = []
     conditions = [BASE, Condition("sigma 1 mm", sigma=0.001), Condition("clean", lost=0.0, false=0.0)]
-    found = accuracy.run(
-        conditions, accuracy.ISOLATED[:1], methods | {"nearly": nearly}, **settings, progress=said.append
-    )
+    found = accuracy.run(conditions, ISOLATED[:1], methods | {"nearly": nearly}, **settings, progress=said.append)
     told = accuracy.write(found, tmp_path, settings)
     assert len(said) == len(conditions) + 2
     names = {path.name for path in tmp_path.iterdir()}
@@ -233,4 +235,4 @@ def test_a_tiny_run_makes_every_file(tmp_path):
     assert set(read["conditions"][0]["methods"]) == {*methods, "nearly"}
     assert read["versions"]["jax"]
     assert read["settings"]["seed"] == 0
-    assert [table.row_count > 0 for table in accuracy.accuracy_figures.tables(told)] == [True] * 4
+    assert [table.row_count > 0 for table in plots.tables(told)] == [True] * 4

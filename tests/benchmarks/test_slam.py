@@ -13,6 +13,7 @@ from shapely import LineString, MultiLineString
 
 from benchmarks.slam import accuracy as slam
 from benchmarks.slam import scenarios as slam_scenes
+from benchmarks.slam import summary
 from benchmarks.slam.cramer_rao import Bound, _links, _Slopes, bound, pose_bound
 from benchmarks.slam.scenarios import (
     CLEARANCE,
@@ -217,9 +218,9 @@ def test_measures_of_known_errors(office, monkeypatch):
     json.dumps(slam.without_nan(told), allow_nan=False)
     settings = {"sigma": 0.001, "distance": DISTANCE, "turn": TURN}
     versions = {"jax": "1", "device": "cpu", "commit": "abc"}
-    table = slam.table(slam.without_nan({"versions": versions, "settings": settings, "scenarios": told}))
+    table = summary.table(slam.without_nan({"versions": versions, "settings": settings, "scenarios": told}))
     assert table.row_count == 2
-    assert len(table.columns) == len(slam.COLUMNS) + 1
+    assert len(table.columns) == len(summary.COLUMNS) + 1
 
 
 def test_a_run_that_fails_is_told(office, monkeypatch):
@@ -228,7 +229,7 @@ def test_a_run_that_fails_is_told(office, monkeypatch):
     got = slam.outcome(office, "smoothed", nothing)
     assert got.failed
     assert got.odometry > 0
-    row = slam.measures([got])
+    row = summary.measures([got])
     assert (row["failed"], row["why"]) == (1, got.failed)
     assert np.isnan(row["ate_mm"])
 

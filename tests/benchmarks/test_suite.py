@@ -124,7 +124,7 @@ def test_points_are_those_of_the_arcs(given):
     votes, _ = of_product(ring, scan[None])
     assert len(points) == votes.sum()
     arcs, paths = arc_tables(ring, SETTINGS).arcs, ring.echo_paths
-    counts, theta = np.asarray(arcs.arcs.counts), np.asarray(arcs.arcs.theta)
+    counts, theta = np.asarray(arcs.arcs.exists), np.asarray(arcs.arcs.theta)
     begin = 0
     for p, s in itertools.islice(zip(path, slot, strict=True), 5):
         own = points[begin : begin + counts[p].sum()]

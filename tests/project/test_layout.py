@@ -405,8 +405,11 @@ def test_kernels_export_what_exists():
 
 
 def python(code: str) -> list[str]:
-    """Words that a fresh Python process prints."""
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    """Words that a fresh Python process prints. If it fails, the last line of its error output is shown."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    if done.returncode != 0:
+        pytest.fail((done.stderr.strip().splitlines() or ["no error output"])[-1], pytrace=False)
+    return done.stdout.split()
 
 
 HEAVY = ("jax", "jaxlib", "numpy", "cv2", "matplotlib", "scipy", "equinox", "pyarrow", "msgspec", "rich")
