@@ -1,4 +1,4 @@
-"""Regions of cohesive occupied cells, by OpenCV: the one file that imports cv2 (paper, section 4)."""
+"""Connected components analysis of occupied cells by OpenCV (paper, section 4). Only this module imports cv2."""
 
 import cv2
 import numpy as np
@@ -8,49 +8,52 @@ from jaxtyping import Bool, Int
 def label_components(
     occupied: Bool[np.ndarray, "scans theta rho"],
 ) -> tuple[Int[np.ndarray, "scans theta_and_one rho"], Int[np.ndarray, " scans"]]:
-    """8-connected components of the accumulators of a batch of scans, joined across both seams of the plane of lines.
+    """8-connected components of the accumulators of a batch of scans, across both seams of the parameter space.
 
-    The first and the last row touch, because theta wraps; cells of the first column touch those half a turn further,
-    because (-rho, theta) is the line (rho, theta + pi). All scans go through OpenCV as one image, of runs of empty rows
-    one each: few cells are occupied.
+    The first and the last row are neighbors, because theta is periodic. Cells of the first column are neighbors of
+    those half a turn away, because (-rho, theta) is the line (rho, theta + pi).
 
     Args:
         occupied: highly occupied cells, rows theta, columns rho.
 
     Returns:
-        labels: 0 for no component, else k or -k for component k of that scan, counted from 1 in the order of cells.
-            Minus marks the far side of a component that joined across rho = 0: cells more than a quarter turn from its
-            first cell. After the last row comes an empty one: the points of no cell have the index of its first cell.
+        labels: 0 for no component, otherwise k or -k for component k of the scan, counted from 1 in the order of its
+            cells. Negative labels mark the far side of a component that joins across rho = 0: cells more than a quarter
+            turn from its first cell. The additional last row is empty; points without a cell have the index of its
+            first cell.
         counts: number of components of each scan.
     """
     scans, rows, columns = occupied.shape
+    # Label all scans as one image, which contains each run of empty rows as one row: few cells are occupied.
     cell = np.flatnonzero(occupied)
-    cell += cell // (rows * columns) * columns  # among the labels, which have a row more
+    cell += cell // (rows * columns) * columns  # index in the labels, which have one more row per scan
     row, column = np.divmod(cell, columns)
-    place = np.full(len(cell), 2)
-    np.minimum(row[1:] - row[:-1], 2, out=place[1:])
-    place = np.cumsum(place)
-    image = np.zeros((int(place[-1]) + 1 if len(place) else 1, columns), np.uint8)
-    image[place, column] = 1
-    small, kind = (np.int16, cv2.CV_16U) if len(cell) < 1 << 15 else (np.int32, cv2.CV_32S)
-    total, parts = cv2.connectedComponentsWithAlgorithm(image, 8, kind, cv2.CCL_BBDT)  # the fastest here
-    labels = np.zeros((scans, rows + 1, columns), small)
-    labels.ravel()[cell] = parts[place, column]
+    image_row = np.full(len(cell), 2)
+    np.minimum(row[1:] - row[:-1], 2, out=image_row[1:])
+    image_row = np.cumsum(image_row)
+    image = np.zeros((int(image_row[-1]) + 1 if len(image_row) else 1, columns), np.uint8)
+    image[image_row, column] = 1
+    dtype, label_type = (np.int16, cv2.CV_16U) if len(cell) < 1 << 15 else (np.int32, cv2.CV_32S)
+    total, parts = cv2.connectedComponentsWithAlgorithm(image, 8, label_type, cv2.CCL_BBDT)  # fastest algorithm here
+    labels = np.zeros((scans, rows + 1, columns), dtype)
+    labels.ravel()[cell] = parts[image_row, column]
 
+    # Find the pairs of parts that touch across the seams.
     theta_seam = _touching(labels[:, 0], labels[:, rows - 1], wrap=False)
     edge, half = labels[:, :rows, 0], rows // 2
     rho_seam = _touching(edge, np.concatenate([edge[:, half:], edge[:, :half]], axis=1), wrap=True)
-    # From parts, as OpenCV numbers them, to components, and back to their cells.
-    component_of = _joined(np.concatenate([theta_seam, rho_seam], axis=1), total)
+    # Merge parts to components, number these by scan and first cell, and label their cells.
+    component_of = _merge_labels(np.concatenate([theta_seam, rho_seam], axis=1), total)
     component = component_of[labels.ravel()[cell]]
     first = np.full(total, labels.size)
-    first[component[::-1]] = cell[::-1]  # the last to write is the first cell
-    order = np.argsort(first)[: np.count_nonzero(first < labels.size)]  # by scan, and within a scan by first cell
+    first[component[::-1]] = cell[::-1]  # the first cell is written last
+    order = np.argsort(first)[: np.count_nonzero(first < labels.size)]  # by scan, then by first cell
     scan = first[order] // ((rows + 1) * columns)
     counts = np.bincount(scan, minlength=scans)
-    number = np.zeros(total, small)
+    number = np.zeros(total, dtype)
     number[order] = np.arange(len(order)) - (np.cumsum(counts) - counts)[scan] + 1
     label = number[component]
+    # Negate the labels of the far side of components that join across rho = 0.
     if rho_seam.size:
         joined = np.zeros(total, bool)
         joined[component_of[rho_seam[0]]] = True
@@ -61,8 +64,8 @@ def label_components(
     return labels, counts
 
 
-def _joined(pairs: Int[np.ndarray, "2 pairs"], total: int) -> Int[np.ndarray, " total"]:
-    """The least label that each label can be reached from by pairs; few are in one, and ways are short."""
+def _merge_labels(pairs: Int[np.ndarray, "2 pairs"], total: int) -> Int[np.ndarray, " total"]:
+    """Smallest label that is connected to each label by pairs. Few labels are in pairs, and chains are short."""
     least = np.arange(total)
     while (least[pairs[0]] != least[pairs[1]]).any():
         low = least[pairs].min(axis=0)
@@ -74,7 +77,7 @@ def _joined(pairs: Int[np.ndarray, "2 pairs"], total: int) -> Int[np.ndarray, " 
 def _touching(
     one: Int[np.ndarray, "scans cells"], other: Int[np.ndarray, "scans cells"], *, wrap: bool
 ) -> Int[np.ndarray, "2 pairs"]:
-    """Pairs of labels that touch: cell k of one side touches cells k-1, k and k+1 of the other."""
+    """Pairs of labels that touch: cell k of one side is a neighbor of cells k-1, k and k+1 of the other side."""
     scan, cell = np.nonzero(one)
     if not len(cell) or not other.any():
         return np.zeros((2, 0), one.dtype)

@@ -1,4 +1,4 @@
-"""Settings of the extraction in TOML: written beside every result, and taken back with ``--settings``."""
+"""Hough settings in TOML files: written beside every result, and read with the option ``--settings``."""
 
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -16,21 +16,21 @@ _File = msgspec.defstruct(
 )
 
 
-def load_settings(path: Path | str) -> kernels.HoughSettings:
-    """Settings from TOML; keys that are left out keep their defaults.
+def load_settings(filename: Path | str) -> kernels.HoughSettings:
+    """Load settings from TOML; missing keys keep their defaults.
 
     Raises:
-        SonarError: no such file, no TOML, an unknown key, a value of another type or out of range.
+        SonarError: no such file, invalid TOML, an unknown key, or a value of a wrong type or out of range.
     """
-    content = read_toml(path, what="settings")
-    content.pop("command", None)  # what else was chosen, for whoever reads it
+    content = read_toml(filename, what="settings")
+    content.pop("command", None)  # options of the command, for information only
     try:
         return kernels.HoughSettings(**msgspec.structs.asdict(msgspec.convert(content, _File)))
-    except (ValueError, OverflowError) as failure:  # an unknown key, another type, out of range
+    except (ValueError, OverflowError) as failure:  # unknown key, wrong type, out of range
         keys = ", ".join(field.name for field in fields(kernels.HoughSettings))
-        raise SonarError(f"{shown(path)}: {reason(failure)}; the keys are {keys}") from None
+        raise SonarError(f"{shown(filename)}: {reason(failure)}; the keys are {keys}") from None
 
 
-def save_settings(settings: kernels.HoughSettings, path: Path | str) -> None:
-    """Write settings so that ``load_settings`` gives the same ones."""
-    write_toml(asdict(settings), path)
+def save_settings(settings: kernels.HoughSettings, filename: Path | str) -> None:
+    """Write settings so that ``load_settings`` restores them."""
+    write_toml(asdict(settings), filename)

@@ -178,10 +178,10 @@ class Ring(eqx.Module):
         return _path_index(self.count, self.neighbors)
 
     @property
-    def sensors(self) -> kernels.Sensors:
+    def sensors(self) -> kernels.SensorArray:
         """The ring as an argument of kernels; differentiable with respect to every leaf of the ring."""
         paths = self.paths.astype(np.int32)
-        return kernels.Sensors(
+        return kernels.SensorArray(
             position=jnp.asarray(self.position),
             heading=jnp.asarray(self.heading),
             beam=jnp.asarray(self.beam),

@@ -1,4 +1,4 @@
-"""What a device would have said: a scan log, or a robot on its way through a room, as firing groups and poses."""
+"""Device messages (firing groups and poses) from a scan log, or from a robot that moves through a room."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,26 +15,26 @@ from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
 from jaxsonar.simulation.simulator import simulate
 
-LARGEST = {"scan": 2**32, "echo": 2**8}
-"""Numbers on the wire are below these."""
+NUMBER_LIMITS = {"scan": 2**32, "echo": 2**8}
+"""Exclusive upper bounds of numbers in the protocol."""
 
 
 def log_messages(log: Log, ring: Ring, *, moving: bool = False, temperature: float = np.nan) -> Iterator[Message]:
-    """The messages that give this log again once they are put together.
+    """Messages from which the receiver assembles this log again.
 
-    A scan begins at its stamp; its groups follow one another as fast as sound allows, or faster where the next scan
-    begins before that. Without stamps the scans follow one another at once.
+    A scan starts at its stamp. Its groups follow after the time of flight of the maximum range, or sooner if the next
+    scan starts before that. Scans without stamps follow each other immediately.
 
     Args:
-        log: what was heard. Ranges become times of flight at the reference speed of sound, whatever the temperature.
-        ring: which sensors fire together.
-        moving: False: the scan's pose before its first group. True: a pose before every group, on the way from the
-            pose of one scan to that of the next; a log's pose is then that of the scan's last group.
-        temperature: of the air, as the device would measure it, deg C; NaN if it does not.
+        log: the scans. Ranges become times of flight at the reference speed of sound, at any temperature.
+        ring: determines which sensors fire simultaneously.
+        moving: False: one pose per scan, before its first group. True: one pose before every group, interpolated
+            between the poses of consecutive scans; the pose of a scan in the log is then that of its last group.
+        temperature: measured air temperature in the messages, deg C; NaN if it is not measured.
 
     Raises:
-        SonarError: sensors that the ring does not have, or numbers and times that no device can send. Only this call
-            raises; what it returns does not.
+        SonarError: sensors that the ring does not have, or numbers and times outside the protocol's limits. All errors
+            are raised by this call and none by the returned iterator.
     """
     group_of = _group_of(ring)
     _check_log(log, ring)
@@ -52,34 +52,34 @@ def room_messages(
     temperature: float = np.nan,
     **settings: Any,
 ) -> Iterator[Message]:
-    """The messages of a device on a robot that moves while the groups of a scan fire.
+    """Messages of a device on a robot that moves while the groups of a scan fire.
 
-    Each group is simulated from the pose at which it fires, on the way from the pose of one scan to that of the next.
+    Each group is simulated at the pose where it fires, which is interpolated between the poses of consecutive scans.
 
     Args:
         ring: the sensors.
-        room: what reflects.
+        room: the reflectors.
         poses: world_from_robot (x, y, theta; metres, radians) of the last group of every scan.
         stamps: when the first group of every scan fires, seconds.
-        temperature: of the air, as the device would measure it, deg C; NaN if it does not.
-        settings: further keywords of ``simulate``.
+        temperature: measured air temperature in the messages, deg C; NaN if it is not measured.
+        settings: further keyword arguments of ``simulate``.
 
     Raises:
-        SonarError: a value out of range, named with what is allowed.
+        SonarError: a value out of range; the message names it and the allowed range.
     """
     group_of = _group_of(ring)
     time = _group_times(ring, stamps)
     groups = time.shape[1]
     pose = _group_poses(poses, time)
-    heard = simulate(ring, room, pose.reshape(-1, 3), stamps=time.reshape(-1), **settings)
-    tx, rx = ring.paths[heard.path].T
-    own = group_of[tx] == heard.scan % groups  # what the others would have heard from there they did not
+    echoes = simulate(ring, room, pose.reshape(-1, 3), stamps=time.reshape(-1), **settings)
+    tx, rx = ring.paths[echoes.path].T
+    fired = group_of[tx] == echoes.scan % groups  # the simulation of each group contains all transmitters
     part = Log.from_echoes(
-        heard.scan[own] // groups,
-        tx[own],
-        rx[own],
-        heard.range[own],
-        amplitude=heard.amplitude[own],
+        echoes.scan[fired] // groups,
+        tx[fired],
+        rx[fired],
+        echoes.range[fired],
+        amplitude=echoes.amplitude[fired],
         stamp=np.asarray(stamps),
         pose=np.asarray(poses),
     )
@@ -96,14 +96,15 @@ def _group_of(ring: Ring) -> Int[np.ndarray, " sensors"]:
 
 
 def _check_log(log: Log, ring: Ring) -> None:
+    """Raise a SonarError for sensors, numbers and poses that the protocol cannot carry."""
     for column in (log.tx, log.rx):
         if len(column) and column.max() >= ring.count:
             echo = int(np.argmax(column >= ring.count))
             place = f"log: scan {log.scan[log.echo_scan[echo]]}"
             raise SonarError(f"{place}: sensor {column[echo]} came; allowed with this ring is 0 to {ring.count - 1}")
-    wrong = (log.scan < 0) | (log.scan >= LARGEST["scan"])
+    wrong = (log.scan < 0) | (log.scan >= NUMBER_LIMITS["scan"])
     if wrong.any():
-        allowed = f"0 to {LARGEST['scan'] - 1}"
+        allowed = f"0 to {NUMBER_LIMITS['scan'] - 1}"
         raise SonarError(f"log: scan {log.scan[wrong][0]} came; allowed for a device is {allowed}")
     far = (np.abs(log.pose) > [MAX_POSITION, MAX_POSITION, MAX_ANGLE]).any(axis=1)
     if far.any():
@@ -113,7 +114,7 @@ def _check_log(log: Log, ring: Ring) -> None:
 
 
 def _group_times(ring: Ring, stamps: Float[np.ndarray, " scans"]) -> Float[np.ndarray, "scans groups"]:
-    """When every group fires, seconds."""
+    """Time at which each group fires, seconds."""
     groups = len(ring.firing_groups)
     firing = 2 * ring.max_range / REFERENCE_SPEED_OF_SOUND
     if np.isnan(stamps).all():
@@ -130,21 +131,21 @@ def _group_times(ring: Ring, stamps: Float[np.ndarray, " scans"]) -> Float[np.nd
 def _group_poses(
     poses: Float[np.ndarray, "scans 3"], time: Float[np.ndarray, "scans groups"]
 ) -> Float[np.ndarray, "scans groups 3"]:
-    """Poses at the times of the groups, those of the last groups given; NaN in scans that have none."""
-    there = ~np.isnan(poses[:, 0])
-    if not there.any():
+    """Interpolated poses of the groups; the given poses belong to the last groups. NaN for scans without a pose."""
+    has_pose = ~np.isnan(poses[:, 0])
+    if not has_pose.any():
         return np.full((*time.shape, 3), np.nan)
-    known, at = poses[there], time[there, -1]
+    known, at = poses[has_pose], time[has_pose, -1]
     unwrapped = np.column_stack([known[:, :2], np.unwrap(known[:, 2])])
     pose = np.stack([np.interp(time, at, column) for column in unwrapped.T], axis=-1)
     pose[..., 2] = wrap_angle(pose[..., 2])
-    pose[:, -1] = poses  # to the last bit
-    pose[~there] = np.nan
+    pose[:, -1] = poses  # without rounding
+    pose[~has_pose] = np.nan
     return pose
 
 
 def _echoes(log: Log) -> np.ndarray:
-    """The log's echoes as a device writes them, in the log's order."""
+    """The echoes in the format of the protocol, in the order of the log."""
     echoes = np.empty(len(log.tx), dtype=ECHO)
     order = np.lexsort([log.range, log.rx, log.tx, log.echo_scan])
     same = np.ones(len(order), dtype=bool)
@@ -154,8 +155,10 @@ def _echoes(log: Log) -> np.ndarray:
     first = np.maximum.accumulate(np.where(same, 0, np.arange(len(order))))
     number = np.empty(len(order), dtype=np.int64)
     number[order] = np.arange(len(order)) - first  # nearest first
-    if len(number) and number.max() >= LARGEST["echo"]:
-        raise SonarError(f"log: {number.max() + 1} echoes of one path in one scan; allowed are up to {LARGEST['echo']}")
+    if len(number) and number.max() >= NUMBER_LIMITS["echo"]:
+        raise SonarError(
+            f"log: {number.max() + 1} echoes of one path in one scan; allowed are up to {NUMBER_LIMITS['echo']}"
+        )
     echoes["tx"], echoes["rx"], echoes["echo"], echoes["flags"] = log.tx, log.rx, number, 0
     with np.errstate(over="ignore", under="ignore"):
         echoes["time_us"] = log.range * (2e6 / REFERENCE_SPEED_OF_SOUND)
@@ -175,7 +178,7 @@ def _messages(
     pose: Float[np.ndarray, "scans poses 3"],
     temperature: float,
 ) -> Iterator[Message]:
-    """One scan after the other; a scan's first groups have a pose each, as many as there are poses."""
+    """Messages scan by scan; the first groups of a scan have one pose each, as many as there are poses."""
     scans, groups = time.shape
     key = log.echo_scan * groups + group_of[log.tx]
     order = np.argsort(key, kind="stable")
@@ -184,18 +187,18 @@ def _messages(
     time_us = np.round(time * 1e6).astype(np.int64).tolist()
     numbers, poses = log.scan.tolist(), pose.tolist()
 
-    def one_by_one() -> Iterator[Message]:
-        sequence, placed = 0, False
+    def messages() -> Iterator[Message]:
+        sequence, pose_valid = 0, False
         for i in range(scans):
             for k in range(groups):
                 if k < len(poses[i]):
                     known = poses[i][k][0] == poses[i][k][0]  # not NaN
-                    if known or placed:  # an unknown one is sent once, so that no earlier one holds
+                    if known or pose_valid:  # an unknown pose is sent once, to invalidate the previous one
                         yield Pose(sequence % 2**32, time_us[i][k], *poses[i][k])
                         sequence += 1
-                    placed = known
+                    pose_valid = known
                 part = echoes[start[i * groups + k] : start[i * groups + k + 1]]
                 yield Group(sequence % 2**32, time_us[i][k], numbers[i], k, groups, temperature, part)
                 sequence += 1
 
-    return one_by_one()
+    return messages()

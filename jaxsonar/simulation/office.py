@@ -1,4 +1,4 @@
-"""The embedded office: a room of our own in the spirit of the paper's figures, and 17 poses in it (section 5)."""
+"""The embedded office: a floor plan similar to the paper's figures, with 17 poses (section 5)."""
 
 from importlib.resources import as_file, files
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from jaxsonar.simulation.poses_csv import load_poses
 
 
 class Office(NamedTuple):
-    """The room, the robot's way through it, and the paper's ring."""
+    """The paper's ring, the room, and the trajectory of the robot."""
 
     ring: Ring
     room: Room
@@ -25,7 +25,7 @@ class Office(NamedTuple):
 
 
 def load_office() -> Office:
-    """The office as it is shipped: walls up to 2 m from the first pose, recesses, and a chair back-rest."""
+    """Load the office from the package: walls within 2 m of the first pose, recesses, and a chair back-rest."""
     folder = files("jaxsonar") / "data"
     with as_file(folder / "office.geojson") as room, as_file(folder / "office-path.csv") as path:
         return Office(load_ring("faw"), load_room(room), *load_poses(path))

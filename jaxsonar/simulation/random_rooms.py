@@ -1,4 +1,4 @@
-"""Random rooms, and poses in rooms: what simulations are run on so that no result hangs on one room."""
+"""Random rooms and random poses in rooms, for results that do not depend on one room."""
 
 import numpy as np
 from jaxtyping import Float
@@ -16,54 +16,54 @@ def random_room(
     segment: float = 0.4,
     pole: float = 0.3,
 ) -> Room:
-    """A closed room 3 to 6 m across with 4 to 7 walls, at any angle, in which a ring of 2 m range finds walls.
+    """A random closed room, 3 to 6 m wide, with 4 to 7 walls in any orientation; a ring of 2 m range detects walls.
 
-    Half of the rooms are rectangles, turned at random; the others are polygons without parallel walls.
+    Half of the rooms are rectangles with a random rotation. The others are polygons without parallel walls.
 
     Args:
-        rng: source of randomness; the same state gives the same room.
+        rng: random generator; the same state gives the same room.
         recess: probability that one wall has a recess (a door, 0.6 to 1 m wide).
-        box: probability that a box (0.3 to 0.6 m) stands in the room.
-        segment: probability that a free-standing segment (0.3 to 0.8 m) stands in the room.
-        pole: probability that a pole stands in the room.
+        box: probability that the room contains a box (0.3 to 0.6 m).
+        segment: probability that the room contains a free-standing wall (0.3 to 0.8 m).
+        pole: probability that the room contains a pole.
     """
     while True:
         outline = _rectangle(rng.uniform(3.0, 5.0, 2)) if rng.random() < 0.5 else _polygon(rng)
         if rng.random() < recess:
             outline = _with_recess(rng, outline)
         turn = rng.uniform(-np.pi, np.pi)
-        outline = _placed(outline, rng.uniform(-1.0, 1.0, 2), turn)
-        shell = _loop(outline)
+        outline = _moved(outline, rng.uniform(-1.0, 1.0, 2), turn)
+        shell = _closed_walls(outline)
         names = tuple(f"wall {k}" for k in range(len(shell)))
         parts, poles = [shell], np.zeros((0, 2))
         low, high = outline.min(0), outline.max(0)
         if rng.random() < box:
-            parts.append(_loop(_placed(_rectangle(rng.uniform(0.3, 0.6, 2)), rng.uniform(low, high), turn)))
+            parts.append(_closed_walls(_moved(_rectangle(rng.uniform(0.3, 0.6, 2)), rng.uniform(low, high), turn)))
             names += ("box",) * 4
         if rng.random() < segment:
             half = rng.uniform(0.15, 0.4)
             ends = np.array([[-half, 0.0], [half, 0.0]])
-            parts.append(_placed(ends, rng.uniform(low, high), rng.uniform(-np.pi, np.pi))[None])
+            parts.append(_moved(ends, rng.uniform(low, high), rng.uniform(-np.pi, np.pi))[None])
             names += ("segment",)
         if rng.random() < pole:
             poles = rng.uniform(low, high, (1, 2))
         room = Room(np.concatenate(parts), names, poles)
-        if _sound(room, len(shell), rng):
+        if _is_usable(room, len(shell), rng):
             return room
 
 
 def random_pose(rng: np.random.Generator, room: Room, *, clearance: float = 0.45) -> Float[np.ndarray, " 3"]:
-    """A pose (x, y, theta) inside a closed room, metres and radians, world_from_robot.
+    """A random pose inside a closed room: world_from_robot x, y (metres), theta (radians).
 
-    Inside means that walls are met in all directions; this works whatever stands in the room.
+    A point is inside if rays in all directions meet a wall; this also works with obstacles in the room.
 
     Args:
-        rng: source of randomness.
-        room: the walls around.
-        clearance: least distance of the robot's centre from any wall or pole, metres.
+        rng: random generator.
+        room: the floor plan.
+        clearance: smallest distance of the robot's center from any wall or pole, metres.
 
     Raises:
-        SonarError: no such place was found: the room is open or too small.
+        SonarError: no such pose was found, because the room is open or too small.
     """
     if not (np.isfinite(clearance) and clearance >= 0):
         raise SonarError(f"random_pose: clearance {clearance:g} m; allowed is 0 or more")
@@ -76,7 +76,7 @@ def random_pose(rng: np.random.Generator, room: Room, *, clearance: float = 0.45
 
 
 def _free(room: Room, points: np.ndarray, clearance: float) -> np.ndarray:
-    """Which points lie inside, with walls in every one of 64 directions, and clear of everything."""
+    """Points inside the room, with a wall in each of 64 directions, and with this clearance (metres)."""
     inside = (point_to_segments(points, room.walls) >= clearance).all(axis=1)
     inside &= (np.linalg.norm(points[:, None] - room.poles, axis=-1) >= clearance).all(axis=1)
     kept = np.flatnonzero(inside)
@@ -89,8 +89,8 @@ def _free(room: Room, points: np.ndarray, clearance: float) -> np.ndarray:
     return inside
 
 
-def _sound(room: Room, shell: int, rng: np.random.Generator) -> bool:
-    """Whether a random room is of use: nothing crosses, obstacles stand inside, and a robot finds a place."""
+def _is_usable(room: Room, shell: int, rng: np.random.Generator) -> bool:
+    """Whether a random room is usable: no walls cross, obstacles are inside, and there is free space for a robot."""
     share_a, share_b = crossings(room.walls, room.walls)
     inner = (share_a > 1e-6) & (share_a < 1 - 1e-6) & (share_b > 1e-6) & (share_b < 1 - 1e-6)
     if inner.any() or (np.ptp(room.walls[:shell], axis=(0, 1)) > 7.0).any():
@@ -104,11 +104,12 @@ def _sound(room: Room, shell: int, rng: np.random.Generator) -> bool:
 
 
 def _rectangle(size: np.ndarray) -> np.ndarray:
+    """Corners of a rectangle around the origin, counter-clockwise."""
     return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * size / 2
 
 
 def _polygon(rng: np.random.Generator) -> np.ndarray:
-    """A polygon around the origin with 4 to 7 corners, counter-clockwise; star-shaped, hence simple."""
+    """A simple (star-shaped) polygon around the origin with 4 to 7 corners, counter-clockwise."""
     count = int(rng.integers(4, 8))
     angle = 2 * np.pi * (np.arange(count) + rng.uniform(-0.25, 0.25, count)) / count
     radius = rng.uniform(1.8, 2.9, count)
@@ -116,7 +117,7 @@ def _polygon(rng: np.random.Generator) -> np.ndarray:
 
 
 def _with_recess(rng: np.random.Generator, outline: np.ndarray) -> np.ndarray:
-    """The outline with a rectangular niche behind the middle of one wall, where the wall is long enough."""
+    """The outline with a rectangular recess in the middle of one wall, if that wall is long enough."""
     k = int(rng.integers(len(outline)))
     start, end = outline[k], outline[(k + 1) % len(outline)]
     length = np.linalg.norm(end - start)
@@ -130,10 +131,12 @@ def _with_recess(rng: np.random.Generator, outline: np.ndarray) -> np.ndarray:
     return np.concatenate([outline[: k + 1], niche, outline[k + 1 :]])
 
 
-def _loop(outline: np.ndarray) -> np.ndarray:
+def _closed_walls(outline: np.ndarray) -> np.ndarray:
+    """Walls between consecutive corners."""
     return np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
 
 
-def _placed(points: np.ndarray, at: np.ndarray, turn: float) -> np.ndarray:
+def _moved(points: np.ndarray, at: np.ndarray, turn: float) -> np.ndarray:
+    """Points after a rotation about the origin and a translation."""
     cos, sin = np.cos(turn), np.sin(turn)
     return at + points @ np.array([[cos, sin], [-sin, cos]])

@@ -1,4 +1,4 @@
-"""What wheels say of a robot's way: simulated odometry, wrong by a random walk and by what is wrong for good."""
+"""Simulated wheel odometry with random walk errors and systematic scale errors."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,8 +6,8 @@ from jaxtyping import Float
 from jaxsonar.geometry.se2 import relative, wrap_angle
 from jaxsonar.hardware.errors import SonarError
 
-ACROSS = 0.5
-"""Sideways error of a step, as a share of that along it: wheels roll along and slip across."""
+LATERAL_RATIO = 0.5
+"""Standard deviation of the lateral error of a step relative to its longitudinal error. Chosen by hand."""
 
 
 def simulate_odometry(
@@ -19,25 +19,25 @@ def simulate_odometry(
     turn_scale: float = 0.0,
     seed: int = 0,
 ) -> Float[np.ndarray, "scans 3"]:
-    """The poses that odometry would report: it begins where the robot does, and drifts.
+    """Poses by odometry, starting at the first true pose.
 
-    The errors of the steps are independent (``step_sd``), so that the drift does not depend on how a way is divided
-    into steps. The same arguments give the same poses.
+    The errors of the steps are independent, with variances proportional to the length (``odometry_step_sd``). The drift
+    therefore does not depend on the division of a trajectory into steps. The same arguments give the same poses.
 
     Args:
-        poses: world_from_robot (x, y, theta) as it is, metres and radians.
-        distance: standard deviation of the way after one metre, metres; it grows with the root of the way. After one
-            radian of turning the heading is wrong by as many radians, besides ``turn``.
-        turn: standard deviation of the heading after one metre, radians; it grows with the root of the way.
-        scale: by which every way is too long, relative: wheels smaller than believed.
-        turn_scale: by which every turn is too far, relative: a track wider than believed.
-        seed: of the errors.
+        poses: true world_from_robot (x, y, theta), metres and radians.
+        distance: standard deviation of the distance after one metre, metres; grows with the square root of the
+            distance. It is also the standard deviation of the heading after one radian of rotation, besides ``turn``.
+        turn: standard deviation of the heading after one metre, radians; grows with the square root of the distance.
+        scale: relative error of all distances; positive for wheels that are smaller than assumed.
+        turn_scale: relative error of all rotations; positive for a track that is wider than assumed.
+        seed: seed of the errors.
 
     Returns:
         world_from_robot by odometry, (scans, 3), headings in [-pi, pi).
 
     Raises:
-        SonarError: a value out of range, named with what is allowed.
+        SonarError: a value out of range; the message names it and the allowed range.
     """
     limits = {"distance": (distance, 0.0, 10.0), "turn": (turn, 0.0, 10.0)}
     limits |= {"scale": (scale, -0.9, 10.0), "turn_scale": (turn_scale, -0.9, 10.0), "seed": (seed, 0, np.inf)}
@@ -50,18 +50,18 @@ def simulate_odometry(
     if len(poses) < 2:
         return poses.copy()
     steps = relative(poses[:-1], poses[1:])
-    error = odometry_step_sd(poses, distance=distance, turn=turn) * np.random.default_rng(seed).standard_normal(
-        steps.shape
-    )
-    way = np.linalg.norm(steps[:, :2], axis=-1, keepdims=True)
-    along = np.divide(steps[:, :2], way, out=np.zeros((len(steps), 2)), where=way > 0)
+    sd = odometry_step_sd(poses, distance=distance, turn=turn)
+    error = sd * np.random.default_rng(seed).standard_normal(steps.shape)
+    length = np.linalg.norm(steps[:, :2], axis=-1, keepdims=True)
+    along = np.divide(steps[:, :2], length, out=np.zeros((len(steps), 2)), where=length > 0)
     across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
-    told = steps[:, :2] * (1 + scale) + along * error[:, :1] + across * error[:, 1:2]
+    measured = steps[:, :2] * (1 + scale) + along * error[:, :1] + across * error[:, 1:2]
     heading = poses[0, 2] + np.cumsum(np.append(0.0, steps[:, 2] * (1 + turn_scale) + error[:, 2]))
     cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
-    moved = np.stack([cos * told[:, 0] - sin * told[:, 1], sin * told[:, 0] + cos * told[:, 1]], axis=-1)
-    place = poses[0, :2] + np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
-    return np.column_stack([place, wrap_angle(heading)])
+    x, y = measured.T
+    displacement = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    position = poses[0, :2] + np.concatenate([np.zeros((1, 2)), np.cumsum(displacement, axis=0)])
+    return np.column_stack([position, wrap_angle(heading)])
 
 
 def odometry_step_sd(
@@ -71,10 +71,10 @@ def odometry_step_sd(
 
     Args:
         poses: world_from_robot (x, y, theta), metres and radians.
-        distance: as for ``drifted``.
-        turn: as for ``drifted``.
+        distance: as for ``simulate_odometry``.
+        turn: as for ``simulate_odometry``.
     """
     steps = relative(poses[:-1], poses[1:])
-    way, turned = np.linalg.norm(steps[:, :2], axis=-1), np.abs(steps[:, 2])
-    along = distance * np.sqrt(way)
-    return np.stack([along, ACROSS * along, np.sqrt(turn**2 * way + distance**2 * turned)], axis=-1)
+    length, rotation = np.linalg.norm(steps[:, :2], axis=-1), np.abs(steps[:, 2])
+    along = distance * np.sqrt(length)
+    return np.stack([along, LATERAL_RATIO * along, np.sqrt(turn**2 * length + distance**2 * rotation)], axis=-1)

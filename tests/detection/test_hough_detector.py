@@ -274,7 +274,7 @@ def primitives(jaxpr):
 
 def test_one_jitted_step_from_echoes_to_cells(faw_ring):
     """Votes, low pass and threshold are one program: no call of the host in it, cells and points come out."""
-    echoes = kernels.Echoes(jnp.zeros((2, 64), jnp.int32), jnp.full((2, 64), jnp.nan, jnp.float32))
+    echoes = kernels.PackedEchoes(jnp.zeros((2, 64), jnp.int32), jnp.full((2, 64), jnp.nan, jnp.float32))
     step = partial(kernels.vote, settings=HoughSettings())
     program = jax.make_jaxpr(step)(arc_tables(faw_ring, HoughSettings()).arcs, echoes)
     came = [(out.shape, str(out.dtype)) for out in program.out_avals]

@@ -5,7 +5,7 @@ import pytest
 
 from jaxsonar import SonarError
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
-from jaxsonar.simulation.wheel_odometry import ACROSS, simulate_odometry, odometry_step_sd
+from jaxsonar.simulation.wheel_odometry import LATERAL_RATIO, simulate_odometry, odometry_step_sd
 
 
 def straight(metres, steps):
@@ -55,7 +55,7 @@ def test_the_walk_grows_with_the_root_of_the_way(steps):
     parts = 2000
     poses = straight(9.0 * parts, steps * parts)
     off = errors_of_parts(poses, steps, distance=0.02, turn=0.0)
-    np.testing.assert_allclose(off.std(axis=0), [0.06, 0.06 * ACROSS, 0], rtol=0.08)
+    np.testing.assert_allclose(off.std(axis=0), [0.06, 0.06 * LATERAL_RATIO, 0], rtol=0.08)
     np.testing.assert_allclose(off.mean(axis=0), 0, atol=0.006)
     off = errors_of_parts(poses, steps, distance=0.0, turn=0.01)
     np.testing.assert_allclose(off[:, 2].std(), 0.03, rtol=0.08)
@@ -83,7 +83,7 @@ def test_what_is_wrong_for_good(rng):
 def test_standard_deviations_are_those_of_the_steps(rng):
     poses = np.concatenate([straight(0.25, 1), [[0.25, 0.0, 0.4]]])
     sd = odometry_step_sd(poses, distance=0.02, turn=0.1)
-    np.testing.assert_allclose(sd, [[0.01, 0.01 * ACROSS, 0.05], [0, 0, 0.02 * np.sqrt(0.4)]])
+    np.testing.assert_allclose(sd, [[0.01, 0.01 * LATERAL_RATIO, 0.05], [0, 0, 0.02 * np.sqrt(0.4)]])
 
 
 @pytest.mark.parametrize(
