@@ -9,20 +9,20 @@ from .geometry import normal, rotate, wrap_angle
 
 
 class SensorArray(eqx.Module):
-    """What the kernels know of a ring. Every field is a leaf: change a pose and nothing is compiled anew."""
+    """A ring of sensors. Every field is a leaf: no program is compiled again when a value changes."""
 
     position: Float[Array, "sensors 2"]
     """Mounting positions, robot frame, metres."""
     heading: Float[Array, " sensors"]
-    """Directions the sensors look to, radians counter-clockwise from x."""
+    """Directions of the sensors' axes, radians counter-clockwise from x."""
     beam: Float[Array, " sensors"]
-    """Full detection cones, radians."""
+    """Full opening angles of the detection cones, radians."""
     range_offset: Float[Array, " sensors"]
-    """What each sensor reports too much, metres."""
+    """Constant error of each sensor's ranges, metres: positive if they are reported too long."""
     range_scale: Float[Array, ""]
-    """Speed of sound over the speed that the reported ranges assume."""
+    """Speed of sound divided by the speed that the reported ranges assume."""
     max_range: Float[Array, ""]
-    """Half path length up to which an echo counts, metres."""
+    """Half path length beyond which echoes are ignored, metres."""
     tx: Int[Array, " paths"]
     """Transmitter of each echo path."""
     rx: Int[Array, " paths"]
@@ -30,37 +30,37 @@ class SensorArray(eqx.Module):
 
 
 class EchoPaths(eqx.Module):
-    """Geometry of one echo path, or of all of them with a leading axis."""
+    """Geometry of one transmitter-receiver pair, or of all of them with a leading axis."""
 
     midpoint: Float[Array, "*paths 2"]
     """The virtual sensor: midpoint of tx and rx, robot frame, metres."""
     half_baseline: Float[Array, "*paths 2"]
-    """Half the way from tx to rx, metres; zero for a direct path."""
+    """Half the vector from tx to rx, metres; zero for a direct path."""
     start: Float[Array, "*paths"]
-    """First direction from which a plane is heard, radians."""
+    """First direction of the detection range of planes, radians."""
     width: Float[Array, "*paths"]
     """Width of the detection range, radians, counter-clockwise from start; 0 where the cones do not overlap."""
     range_offset: Float[Array, "*paths"]
-    """Metres that the path reports too much: the mean of its two sensors."""
+    """Constant error of the path's ranges, metres: the mean of its two sensors."""
     axes: Float[Array, "*paths 2 2"]
-    """Unit vectors along which tx and rx look."""
+    """Unit vectors along the axes of tx and rx."""
     cone: Float[Array, "*paths 2"]
     """Squared chord between the axis and the border of the cones of tx and rx: 4 sin(beam / 4)^2, 0 to 2."""
 
 
 def chord_squared(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Squared distance of two unit vectors this angle apart (radians, at most pi counts), without cancellation."""
+    """Squared distance of two unit vectors at this angle (radians, at most pi), without cancellation."""
     return 4 * jnp.sin(jnp.minimum(angle, jnp.pi) / 2) ** 2
 
 
 def widen_cones(paths: EchoPaths, factor: float) -> EchoPaths:
-    """The same paths with wider cones, half a plane at most: for sensors that look elsewhere than they should."""
+    """Return the same paths with detection cones that are wider by a factor, but not wider than half the plane."""
     half_beam = jnp.minimum(factor * 2 * jnp.arcsin(jnp.sqrt(paths.cone) / 2), jnp.pi / 2)
     return eqx.tree_at(lambda p: p.cone, paths, chord_squared(half_beam))
 
 
 def transform_path(path: EchoPaths, pose: Float[Array, "3"]) -> EchoPaths:
-    """ONE echo path as seen from a frame in which the robot stands at the pose: x, y (metres), theta (radians)."""
+    """Transform ONE echo path from the robot frame to the parent frame of a pose x, y (metres), theta (radians)."""
     return EchoPaths(
         midpoint=pose[:2] + rotate(path.midpoint, pose[2]),
         half_baseline=rotate(path.half_baseline, pose[2]),
@@ -77,7 +77,7 @@ def echo_paths(sensors: SensorArray) -> EchoPaths:
     """Geometry of every echo path of a ring, in the order of ``sensors.tx``."""
 
     def one_path(tx: Int[Array, ""], rx: Int[Array, ""]) -> EchoPaths:
-        # A plane echo reaches rx only from a direction in both cones: intersect them around the heading of tx.
+        # The echo of a plane reaches rx only from a direction in both cones: intersect them, relative to tx.
         turn = wrap_angle(sensors.heading[rx] - sensors.heading[tx])
         half_tx, half_rx = sensors.beam[tx] / 2, sensors.beam[rx] / 2
         first = jnp.maximum(-half_tx, turn - half_rx)

@@ -1,7 +1,8 @@
 """The accumulator: votes of tangent lines, low pass, threshold (paper, section 4).
 
-Rows are theta, columns are rho. The plane of lines has two seams, and both are kept: theta wraps around, and the column
-before rho = 0 is the first column half a turn further, because (-rho, theta) is the line (rho, theta + pi).
+Rows are theta, columns are rho. The parameter space of lines has two seams, and neighborhoods extend across both:
+theta wraps around, and the column before rho = 0 is the first column shifted by half a turn, because (-rho, theta) is
+the line (rho, theta + pi).
 """
 
 from dataclasses import dataclass
@@ -15,31 +16,31 @@ from jaxtyping import Array, Bool, Float, Int, Num
 from .array_geometry import EchoPaths
 from .geometry import fold_line, wrap_angle
 
-_DIRECTIONS = 719  # samples of the full turn, in step with neither cones nor cells
+_DIRECTIONS = 719  # samples of the full turn; a prime number, so that they do not align with cones or cells
 
 
 @dataclass(frozen=True)
 class HoughSettings:
-    """What the paper leaves to choose, with its values, or ours where it gives none (paper, section 4).
+    """Parameters of the Hough transform: the values of the paper (section 4); where it has none, chosen by hand.
 
     Raises:
-        ValueError: a value out of range, named with what is allowed.
+        ValueError: a value is out of range; the message names it and the allowed values.
     """
 
     theta_cells: int = 100
-    """Cells around the full turn, an even number; 100 make the paper's 0.0628 rad."""
+    """Number of cells in theta, even; 100 give cells of 0.0628 rad (paper)."""
     rho_cells: int = 100
-    """Cells from rho = 0 outward."""
+    """Number of cells in rho, from 0 outward."""
     rho_cell: float = 0.04
     """Size of a cell in rho, metres."""
     point_pitch: float = float(np.radians(1.0))
     """Distance between the points of an arc, radians."""
     smoothing: tuple[float | int, ...] = (1.0, 2.0, 1.0)
-    """Taps of the low pass, applied along theta and along rho, an odd number of them; normalised to sum 1."""
+    """Taps of the low pass along theta and along rho, an odd number; they are normalized to the sum 1."""
     threshold: float = 0.2
-    """Occupancy a cell must exceed, as a fraction of the points that a fully seen wall puts into its cell."""
+    """Occupancy that a cell must exceed, as a fraction of the votes of a fully visible wall."""
     min_echoes: int = 3
-    """Echoes that a line must have: two determine it, a third confirms it."""
+    """Smallest number of echoes of a line: two determine it, a third confirms it."""
 
     def __post_init__(self):
         allowed = {
@@ -84,7 +85,7 @@ class HoughSettings:
 
 
 def theta_row(theta: Float[Array, "*lines"], settings: HoughSettings) -> Int[Array, "*lines"]:
-    """Row of the accumulator that holds the direction theta (radians, any turn)."""
+    """Row of the accumulator for the direction theta (radians, not necessarily wrapped)."""
     row = jnp.floor((wrap_angle(theta) + jnp.pi) / settings.theta_cell).astype(jnp.int32)
     return jnp.minimum(row, settings.theta_cells - 1)  # rounding just below pi
 
@@ -92,24 +93,24 @@ def theta_row(theta: Float[Array, "*lines"], settings: HoughSettings) -> Int[Arr
 def cell_of(
     rho: Float[Array, "*lines"],
     row: Int[Array, "*lines"],
-    counts: Bool[Array, "*lines"],
+    exists: Bool[Array, "*lines"],
     settings: HoughSettings,
 ) -> Int[Array, "*lines"]:
     """Flat index row * rho_cells + column of each line's cell, from its distance (any sign) and its row.
 
-    Lines that do not count and lines beyond the accumulator get the index one past the last cell.
+    Lines that do not exist and lines beyond the accumulator get the index one past the last cell.
     """
     turned = row + settings.theta_cells // 2  # (-rho, theta) is (rho, theta + pi)
     turned = jnp.where(turned < settings.theta_cells, turned, turned - settings.theta_cells)
     row = jnp.where(rho < 0, turned, row)
     column = jnp.floor(jnp.abs(rho) / settings.rho_cell)
-    inside = counts & (column < settings.rho_cells)
+    inside = exists & (column < settings.rho_cells)
     column = jnp.where(inside, column, 0).astype(jnp.int32)
     return jnp.where(inside, row * settings.rho_cells + column, settings.cells)
 
 
 def accumulate(cells: Int[Array, "*lines"], settings: HoughSettings) -> Int[Array, "theta rho"]:
-    """Number of points in each cell. Whole numbers, so the order of votes, and the device, cannot matter."""
+    """Number of points in each cell. The votes are integers, so that their order and the device do not matter."""
     votes = jnp.zeros(settings.cells + 1, jnp.int32).at[cells.ravel()].add(1, mode="promise_in_bounds")
     return votes[:-1].reshape(settings.theta_cells, settings.rho_cells)
 
@@ -120,10 +121,10 @@ def soft_accumulate(
     weight: Float[Array, "*lines"],
     settings: HoughSettings,
 ) -> Float[Array, "theta rho"]:
-    """Weighted votes, each shared by the four cells around it: differentiable in rho, theta and weight.
+    """Weighted votes by bilinear interpolation: differentiable in rho, theta and weight.
 
-    The votes of a line sum to its weight. A cell's centre gets all of it, so that ``accumulate`` is the limit of lines
-    that lie on cell centres.
+    The votes of a line in the four cells around it sum to its weight. A line at the centre of a cell votes for this
+    cell only, as in ``accumulate``.
     """
     rows, columns = settings.theta_cells, settings.rho_cells
     rho, theta = fold_line(rho, theta)
@@ -137,7 +138,7 @@ def soft_accumulate(
             r = (first_row + down).astype(jnp.int32)
             c = (first_column + right).astype(jnp.int32)
             share = weight * (1 - jnp.abs(row - first_row - down)) * (1 - jnp.abs(column - first_column - right))
-            r = jnp.where(c < 0, r + rows // 2, r) % rows  # before rho = 0 the same line lies half a turn further
+            r = jnp.where(c < 0, r + rows // 2, r) % rows  # before rho = 0 the same line is half a turn further
             c = jnp.where(c < 0, -1 - c, c)
             index = jnp.where(c < columns, r * columns + c, rows * columns)
             votes = votes.at[index].add(share, mode="promise_in_bounds")
@@ -145,11 +146,11 @@ def soft_accumulate(
 
 
 def lowpass(votes: Num[Array, "theta rho"], settings: HoughSettings) -> Float[Array, "theta rho"]:
-    """Two-dimensional low pass, to balance between neighbor cells; beyond the last column there are no votes."""
+    """Two-dimensional low pass across both seams (paper, section 4); beyond the last column there are no votes."""
     taps = (np.asarray(settings.smoothing) / np.sum(settings.smoothing)).tolist()
     half, (rows, columns) = len(taps) // 2, votes.shape
     smooth = jnp.asarray(votes, jnp.float32)
-    # Along theta, then along rho, each over one array in memory, so that each is one loop.
+    # Along theta, then along rho, each on one padded array, so that XLA compiles each to one loop.
     wide = jnp.zeros((rows + 2 * half, columns)).at[half : half + rows].set(smooth)
     wide = wide.at[:half].set(smooth[rows - half :]).at[half + rows :].set(smooth[:half])
     smooth = sum((tap * wide[k : k + rows] for k, tap in enumerate(taps)), start=jnp.zeros(()))
@@ -159,14 +160,14 @@ def lowpass(votes: Num[Array, "theta rho"], settings: HoughSettings) -> Float[Ar
 
 
 def _before(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "theta width"]:
-    """So many columns before the first one: (-rho, theta) is (rho, theta + pi)."""
+    """The columns before the first one: (-rho, theta) is (rho, theta + pi)."""
     return jnp.roll(cells[:, :width][:, ::-1], len(cells) // 2, axis=0)
 
 
 def extend_across_seams(cells: Float[Array, "theta rho"], width: int) -> Float[Array, "rows columns"]:
-    """An accumulator with this many more cells on every side: what touches across both seams; 0 beyond the last column.
+    """An accumulator with this many more cells on every side: neighbors across both seams; 0 beyond the last column.
 
-    One array in memory, so that what reads it with all its neighbors is one loop.
+    It is one array in memory, so that XLA compiles an operation on neighborhoods to one loop.
     """
     rows, columns = cells.shape
     before = _before(cells, width)
@@ -177,50 +178,50 @@ def extend_across_seams(cells: Float[Array, "theta rho"], width: int) -> Float[A
 
 @partial(jax.jit, static_argnames="settings")
 def full_wall_votes(paths: EchoPaths, settings: HoughSettings) -> Float[Array, ""]:
-    """Points that a fully seen wall puts into its cell: the unit of the threshold.
+    """Votes of a fully visible wall in its cell: the unit of the threshold.
 
-    The paths that hear it times the points that an arc has in one cell. So the threshold depends neither on the point
-    pitch nor on the ring.
+    It is the number of paths that receive the wall times the number of points that an arc has in one cell. So the
+    threshold depends neither on the point pitch nor on the ring.
     """
     return votes_of_paths(full_wall_paths(paths), settings)
 
 
 def votes_of_paths(paths: Float[Array, ""], settings: HoughSettings) -> Float[Array, ""]:
-    """Points that so many paths put into the cell of a wall that all of them hear."""
+    """Votes in the cell of a wall that this many paths receive."""
     return paths * settings.theta_cell / settings.point_pitch
 
 
 @jax.jit
 def full_wall_paths(paths: EchoPaths) -> Float[Array, ""]:
-    """Number of paths that hear a wide plane in a given direction, averaged over the directions that any path hears."""
+    """Number of paths that receive a wide plane: the mean over all directions in which any path receives it."""
     directions = (jnp.arange(_DIRECTIONS, dtype=paths.width.dtype) + 0.5) * (2 * jnp.pi / _DIRECTIONS)
-    heard = jnp.mod(directions[:, None] - paths.start[None, :], 2 * jnp.pi) < paths.width[None, :]
-    covered = jnp.maximum(heard.any(axis=1).mean(), 1 / _DIRECTIONS) * 2 * jnp.pi
+    received = jnp.mod(directions[:, None] - paths.start[None, :], 2 * jnp.pi) < paths.width[None, :]
+    covered = jnp.maximum(received.any(axis=1).mean(), 1 / _DIRECTIONS) * 2 * jnp.pi
     return paths.width.sum() / covered
 
 
 def peaks(
     smooth: Float[Array, "theta rho"], level: Float[Array, ""], *, size: int, settings: HoughSettings
 ) -> tuple[Float[Array, " size"], Float[Array, " size"]]:
-    """The highest maxima of an accumulator after the low pass, as lines (rho, theta), both seams kept.
+    """The highest local maxima of an accumulator after the low pass, as lines (rho, theta).
 
     Args:
         smooth: occupancies.
-        level: a maximum must be higher.
-        size: of the result; NaN where there are fewer.
+        level: smallest occupancy of a maximum.
+        size: number of maxima in the result; NaN where there are fewer.
         settings: of the accumulator.
 
     Returns:
-        rho, theta: centres of gravity of the occupancy around each maximum, metres and radians.
+        rho, theta: centroids of the occupancy in the 3 x 3 cells around each maximum, metres and radians.
     """
     rows, columns = smooth.shape
     wide = extend_across_seams(smooth, 1)
     steps = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
     around = [wide[1 + down : 1 + down + rows, 1 + right : 1 + right + columns] for down, right in steps]
     earlier, later = (reduce(jnp.maximum, neighbors) for neighbors in (around[:4], around[5:]))
-    # Of equal neighbors one is the maximum.
+    # Of equal neighbors exactly one is a maximum.
     peak = jnp.where((smooth > jnp.maximum(later, level)) & (smooth >= earlier), smooth, 0)
-    # Across rho = 0 both are before each other: the later half turn gives way.
+    # Across rho = 0 each of two neighbors precedes the other: suppress the one in the second half turn.
     first, across = peak[rows // 2 :, 0], wide[1 + rows // 2 : 1 + rows, 0]
     peak = peak.at[rows // 2 :, 0].set(jnp.where(first > across, first, 0))
     height, cell = jax.lax.top_k(peak.ravel(), size)

@@ -1,12 +1,12 @@
-"""Echo arcs: where a reflector may be that answered after a given time (paper, section 4).
+"""Isorange arcs: where the reflector of an echo with a given range can be (paper, section 4).
 
-The points at equal path length lie on a circle around the sensor (direct echo) or on an ellipse with tx and rx as foci
-(cross echo). Both have one tangent line per normal direction theta, in one closed form: with m the virtual sensor, d
-half the way from tx to rx, and n, t the unit normal and tangent,
+The points of equal path length are on a circle around the sensor (direct echo) or on an ellipse with tx and rx as foci
+(cross echo). Both have one tangent line for each direction theta of the normal, in one closed form: with the virtual
+sensor m, half the baseline d, the unit normal n and the unit tangent t,
 
     rho(theta) = m . n + sqrt(r^2 - (d . t)^2)
 
-which is the image-source range of a plane solved for rho. A circle is the case d = 0.
+which is the range of a plane (``measurement_model.plane_range``) solved for rho. A circle is the case d = 0.
 """
 
 import equinox as eqx
@@ -18,22 +18,22 @@ from .geometry import normal, safe_sqrt, tangent
 
 
 class Arc(eqx.Module):
-    """What the arcs of one echo path have in common, whatever the range: equidistant normals and their constants."""
+    """The part of the arcs of one echo path that does not depend on the range: equidistant normals and constants."""
 
     theta: Float[Array, "*paths points"]
-    """Directions of the normals, radians, not wrapped."""
+    """Directions of the normals, radians; not wrapped."""
     normal_x: Float[Array, "*paths points"]
     """Cosines of the normals."""
     normal_y: Float[Array, "*paths points"]
     """Sines of the normals."""
     midpoint_normal: Float[Array, "*paths points"]
-    """The virtual sensor's coordinate along each normal, m . n, metres."""
+    """Virtual sensor . normal, metres."""
     baseline_tangent_squared: Float[Array, "*paths points"]
-    """Square of the half baseline across each normal, (d . t)^2, square metres."""
+    """(Half baseline . tangent)^2, square metres."""
     half_baseline_squared: Float[Array, "*paths"]
-    """Square of the half baseline, square metres."""
+    """Squared length of the half baseline, square metres."""
     exists: Bool[Array, "*paths points"]
-    """Which of the points exist: a narrow detection range has fewer than the widest."""
+    """Which of the points exist: a narrow detection range has fewer points than the widest one."""
 
 
 def arc(path: EchoPaths, *, pitch: float, points: int) -> Arc:
@@ -41,9 +41,9 @@ def arc(path: EchoPaths, *, pitch: float, points: int) -> Arc:
 
     Args:
         path: the echo path.
-        pitch: wanted distance between points, radians; the range is cut into the nearest whole number of equal pieces,
-            at least one, and each piece has its point in the middle.
-        points: size of the result; a range that needs more points than this is covered by this many.
+        pitch: nominal distance between points, radians; the detection range is divided into the nearest whole number
+            of equal intervals, at least one, and each interval has its point in the middle.
+        points: size of the result, and the largest number of intervals.
     """
     whole = jnp.clip(jnp.round(path.width / pitch), 1, points)
     index = jnp.arange(points, dtype=path.width.dtype)
@@ -61,34 +61,34 @@ def arc(path: EchoPaths, *, pitch: float, points: int) -> Arc:
 
 
 def tangent_rho(
-    arc: Arc, reach: Float[Array, ""], *, max_range: Float[Array, ""]
+    arc: Arc, distance: Float[Array, ""], *, max_range: Float[Array, ""]
 ) -> tuple[Float[Array, " points"], Bool[Array, " points"]]:
     """Distances from the origin of the tangent lines at the points of ONE echo's arc.
 
-    A missing echo (0 or NaN), one at or beyond the maximum range, and one shorter than the way from tx to rx, which no
+    A missing echo (0 or NaN), an echo at or beyond the maximum range, and an echo shorter than the baseline, which no
     reflector can cause, have no lines.
 
     Args:
         arc: the arc's normals and constants.
-        reach: half the path length of the echo, metres.
-        max_range: half path length from which on there is no echo, metres.
+        distance: half the path length of the echo (its range), metres.
+        max_range: half path length from which on echoes are ignored, metres.
 
     Returns:
         rho: metres, may be negative; 0 where there is no line.
-        counts: which of the points are lines.
+        exists: which of the points have a line.
     """
-    heard = (reach < max_range) & (reach * reach > arc.half_baseline_squared) & (reach > 0)  # False for NaN
-    reach = jnp.where(heard, reach, 1)  # before the arithmetic, so that no gradient is NaN
-    rho = arc.midpoint_normal + safe_sqrt(reach * reach - arc.baseline_tangent_squared)
-    counts = arc.exists & heard
-    return jnp.where(counts, rho, 0), counts
+    valid = (distance < max_range) & (distance * distance > arc.half_baseline_squared) & (distance > 0)  # False for NaN
+    distance = jnp.where(valid, distance, 1)  # before the arithmetic, so that no gradient is NaN
+    rho = arc.midpoint_normal + safe_sqrt(distance * distance - arc.baseline_tangent_squared)
+    exists = arc.exists & valid
+    return jnp.where(exists, rho, 0), exists
 
 
-def arc_point(path: EchoPaths, reach: Float[Array, ""], theta: Float[Array, ""]) -> Float[Array, "2"]:
-    """Point of ONE echo's arc whose tangent line has the normal direction theta, robot frame, metres."""
+def arc_point(path: EchoPaths, distance: Float[Array, ""], theta: Float[Array, ""]) -> Float[Array, "2"]:
+    """Point of ONE echo's arc at which the tangent line has the normal direction theta, robot frame, metres."""
     n, t = normal(theta), tangent(theta)
     along, across = path.half_baseline @ n, path.half_baseline @ t
-    height = safe_sqrt(reach * reach - across * across)
-    # Gradient of the ellipse's support function sqrt(r^2 - (d.t)^2) + m.n with respect to the normal.
+    height = safe_sqrt(distance * distance - across * across)
+    # Gradient of the ellipse's support function m.n + sqrt(r^2 - (d.t)^2) with respect to the normal.
     slide = jnp.where(height > 0, across * along / jnp.where(height > 0, height, 1), 0)
     return path.midpoint + height * n + slide * t
