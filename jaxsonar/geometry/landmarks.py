@@ -30,12 +30,8 @@ def concatenate_landmarks(parts: Sequence[Landmarks]) -> Landmarks:
 
 def pad_landmarks(landmarks: Landmarks, rows: int) -> Landmarks:
     """The landmarks with this many rows; new rows are unused."""
-    return Landmarks(
-        kind=pad_rows(np.asarray(landmarks.kind), rows, fill=UNUSED),
-        parameters=pad_rows(np.asarray(landmarks.parameters), rows),
-        anchor=pad_rows(np.asarray(landmarks.anchor), rows),
-        extent=pad_rows(np.asarray(landmarks.extent), rows),
-    )
+    kind, *rest = _arrays(landmarks)
+    return Landmarks(pad_rows(kind, rows, fill=UNUSED), *(pad_rows(leaf, rows) for leaf in rest))
 
 
 def landmarks_from_segments(
@@ -67,27 +63,28 @@ def landmarks_from_points(kind: Int[np.ndarray, " points"], positions: Float[np.
 
 def landmark_positions(landmarks: Landmarks) -> Float[np.ndarray, "landmarks 2"]:
     """Position of each point; of each plane the footpoint of its anchor."""
-    first = landmarks.parameters[:, :1]
-    plane = (landmarks.kind == PLANE)[:, None]
-    return landmarks.anchor + np.where(plane, first * unit(landmarks.parameters[:, 1]), landmarks.parameters)
+    kind, parameters, anchor, _ = _arrays(landmarks)
+    foot = parameters[:, :1] * unit(parameters[:, 1])
+    return anchor + np.where((kind == PLANE)[:, None], foot, parameters)
 
 
 def wall_segments(landmarks: Landmarks) -> Float[np.ndarray, "landmarks 2 2"]:
     """Both end points of each plane, metres; all landmarks must be planes."""
-    tangent = tangent_of(landmarks.parameters[:, 1])
-    return landmark_positions(landmarks)[:, None] + landmarks.extent[..., None] * tangent[:, None]
+    _, parameters, _, extent = _arrays(landmarks)
+    tangent = tangent_of(parameters[:, 1])
+    return landmark_positions(landmarks)[:, None] + extent[..., None] * tangent[:, None]
 
 
 def transform_landmarks(new_from_old: Float[np.ndarray, "3"], landmarks: Landmarks) -> Landmarks:
     """The landmarks in another frame; their anchors move along."""
+    kind, parameters, anchor, extent = _arrays(landmarks)
     heading = new_from_old[2]
-    plane = (landmarks.kind == PLANE)[:, None]
-    line = landmarks.parameters + np.array([0.0, heading])
+    line, point = parameters + np.array([0.0, heading]), rotate(parameters, heading)
     return Landmarks(
-        kind=landmarks.kind,
-        parameters=np.where(plane, line, rotate(landmarks.parameters, heading)),
-        anchor=rotate(landmarks.anchor, heading) + new_from_old[:2],
-        extent=landmarks.extent,
+        kind=kind,
+        parameters=np.where((kind == PLANE)[:, None], line, point),
+        anchor=rotate(anchor, heading) + new_from_old[:2],
+        extent=extent,
     )
 
 
@@ -112,17 +109,18 @@ def transform_parameters(
         landmarks: in the old frame.
         anchor: in the new frame, one for each landmark.
     """
+    kind, parameters, own_anchor, _ = _arrays(landmarks)
     heading = np.asarray(new_from_old[2])
-    arm = rotate(landmarks.anchor, heading)
+    arm = rotate(own_anchor, heading)
     offset = arm + new_from_old[:2] - anchor
-    plane = (landmarks.kind == PLANE)[..., None]
+    plane = (kind == PLANE)[..., None]
     # Planes: the distance of the new anchor along the normal.
-    theta = landmarks.parameters[..., 1] + heading
+    theta = parameters[..., 1] + heading
     normal = unit(theta)
     along = (tangent_of(theta) * offset).sum(-1)
-    line = np.stack([landmarks.parameters[..., 0] + (normal * offset).sum(-1), wrap_angle(theta)], axis=-1)
+    line = np.stack([parameters[..., 0] + (normal * offset).sum(-1), wrap_angle(theta)], axis=-1)
     # Points: the offset from the new anchor.
-    point_arm = arm + rotate(landmarks.parameters, heading)
+    point_arm = arm + rotate(parameters, heading)
     point = point_arm + new_from_old[:2] - anchor
     by_transform = np.zeros((*theta.shape, 2, 3))
     by_transform[..., 0, :2] = np.where(plane, normal, [1.0, 0.0])
@@ -154,3 +152,9 @@ def landmarks_in_robot_frame(
     seen = transform_parameters(robot_from_frame, landmarks, np.zeros(2))
     by_pose = seen.by_transform @ relative_jacobians(pose, robot_from_frame)[0]
     return seen.parameters, np.concatenate([by_pose, seen.by_parameters], axis=-1)
+
+
+def _arrays(landmarks: Landmarks) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Kind, parameters, anchor and extent as NumPy arrays."""
+    kind, parameters = np.asarray(landmarks.kind), np.asarray(landmarks.parameters)
+    return kind, parameters, np.asarray(landmarks.anchor), np.asarray(landmarks.extent)

@@ -10,10 +10,10 @@ Design decisions:
 - Submaps instead of one filter. In a frame that starts at the robot the errors are small, so that linearization is
   valid, and the cost of a step stays constant. A submap starts with the last scan of the submap before: nothing else is
   known about its frame.
-- Echoes, not lines, correct the pose. Lines only associate echoes with walls. An echo without a line counts only if the
-  belief predicts its range to two standard deviations; otherwise a wrong landmark would fit by chance.
-- A new wall must have 0.4 of the echoes of a long wall. A wall with few echoes may be mistaken for its edge, and a wrong
-  wall rotates the robot.
+- Echoes, not lines, correct the pose. Lines only associate echoes with walls. An echo without a line counts only if
+  the belief predicts its range to two standard deviations; otherwise a wrong landmark would fit by chance.
+- A new wall must have 0.4 of the echoes of a long wall. A wall with few echoes may be mistaken for its edge, and a
+  wrong wall rotates the robot.
 - A moved robot (kidnapped) is recognized by missed detections: most sensors that face known walls receive no echo of
   them. That all features of a scan are unknown proves nothing; around a corner this is normal.
 - With pose estimation the scans are kept by submap. Free space has directions and cannot be rotated, so the evidence of

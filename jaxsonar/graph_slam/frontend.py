@@ -140,7 +140,7 @@ def predict(state: SubmapState, odometry: Float[np.ndarray, "3"], noise: Odometr
     if not measured:
         variance = variance * (1 + state.dead_reckoned)
     belief = state.belief
-    pose, covariance = propagate(belief.pose, belief.covariance, np.nan_to_num(step), np.diag(variance))
+    pose, covariance = propagate(state.pose, np.asarray(belief.covariance), np.nan_to_num(step), np.diag(variance))
     return replace(
         state,
         belief=kernels.Belief(pose, belief.landmarks, covariance),
@@ -257,7 +257,7 @@ def close_submap(state: SubmapState) -> Submap:
         landmarks=state.belief.landmarks.take(kept),
         scan_counts=state.scan_counts[kept],
         exit_pose=state.pose,
-        covariance=covariance,
+        covariance=np.asarray(covariance),
         rows=np.array(state.rows, dtype=np.int64),
         poses=np.array(state.poses).reshape(-1, 3),
         pose_covariances=np.array(state.covariances).reshape(-1, 3, 3),
@@ -289,7 +289,7 @@ def _with_extended_walls(
     for feature in np.flatnonzero((landmark >= 0) & (features.kind == kernels.PLANE)):
         wall = landmark[feature]
         segment = transform_points(np.asarray(belief.pose), features.segment[feature])
-        along = (segment - landmarks.anchor[wall]) @ tangent_of(landmarks.parameters[wall, 1])
+        along = (segment - landmarks.anchor[wall]) @ tangent_of(np.asarray(landmarks.parameters)[wall, 1])
         extent[wall] = min(extent[wall, 0], along.min()), max(extent[wall, 1], along.max())
     return replace(belief, landmarks=replace(landmarks, extent=extent))
 

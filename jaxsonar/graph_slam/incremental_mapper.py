@@ -90,9 +90,7 @@ class Mapper:
         check_merging(self.merging)
         check_window(self.window)
         if self.odometry_noise is not None and (self.window is not None or self.merging == "paper"):
-            raise SonarError(
-                "mapper: odometry_noise with a window or the paper's merging; allowed is one of them"
-            )
+            raise SonarError("mapper: odometry_noise with a window or the paper's merging; allowed is one of them")
         object.__setattr__(self, "settings", hough_settings(self.ring, self.settings, window=self.window))
 
     def start(self) -> MapState:

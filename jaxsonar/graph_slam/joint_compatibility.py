@@ -124,7 +124,7 @@ def associate_features(
     if not len(landmarks.kind) or not count:
         return FeatureAssociation(unassociated, enough_echoes)
     # Squared Mahalanobis distance of every feature from every landmark.
-    expected, jacobian = landmarks_in_robot_frame(belief.pose, landmarks)
+    expected, jacobian = landmarks_in_robot_frame(np.asarray(belief.pose), landmarks)
     expected_cov = jacobian @ _own_covariances(belief) @ jacobian.transpose(0, 2, 1)
     innovation = _innovations(features, expected)
     innovation_cov = expected_cov[None] + SETTINGS.covariance_factor * features.covariance[:, None]
@@ -157,7 +157,7 @@ def _own_covariances(belief: kernels.Belief) -> Float[np.ndarray, "landmarks 5 5
     count = len(belief.landmarks.kind)
     own = 3 + 2 * np.arange(count)[:, None] + [0, 1]
     column = np.concatenate([np.tile(np.arange(3), (count, 1)), own], axis=1)
-    return belief.covariance[column[:, :, None], column[:, None, :]]
+    return np.asarray(belief.covariance)[column[:, :, None], column[:, None, :]]
 
 
 @lru_cache(maxsize=64)
@@ -213,7 +213,9 @@ def _lies_along(belief: kernels.Belief, features: FeatureMeasurements) -> Bool[n
     """Whether the middle of a feature lies beside the observed part of a wall; true for points."""
     landmarks = belief.landmarks
     middle = transform_points(np.asarray(belief.pose), features.segment.mean(axis=1))
-    along = np.einsum("flk,lk->fl", middle[:, None] - landmarks.anchor, tangent_of(landmarks.parameters[:, 1]))
+    along = np.einsum(
+        "flk,lk->fl", middle[:, None] - landmarks.anchor, tangent_of(np.asarray(landmarks.parameters)[:, 1])
+    )
     gap = SETTINGS.wall_gap
     beside = (along > landmarks.extent[:, 0] - gap) & (along < landmarks.extent[:, 1] + gap)
     return beside | (landmarks.kind != kernels.PLANE)

@@ -28,8 +28,8 @@ def adjusted_map(world: GlobalMap, found: AdjustmentResult, cov: Float[np.ndarra
     wall, point = kept[kept < wall_count], kept[kept >= wall_count]
     walls, points = (found.state.landmark_map.landmarks.take(rows) for rows in (wall, point))
     # From (distance of the anchor, theta) to (rho, theta).
-    theta = walls.parameters[:, 1]
-    rho = walls.parameters[:, 0] + (unit(theta) * walls.anchor).sum(-1)
+    distance, theta = np.asarray(walls.parameters).T
+    rho = distance + (unit(theta) * walls.anchor).sum(-1)
     arm = (tangent_of(theta) * walls.anchor).sum(-1)
     theta_variance = cov[wall, 1, 1]
     rho_variance = cov[wall, 0, 0] + 2 * arm * cov[wall, 0, 1] + arm**2 * theta_variance

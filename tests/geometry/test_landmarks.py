@@ -62,7 +62,7 @@ def test_transformations_are_a_group_action(landmarks, pose, rng):
 
 def test_parameters_relative_to_the_moved_anchors_are_those_of_the_moved_landmarks(landmarks, pose):
     moved = transform_landmarks(pose, landmarks)
-    found = transform_parameters(pose, landmarks, moved.anchor)
+    found = transform_parameters(pose, landmarks, np.asarray(moved.anchor))
     assert_same(moved.with_parameters(found.parameters), moved)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxsonar import Ring, Room, kernels, local_model, simulate
+from jaxsonar.geometry.landmarks import wall_segments
 from jaxsonar.geometry.se2 import rotation, unit, wrap_angle
 from jaxsonar.graph_slam.frontend import SubmapState, close_submap, start_submap, update
 from jaxsonar.graph_slam.joint_compatibility import FeatureMeasurements, associate_features
@@ -305,7 +306,7 @@ def test_a_closed_submap_has_no_landmark_of_a_single_scan():
     np.testing.assert_array_equal(submap.poses, poses)
     lost = close_submap(replace(state, track_loss_count=3))
     assert (np.diag(lost.covariance - submap.covariance)[:3] > 0.2).all()
-    np.testing.assert_allclose(submap.segments[0], [[1.0, -1.0], [1.0, 1.0]], atol=1e-12)
+    np.testing.assert_allclose(wall_segments(submap.landmarks)[0], [[1.0, -1.0], [1.0, 1.0]], atol=1e-12)
 
 
 def test_the_next_submap_starts_at_its_own_origin():

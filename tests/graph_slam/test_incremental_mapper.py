@@ -189,7 +189,7 @@ def test_windows_scan_by_scan_are_those_of_the_whole_log(lost):
     for few, all_ in zip(came.scans, wanted.scans, strict=True):
         assert set(few) <= set(all_)
     assert sum(info.model is not None for info in infos) >= 3
-    assert state.waiting == ()
+    assert state.pending_scans == ()
     assert [k for k, info in enumerate(infos) if info.ignored] == list(lost)
 
 
