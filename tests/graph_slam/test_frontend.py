@@ -1,4 +1,4 @@
-"""The step from scan to scan: an iterated Kalman update against a dense one, who is whom, and what motion does."""
+"""The front end: EKF update against dense least squares, data association, start and end of submaps."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def in_double_precision():
 
 
 def reach_of(state, kind, anchor, ends):
-    """Half the way from tx by one reflector to rx: the readable way to say it. ``ends`` in the robot frame."""
+    """Half the length of the path from tx by one landmark to rx, independent of the kernels. ``ends`` in the robot frame."""
     place = ends @ rotation(state[2]).T + state[:2]
     own = state[3:]
     if kind == PLANE:
@@ -68,7 +68,7 @@ def scene_of(parameters, kinds=KINDS, anchors=ANCHORS):
 
 @pytest.fixture
 def case(rng):
-    """A belief, and echoes of a truth that it allows."""
+    """A belief, and echoes of a true state drawn from it."""
     mean = np.concatenate([[0.02, -0.05, 0.3], PARAMETERS.ravel()])
     root = rng.standard_normal((11, 11)) * 0.002
     prior = root @ root.T + np.diag([0.02, 0.02, 0.02] + [0.01] * 8) ** 2
@@ -79,16 +79,16 @@ def case(rng):
 
 
 def dense(mean, prior, path, ranges, rows=ROWS):
-    """Least squares on prior and ranges, slopes by central differences; the inverse of the information."""
+    """Least squares on prior and ranges with numerical derivatives; the inverse of the information matrix."""
     state, information = mean.copy(), np.linalg.inv(prior)
     whole = information
     for _ in range(8):
-        ways = 1e-6 * np.eye(len(state))
-        slope = np.stack(
-            [(expected_of(state + w, path, rows) - expected_of(state - w, path, rows)) / 2e-6 for w in ways], -1
+        steps = 1e-6 * np.eye(len(state))
+        jacobian = np.stack(
+            [(expected_of(state + w, path, rows) - expected_of(state - w, path, rows)) / 2e-6 for w in steps], -1
         )
-        whole = information + slope.T @ slope / SIGMA**2
-        gradient = slope.T @ (ranges - expected_of(state, path, rows)) / SIGMA**2 - information @ (state - mean)
+        whole = information + jacobian.T @ jacobian / SIGMA**2
+        gradient = jacobian.T @ (ranges - expected_of(state, path, rows)) / SIGMA**2 - information @ (state - mean)
         state = state + np.linalg.solve(whole, gradient)
     return state, np.linalg.inv(whole)
 
@@ -101,21 +101,21 @@ def tracked(mean, prior, path, ranges, rows=ROWS, kinds=KINDS, anchors=ANCHORS):
 
 
 @pytest.mark.slow
-def test_an_update_is_least_squares_on_prior_and_ranges(case):
+def test_the_update_equals_dense_least_squares(case):
     mean, prior, path, ranges, truth = case
     state, covariance, found = tracked(mean, prior, path, ranges)
     wanted, wanted_cov = dense(mean, prior, path, ranges)
     assert np.asarray(found.used).all()
     sd = np.sqrt(np.diag(wanted_cov))
-    np.testing.assert_array_less(np.abs(state - wanted), 0.02 * sd)  # a few steps do
+    np.testing.assert_array_less(np.abs(state - wanted), 0.02 * sd)  # after few iterations
     np.testing.assert_allclose(covariance / np.outer(sd, sd), wanted_cov / np.outer(sd, sd), atol=2e-3)
     off = state - truth
     assert off @ np.linalg.solve(covariance, off) < 31.3  # chi2, 11, 0.001
     np.testing.assert_allclose(found.residual, ranges - expected_of(state, path), atol=1e-12)
 
 
-def test_wrong_echoes_are_left_out(case, rng):
-    """Some centimetres off: what remains is as if they had never been."""
+def test_outliers_have_no_influence(case, rng):
+    """Errors of some centimetres: the result is that of the other echoes alone."""
     mean, prior, path, ranges, _ = case
     bad = rng.permutation(ECHOES)[:9]
     spoilt = ranges.copy()
@@ -129,11 +129,11 @@ def test_wrong_echoes_are_left_out(case, rng):
 
 
 @pytest.mark.slow
-def test_neither_order_nor_padding_matters(case, rng):
+def test_order_and_padding_do_not_matter(case, rng):
     mean, prior, path, ranges, _ = case
     plain, plain_cov, found = tracked(mean, prior, path, ranges)
     order = rng.permutation(ECHOES)
-    # Echoes of nothing, and reflectors that are free.
+    # Unassigned echoes and unused landmarks.
     more_path, more_range = np.pad(path[order], (0, 20)), np.pad(ranges[order], (0, 20))
     more_rows = np.pad(ROWS[order], (0, 20), constant_values=-1)
     wide, kinds, anchors = np.zeros((15, 15)), np.append(KINDS, [-1, -1]).astype(np.int32), np.zeros((6, 2))
@@ -148,8 +148,8 @@ def test_neither_order_nor_padding_matters(case, rng):
 
 
 @pytest.mark.slow
-def test_a_wall_alone_says_nothing_of_the_way_along_it(rng):
-    """What is known of y is what the prior says, by the heading that y hangs on."""
+def test_a_single_wall_does_not_determine_the_position_along_it(rng):
+    """The prior alone determines y, through its correlation with the heading."""
     path = rng.integers(len(RING.paths), size=40)
     prior = np.zeros((5, 5))
     prior[:3, :3] = [[4e-4, 0, 0], [0, 9e-4, 3e-4], [0, 3e-4, 4e-4]]
@@ -168,11 +168,11 @@ def test_a_wall_alone_says_nothing_of_the_way_along_it(rng):
 
 
 @pytest.mark.slow
-def test_ranges_are_those_that_the_simulator_hears():
-    """Every first echo of a wall of the office, to the micrometre; and what is expected besides is little."""
+def test_expected_ranges_equal_those_of_the_simulator():
+    """Every first-order wall echo of the office, to the micrometre."""
     office = load_office()
     room, pose = office.room, office.poses[5]
-    heard = simulate(RING, room, pose[None], sigma=0.0)
+    echoes = simulate(RING, room, pose[None], sigma=0.0)
     middle = room.walls.mean(axis=1)
     along = room.walls[:, 1] - room.walls[:, 0]
     half = np.linalg.norm(along, axis=-1) / 2
@@ -187,16 +187,16 @@ def test_ranges_are_those_that_the_simulator_hears():
         half[:, None] * [-1.0, 1.0],
     )
     expected = np.asarray(kernels.expected_ranges(pose, scene, paths_of(np.arange(len(RING.paths)))))
-    wall = heard.kind == EchoKind.PLANE
+    wall = echoes.kind == EchoKind.PLANE
     assert wall.sum() > 20
-    np.testing.assert_allclose(expected[heard.reflector[wall], heard.path[wall]], heard.range[wall], atol=2e-6)
+    np.testing.assert_allclose(expected[echoes.reflector[wall], echoes.path[wall]], echoes.range[wall], atol=2e-6)
 
 
-# Who is whom
+# Data association
 
 
-def known_of(walls, points=(), *, pose_sd=(0.05, 0.05, 0.02), own_sd=1e-3):
-    """Walls (distance, theta) of some metres through their feet, and corners, around a robot at the origin."""
+def belief_with(walls, points=(), *, pose_sd=(0.05, 0.05, 0.02), own_sd=1e-3):
+    """A belief with walls (distance, theta) and corners around a robot at the origin."""
     count = len(walls) + len(points)
     foot = [rho * unit(np.array(theta)) for rho, theta in walls]
     size = 3 + 2 * count
@@ -211,10 +211,10 @@ def known_of(walls, points=(), *, pose_sd=(0.05, 0.05, 0.02), own_sd=1e-3):
     return kernels.Belief(np.zeros(3), landmarks, covariance)
 
 
-def seen_of(walls, points=(), *, sd=1e-3):
+def features_with(walls, points=(), *, sd=1e-3):
     count = len(walls) + len(points)
     segments = [
-        [rho * unit(np.array(theta)) + way * unit(np.array(theta + np.pi / 2)) for way in (-0.1, 0.1)]
+        [rho * unit(np.array(theta)) + along * unit(np.array(theta + np.pi / 2)) for along in (-0.1, 0.1)]
         for rho, theta in walls
     ]
     return FeatureMeasurements(
@@ -226,71 +226,74 @@ def seen_of(walls, points=(), *, sd=1e-3):
     )
 
 
-def matched(known, seen):
-    found = associate_features(known, seen, full_wall_echoes=12.0)
+def associated(belief, features):
+    found = associate_features(belief, features, full_wall_echoes=12.0)
     return found.landmark.tolist(), found.is_new.tolist()
 
 
-def test_each_is_the_others_nearest():
-    """Two features by one wall: the nearer one is it; the other one is none, and too near to be new."""
-    known = known_of([(1.0, 0.0), (1.2, np.pi / 2)])
-    seen = seen_of([(1.02, 0.0), (1.06, 0.0), (1.21, np.pi / 2)])
-    assert matched(known, seen) == ([0, -1, 1], [False, False, False])
+def test_only_mutual_nearest_neighbors_are_associated():
+    """Two features near one wall: the nearer one is associated; the other one is not, and is too near to be new."""
+    known = belief_with([(1.0, 0.0), (1.2, np.pi / 2)])
+    seen = features_with([(1.02, 0.0), (1.06, 0.0), (1.21, np.pi / 2)])
+    assert associated(known, seen) == ([0, -1, 1], [False, False, False])
 
 
-def test_what_is_far_from_all_is_new():
-    known = known_of([(1.0, 0.0)])
-    assert matched(known, seen_of([(1.0, 0.0), (1.4, 1.8)], [(0.3, -0.9)])) == ([0, -1, -1], [False, True, True])
-    assert matched(start_submap().belief, seen_of([(1.0, 0.0)])) == ([-1], [True])
+def test_features_far_from_all_landmarks_are_new():
+    known = belief_with([(1.0, 0.0)])
+    assert associated(known, features_with([(1.0, 0.0), (1.4, 1.8)], [(0.3, -0.9)])) == (
+        [0, -1, -1],
+        [False, True, True],
+    )
+    assert associated(start_submap().belief, features_with([(1.0, 0.0)])) == ([-1], [True])
 
 
-def test_pairs_must_agree_with_each_other():
-    """One wall says 9 cm ahead, the opposite one 9 cm back: each may be, both together not."""
-    known = known_of([(1.0, 0.0), (1.2, -np.pi)])
-    assert matched(known, seen_of([(0.91, 0.0)]))[0] == [0]
-    assert matched(known, seen_of([(1.1, -np.pi)]))[0] == [1]
-    assert matched(known, seen_of([(0.91, 0.0), (1.29, -np.pi)]))[0] == [0, 1]
-    assert sorted(matched(known, seen_of([(0.91, 0.0), (1.10, -np.pi)]))[0]) == [-1, 0]
+def test_pairs_must_be_jointly_compatible():
+    """One wall implies a motion of 9 cm forward, the opposite one 9 cm back: each is possible, both are not."""
+    known = belief_with([(1.0, 0.0), (1.2, -np.pi)])
+    assert associated(known, features_with([(0.91, 0.0)]))[0] == [0]
+    assert associated(known, features_with([(1.1, -np.pi)]))[0] == [1]
+    assert associated(known, features_with([(0.91, 0.0), (1.29, -np.pi)]))[0] == [0, 1]
+    assert sorted(associated(known, features_with([(0.91, 0.0), (1.10, -np.pi)]))[0]) == [-1, 0]
 
 
-def test_the_back_of_a_wall_is_another_wall():
-    """It is 2 cm behind the robot; seen from the other side its normal leads the other way."""
-    known = replace(known_of([(0.02, 0.0)], pose_sd=(0.2, 0.2, 0.05)), pose=np.array([0.04, 0.0, 0.0]))
-    assert matched(known, seen_of([(0.3, 0.0)]))[0] == [-1]
+def test_the_two_sides_of_a_wall_are_different_landmarks():
+    """The wall is 2 cm behind the robot; from its other side the normal has the opposite direction."""
+    known = replace(belief_with([(0.02, 0.0)], pose_sd=(0.2, 0.2, 0.05)), pose=np.array([0.04, 0.0, 0.0]))
+    assert associated(known, features_with([(0.3, 0.0)]))[0] == [-1]
 
 
-def test_a_wall_is_where_it_was_seen():
-    """The same line, two metres beside it: not that wall, and new."""
-    known, seen = known_of([(1.0, 0.0)]), seen_of([(1.0, 0.0)])
+def test_a_feature_beside_the_observed_part_is_another_wall():
+    """The same line, two metres along it."""
+    known, seen = belief_with([(1.0, 0.0)]), features_with([(1.0, 0.0)])
     beside = seen._replace(segment=seen.segment + np.array([0.0, 2.0]))
-    assert matched(known, beside)[0] == [-1]
+    assert associated(known, beside)[0] == [-1]
 
 
-def test_corners_are_no_walls():
-    assert matched(known_of([(1.0, 0.0)]), seen_of([], [(1.0, 0.0)]))[0] == [-1]
+def test_corners_are_not_associated_with_walls():
+    assert associated(belief_with([(1.0, 0.0)]), features_with([], [(1.0, 0.0)]))[0] == [-1]
 
 
 # Submaps
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("distance", "carried"), [(8.0, False), (0.8, True)])
-def test_only_walls_that_should_be_heard_tell_that_the_robot_was_carried(distance, carried):
-    """Around a corner all is new, and becomes known; where walls that face the ring are silent it is elsewhere."""
+@pytest.mark.parametrize(("distance", "kidnapped"), [(8.0, False), (0.8, True)])
+def test_only_missed_detections_of_known_walls_indicate_a_kidnapped_robot(distance, kidnapped):
+    """Around a corner everything is new and is added; if known walls that face the ring cause no echo, nothing is."""
     x, y = 1.5, 1.3
     room = Room(np.array([[[x, -y], [x, y]], [[x, y], [-x, y]], [[-x, y], [-x, -y]], [[-x, -y], [x, -y]]]))
     scan = simulate(RING, room, np.zeros((1, 3)), sigma=SIGMA, seed=1).as_log(RING, np.zeros((1, 3)))[0]
-    known = known_of([(distance, 0.0), (distance, 2.0)])
+    known = belief_with([(distance, 0.0), (distance, 2.0)])
     with jax.enable_x64(False):
         model = local_model(RING, scan, method="hough")
     state = update(RING, SubmapState(known, np.array([5, 5])), scan, model, row=7)
-    assert state.track_loss_count == int(carried)
-    assert (len(state.scan_counts) == 2) == carried
+    assert state.track_loss_count == int(kidnapped)
+    assert (len(state.scan_counts) == 2) == kidnapped
     assert len(state.belief.landmarks.kind) == len(state.scan_counts)
 
 
 def test_a_closed_submap_has_no_landmark_of_a_single_scan():
-    known = known_of([(1.0, 0.0), (1.5, 1.0), (2.0, 2.0)])
+    known = belief_with([(1.0, 0.0), (1.5, 1.0), (2.0, 2.0)])
     root = np.random.default_rng(0).standard_normal((9, 9))
     known = replace(known, covariance=root @ root.T, pose=np.array([0.5, 0.1, 0.2]))
     poses = tuple(np.full(3, 0.1 * k) for k in range(4))
@@ -310,7 +313,7 @@ def test_a_closed_submap_has_no_landmark_of_a_single_scan():
 
 
 def test_the_next_submap_starts_at_its_own_origin():
-    known = known_of([(1.0, 0.0)])
+    known = belief_with([(1.0, 0.0)])
     before = SubmapState(
         known, np.array([3]), rows=(0, 1), odometry=np.array([1.0, 2.0, 3.0]), sum_of_squares=4e-6, dof=4.0
     )

@@ -1,4 +1,4 @@
-"""A map built scan by scan is the map of all scans; states stay as they were and grow with the walls, not the scans."""
+"""Incremental mapping equals mapping all scans at once; states are immutable and bounded by the size of the place."""
 
 import dataclasses
 import math
@@ -23,12 +23,12 @@ def office():
 
 
 def office_log(office, seed=0):
-    heard = simulate(office.ring, office.room, office.poses, sigma=0.003, seed=seed, stamps=office.stamps)
-    return heard.as_log(office.ring, office.poses)
+    echoes = simulate(office.ring, office.room, office.poses, sigma=0.003, seed=seed, stamps=office.stamps)
+    return echoes.as_log(office.ring, office.poses)
 
 
 def driven(mapper, scans):
-    """The state after all scans, and what each came to."""
+    """The state after all scans, and the result of each."""
     state, infos = mapper.start(), []
     for scan in scans:
         state, info = mapper.step(state, scan)
@@ -37,7 +37,7 @@ def driven(mapper, scans):
 
 
 def assert_same_map(one, other, *, atol=1e-9):
-    """Segment by segment in one order, which the numbers of echoes and the places decide."""
+    """Same walls in the same order."""
     assert len(one) == len(other)
     for name in ("segments", "rho", "theta", "sigma_rho", "sigma_theta"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=atol, rtol=1e-6)
@@ -66,7 +66,7 @@ def size_of(state):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("order", "merging"), [("driven", "fused"), ("shuffled", "fused"), ("shuffled", "paper")])
-def test_scan_by_scan_is_all_at_once(office, order, merging):
+def test_scan_by_scan_equals_all_at_once(office, order, merging):
     log = office_log(office)
     rows = {
         "driven": np.arange(17),
@@ -81,8 +81,8 @@ def test_scan_by_scan_is_all_at_once(office, order, merging):
 
 
 @pytest.mark.slow
-def test_every_map_on_the_way_is_that_of_the_scans_so_far(office):
-    """Also the map of nothing; and old states still give their maps when all is done."""
+def test_every_intermediate_map_is_that_of_the_scans_so_far(office):
+    """The empty map included; old states still give their maps in the end."""
     log, mapper = office_log(office, seed=1), Mapper(ring=RING)
     states = [mapper.start()]
     for scan in log:
@@ -94,7 +94,7 @@ def test_every_map_on_the_way_is_that_of_the_scans_so_far(office):
 
 
 @pytest.mark.slow
-def test_two_ways_from_one_state_do_not_disturb_each_other(office):
+def test_two_continuations_of_one_state_are_independent(office):
     log, mapper = office_log(office), Mapper(ring=RING)
     middle, _ = driven(mapper, log[:8])
     scans = list(log)
@@ -105,8 +105,8 @@ def test_two_ways_from_one_state_do_not_disturb_each_other(office):
     assert_same_map(mapper.map(middle), build_map(RING, log[:8]))
 
 
-def test_a_step_tells_what_the_scan_came_to(office):
-    """Its local model, and the segments of that in the world."""
+def test_a_step_returns_the_local_model_and_its_walls(office):
+    """The walls are in the world frame."""
     mapper, state = Mapper(ring=RING), Mapper(ring=RING).start()
     for scan in office_log(office)[:6]:
         state, info = mapper.step(state, scan)
@@ -119,8 +119,8 @@ def test_a_step_tells_what_the_scan_came_to(office):
 
 
 @pytest.mark.slow
-def test_scans_without_a_pose_are_ignored_and_said_so(office):
-    """With windows too, below."""
+def test_scans_without_a_pose_are_ignored_with_a_reason(office):
+    """For windows see below."""
     log, mapper = office_log(office), Mapper(ring=RING)
     scans = [
         dataclasses.replace(scan, pose=np.full(3, np.nan)) if k in (0, 4, 9) else scan for k, scan in enumerate(log)
@@ -132,22 +132,22 @@ def test_scans_without_a_pose_are_ignored_and_said_so(office):
     assert_same_map(mapper.map(state), build_map(RING, Log.from_scans(scans)))
 
 
-def test_scans_that_heard_nothing_or_everything_at_once_are_taken_in():
-    """Silence is evidence too; and a robot that is shut in claims no free place at all."""
+def test_scans_without_echoes_or_with_echoes_everywhere_are_valid():
+    """Missed detections are evidence of free space; a robot enclosed on all sides claims none."""
     mapper, none = Mapper(ring=RING), np.zeros(0, int)
-    silent = Log.from_echoes(none, none, none, np.zeros(0), stamp=np.zeros(1), pose=np.zeros((1, 3)))[0]
+    no_echo = Log.from_echoes(none, none, none, np.zeros(0), stamp=np.zeros(1), pose=np.zeros((1, 3)))[0]
     tx = np.arange(24)
-    shut_in = Log.from_echoes(tx * 0, tx, tx, np.full(24, 0.12), stamp=np.ones(1), pose=np.zeros((1, 3)))[0]
-    state, info = mapper.step(mapper.start(), silent)
+    enclosed = Log.from_echoes(tx * 0, tx, tx, np.full(24, 0.12), stamp=np.ones(1), pose=np.zeros((1, 3)))[0]
+    state, info = mapper.step(mapper.start(), no_echo)
     assert info.ignored == ""
     assert info.segments.shape == (0, 2, 2)
     assert state.evidence.free_space.tiles
-    state, info = mapper.step(state, shut_in)
+    state, info = mapper.step(state, enclosed)
     assert isinstance(mapper.map(state), GlobalMap)
     assert state.evidence.models == 2
 
 
-def test_unusable_arguments_are_refused_at_once():
+def test_invalid_arguments_are_refused():
     with pytest.raises(SonarError, match=r"merging 'best'; allowed is"):
         Mapper(ring=RING, merging="best")
     with pytest.raises(SonarError, match=r"method 'best'; allowed is"):
@@ -170,15 +170,15 @@ CORRIDOR = Room(
 def corridor_log(seed=0):
     x = np.arange(0, 5.0, 0.1)
     poses = np.column_stack([x, 0.05 * np.sin(x), 0.05 * np.cos(x)])
-    poses[30:36] = poses[30]  # it waits
+    poses[30:36] = poses[30]  # the robot waits
     ring = load_ring("corridor8")
     return ring, simulate(ring, CORRIDOR, poses, sigma=0.005, seed=seed).as_log(ring, poses)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lost", [(), (0, 20, 21, 44)])
-def test_windows_scan_by_scan_are_those_of_the_whole_log(lost):
-    """Along the path, with a robot that waits, and with poses missing."""
+def test_windows_scan_by_scan_equal_those_of_the_whole_log(lost):
+    """With a robot that waits, and with missing poses."""
     ring, log = corridor_log()
     scans = [dataclasses.replace(s, pose=np.full(3, np.nan)) if k in lost else s for k, s in enumerate(log)]
     mapper = Mapper(ring=ring, window=2.0)
@@ -193,7 +193,7 @@ def test_windows_scan_by_scan_are_those_of_the_whole_log(lost):
     assert [k for k, info in enumerate(infos) if info.ignored] == list(lost)
 
 
-def test_finishing_twice_or_with_nothing_changes_nothing():
+def test_finishing_twice_or_an_empty_run_changes_nothing():
     ring, log = corridor_log()
     mapper = Mapper(ring=ring, window=2.0)
     state, _ = driven(mapper, list(log)[:22])
@@ -202,8 +202,8 @@ def test_finishing_twice_or_with_nothing_changes_nothing():
     assert mapper.finish(Mapper(ring=RING).start()).evidence.models == 0
 
 
-def a_round(number):
-    """A closed way through a room, a little off each time, with other noise."""
+def round_trip(number):
+    """A closed trajectory through a room with small random deviations and noise."""
     room = Room(
         np.array([[[-2, -1.6], [2, -1.6]], [[2, -1.6], [2, 1.6]], [[2, 1.6], [-2, 1.6]], [[-2, 1.6], [-2, -1.6]]])
     )
@@ -218,19 +218,19 @@ def a_round(number):
 
 
 @pytest.mark.slow
-def test_driving_the_same_round_again_needs_no_more_memory():
-    """Pieces, tiles and numbers of scans are bounded by the walls: ten rounds are hardly more than three."""
+def test_repeated_round_trips_need_no_more_memory():
+    """Wall segments, tiles and listed scans are bounded by the walls: ten round trips need hardly more than three."""
     mapper = Mapper(ring=RING)
-    state, sizes, pieces, tiles = mapper.start(), {}, {}, {}
+    state, sizes, segments, tiles = mapper.start(), {}, {}, {}
     for number in range(10):
-        for scan in a_round(number):
+        for scan in round_trip(number):
             state, _ = mapper.step(state, scan)
         sizes[number + 1] = size_of(state)
-        pieces[number + 1] = len(state.evidence.segments)
+        segments[number + 1] = len(state.evidence.segments)
         tiles[number + 1] = len(state.evidence.free_space.tiles)
     assert tiles[10] == tiles[1]
     assert sizes[10] < 1.5 * sizes[3]
-    assert pieces[10] < 2.5 * pieces[3]
+    assert segments[10] < 2.5 * segments[3]
     assert size_of(state) - size_of(state.evidence.free_space) < 1_000_000
     assert np.bincount(state.evidence.segments.scans[0]).max() <= SETTINGS.evidence.listed_scans
     assert state.evidence.models == 100

@@ -1,11 +1,11 @@
-"""Poses and map together: better than odometry, honest about it, the same scan by scan and all at once."""
+"""SLAM: better than odometry, consistent, equal for a tracker and a whole log; invalid input is refused."""
 
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from support.slam_scene import COUNT, RING, ROOM, SIGMA, SLIP, log, truth
+from support.slam_scene import ODOMETRY_NOISE, RING, ROOM, SCAN_COUNT, SIGMA, log, truth
 
 from jaxsonar import SonarError, local_models, simulate
 from jaxsonar.estimation.trajectory import Trajectory
@@ -25,7 +25,7 @@ def models():
 
 @cache
 def tracked():
-    tracker = Tracker(ring=RING, odometry_noise=SLIP)
+    tracker = Tracker(ring=RING, odometry_noise=ODOMETRY_NOISE)
     state, steps = tracker.start(), []
     for scan, model in zip(log(), models(), strict=True):
         state, step = tracker.step(state, scan, model=model)
@@ -33,21 +33,21 @@ def tracked():
     return tracker, state, steps
 
 
-def assert_near(found, *, share):
-    """Errors are at most this share of odometry's, and as large as is said."""
+def assert_accurate(found, *, fraction):
+    """Errors are at most this fraction of the odometry's, and consistent with the covariances."""
     real = Trajectory(found.stamp, truth())
     own = trajectory_errors(found, real, align="first")
     wheels = trajectory_errors(Trajectory(found.stamp, np.array(log().pose)), real, align="first")
-    assert own.ate < share * wheels.ate
+    assert own.ate < fraction * wheels.ate
     assert own.ate_heading < 0.5 * wheels.ate_heading
     assert 0.05 < own.nees < 4.0
 
 
 @pytest.mark.slow
-def test_scan_by_scan_is_the_log_without_smoothing_and_much_better_than_odometry():
+def test_the_tracker_equals_slam_without_smoothing_and_beats_odometry():
     tracker, state, _ = tracked()
     poses, covariance = tracker.poses(tracker.finish(state))
-    found = slam(RING, log(), odometry_noise=SLIP, smooth=False)
+    found = slam(RING, log(), odometry_noise=ODOMETRY_NOISE, smooth=False)
     np.testing.assert_allclose(found.poses, poses, atol=1e-9)
     np.testing.assert_allclose(found.covariance, covariance, atol=1e-9)
     assert isinstance(found, Slam)
@@ -55,13 +55,13 @@ def test_scan_by_scan_is_the_log_without_smoothing_and_much_better_than_odometry
     assert len(found.world) >= 6
     np.testing.assert_array_equal(found.odometry, log().pose)
     assert found.smoothed is None
-    assert len(found.step_ms) == COUNT
-    assert_near(found.trajectory, share=0.2)
+    assert len(found.step_ms) == SCAN_COUNT
+    assert_accurate(found.trajectory, fraction=0.2)
 
 
 @pytest.mark.slow
-def test_a_step_leaves_the_state_given_as_it_was():
-    """Two ways from one state; and the first pose is that of odometry."""
+def test_a_step_does_not_change_its_input_state():
+    """Two continuations of one state; and the first pose is that of the odometry."""
     tracker, _, steps = tracked()
     state = tracker.start()
     for scan, model in zip(log()[:6], models()[:6], strict=True):
@@ -76,12 +76,12 @@ def test_a_step_leaves_the_state_given_as_it_was():
     tracker.step(one, log()[7], model=models()[7])
     tracker.finish(state)
     _, again = tracker.step(state, log()[6], model=models()[6])
-    for was, now in zip(
+    for earlier, now in zip(
         before,
         [state.submap.pose, state.submap.belief.covariance, state.graph.poses, state.scan_count],
         strict=True,
     ):
-        np.testing.assert_array_equal(was, now)
+        np.testing.assert_array_equal(earlier, now)
     np.testing.assert_array_equal(again.pose, steps[6].pose)
     np.testing.assert_allclose(steps[0].pose, log().pose[0], atol=1e-9)
     np.testing.assert_allclose(steps[0].covariance, 0, atol=1e-12)
@@ -89,7 +89,7 @@ def test_a_step_leaves_the_state_given_as_it_was():
 
 
 @pytest.mark.slow
-def test_without_odometry_scans_are_placed_by_what_they_see():
+def test_without_odometry_scans_are_registered():
     some = log()[:16]
     found = slam(RING, replace(some, pose=np.full((16, 3), np.nan)), smooth=False)
     known = np.isfinite(found.poses[:, 0])
@@ -104,8 +104,8 @@ def test_without_odometry_scans_are_placed_by_what_they_see():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("missing", [[5], [4, 5, 11]])
-def test_scans_without_odometry_between_others_bend_nothing(missing):
-    """The odometry leads on over them; what they see places them, or they are left out."""
+def test_single_scans_without_odometry_do_not_distort_the_trajectory(missing):
+    """The odometry bridges them; they are registered by their echoes or have no pose."""
     some = log()[:16]
     pose = np.array(some.pose)
     pose[missing] = np.nan
@@ -118,12 +118,12 @@ def test_scans_without_odometry_between_others_bend_nothing(missing):
         Trajectory(found.stamp, truth()[:16]),
         align="first",
     )
-    assert own.ate < 0.08  # a motion that counts twice is 15 cm off at once, and with all that follows
+    assert own.ate < 0.08  # a motion that counts twice is an error of 15 cm for all later scans
     assert own.nees < 4
 
 
-def test_a_step_over_a_scan_without_odometry_is_the_whole_step():
-    """With ranges that say nothing, the pose after it is where odometry says."""
+def test_odometry_bridges_a_scan_without_odometry():
+    """Without echoes, the pose after it is that of the odometry."""
     tracker = Tracker(ring=RING, sigma=SIGMA)
     state, pose = tracker.start(), np.full(3, np.nan)
     none = np.zeros(0, dtype=np.int64)
@@ -135,24 +135,24 @@ def test_a_step_over_a_scan_without_odometry_is_the_whole_step():
 
 
 @pytest.mark.parametrize(
-    ("pose", "choices", "said"),
+    ("rows", "options", "message"),
     [
         ([0, 1], {}, "odometry in 2 of 16 scans"),
-        ([], {"scale": True}, "no scan has any"),
-        (range(16), {"scale": True, "smooth": False}, "without smoothing"),
+        ([], {"scale": True}, "need odometry"),
+        (range(16), {"scale": True, "smooth": False}, "estimated by smoothing"),
     ],
 )
-def test_what_odometry_can_not_do_is_refused_before_the_work(pose, choices, said):
+def test_contradictory_arguments_are_refused(rows, options, message):
     some = log()[:16]
     kept = np.full((16, 3), np.nan)
-    kept[list(pose)] = some.pose[list(pose)]
-    with pytest.raises(SonarError, match=said):
-        slam(RING, replace(some, pose=kept), **choices)
+    kept[list(rows)] = some.pose[list(rows)]
+    with pytest.raises(SonarError, match=message):
+        slam(RING, replace(some, pose=kept), **options)
 
 
 @pytest.mark.slow
-def test_a_robot_that_was_carried_begins_anew():
-    """Odometry knows nothing of it: another submap, and no pose that is sure of the wrong place."""
+def test_a_kidnapped_robot_starts_a_new_submap():
+    """The odometry does not contain the motion: a new submap starts, and no pose is certain of a wrong place."""
     there = compose(np.array([1.5, 0.6, 2.0]), np.array([relative(truth()[0], one) for one in truth()[:8]]))
     poses = np.concatenate([truth()[:8], there])
     odometry = np.concatenate([truth()[:8], compose(truth()[7], np.array([relative(there[0], one) for one in there]))])
@@ -170,8 +170,8 @@ def test_a_robot_that_was_carried_begins_anew():
 
 
 @pytest.mark.slow
-def test_a_mapper_estimates_poses_and_draws_its_map_there():
-    mapper = Mapper(ring=RING, odometry_noise=SLIP)
+def test_a_mapper_with_pose_estimation_maps_at_the_estimated_poses():
+    mapper = Mapper(ring=RING, odometry_noise=ODOMETRY_NOISE)
     state, infos = mapper.start(), []
     for scan, model in zip(log()[:20], models(), strict=False):
         state, info = mapper.step(state, scan, model=model)
@@ -188,13 +188,13 @@ def test_a_mapper_estimates_poses_and_draws_its_map_there():
     with pytest.raises(SonarError, match="odometry_noise"):
         Mapper(ring=RING).trajectory(Mapper(ring=RING).start())
     with pytest.raises(SonarError, match="odometry_noise"):
-        Mapper(ring=RING, odometry_noise=SLIP, window=1.0)
+        Mapper(ring=RING, odometry_noise=ODOMETRY_NOISE, window=1.0)
 
 
-def test_bad_calls():
+def test_invalid_input_is_refused():
     with pytest.raises(SonarError, match="no scan"):
         slam(RING, log()[:0])
-    with pytest.raises(SonarError, match="no scan has a pose"):
+    with pytest.raises(SonarError, match="needs poses"):
         slam(RING, replace(log()[:3], pose=np.full((3, 3), np.nan)), window=1.0)
     with pytest.raises(SonarError, match="sigma"):
         Tracker(ring=RING, sigma=-1.0)

@@ -1,4 +1,4 @@
-"""slam_scene."""
+"""A room with corners, a trajectory through it, and its log with simulated odometry, for tests of SLAM."""
 
 from functools import cache
 
@@ -13,18 +13,20 @@ RING = Ring.circular()
 
 SIGMA = 0.002
 
-SLIP = OdometryNoise(position_per_meter=0.04, heading_per_meter=float(np.radians(2.0)), heading_per_radian=0.04)
+ODOMETRY_NOISE = OdometryNoise(
+    position_per_meter=0.04, heading_per_meter=float(np.radians(2.0)), heading_per_radian=0.04
+)
 
-COUNT = 48
+SCAN_COUNT = 48
 
 CORNERS = [(0, 0), (5, 0), (5, 1.7), (6.3, 1.7), (6.3, 4.1), (3.2, 4.1), (3.2, 3), (2.1, 3), (2.1, 3.6), (0, 3.6)]
 
 ROOM = Room(np.array([[a, b] for a, b in zip(CORNERS, [*CORNERS[1:], CORNERS[0]], strict=True)], dtype=float))
 
 
-def way():
-    """Once to and fro, in curves."""
-    t = np.linspace(0.0, 1.0, COUNT)
+def trajectory():
+    """Through the room and back, in curves."""
+    t = np.linspace(0.0, 1.0, SCAN_COUNT)
     place = np.column_stack([1.0 + 3.3 * np.sin(np.pi * t) ** 2, 1.6 + 0.5 * np.sin(2 * np.pi * t)])
     to = np.gradient(place, axis=0)
     return np.column_stack([place, wrap_angle(np.arctan2(to[:, 1], to[:, 0]))])
@@ -32,7 +34,7 @@ def way():
 
 @cache
 def truth():
-    return way()
+    return trajectory()
 
 
 @cache
