@@ -30,7 +30,7 @@ def in_double_precision():
 
 
 def reach_of(state, kind, anchor, ends):
-    """Half the length of the path from tx by one landmark to rx, independent of the kernels. ``ends`` in the robot frame."""
+    """Half the path length from tx by one landmark to rx, independent of the kernels. ``ends`` in the robot frame."""
     place = ends @ rotation(state[2]).T + state[:2]
     own = state[3:]
     if kind == PLANE:
