@@ -1,10 +1,11 @@
-"""The first stage of calibration: a badly wrong ring is focused until the echoes of walls meet in the accumulator.
+"""Autofocus: a ring with large errors is adjusted until the echoes of each wall meet in the Hough accumulator.
 
-What comes out is near enough for least squares, which needs to know which echoes belong together. Sharpening alone
-collapses along the mean range offset and the speed of sound: the mean is held, the speed has a prior.
+The result is accurate enough for least squares, which must know which echoes belong together. The focus measure alone
+is degenerate in the mean range offset and the speed of sound: the mean is held, the speed has a prior.
 """
 
 import dataclasses
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -23,142 +24,205 @@ from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import PRIOR
 
-OFFSET_SD = 0.015
-"""Metres; prior of a sensor's relative range offset around the given one."""
-MOST_OFFSET, MOST_SPEED = 0.050, 0.04
-"""Metres, and share of the speed: no result is farther from the given ring."""
-WORLD = 8.0
-"""Metres; scans taken farther from the middle of a log's poses are left out, so that the accumulator stays small."""
-_CELL = 0.01  # m, of rho
-_WIDTHS = (1.5, 1.0)  # cells, from coarse to fine; wider ones led the office's drive, which hardly turns, astray
-_STEPS = 20  # of each width
-_STRIDES = (0.1, 0.03)  # of each width, in standard deviations of the prior
-_BEYOND = 1.05  # echoes near the maximum range stay when offsets and speed move
+
+@dataclass(frozen=True)
+class AutofocusSettings:
+    """Constants of the autofocus. Chosen by hand unless stated otherwise."""
+
+    offset_sd: float = 0.015
+    """Prior standard deviation of the range offset of a sensor relative to the mean, metres."""
+    max_offset: float = 0.050
+    """Largest change of a range offset, metres."""
+    max_speed_change: float = 0.04
+    """Largest relative change of the speed of sound."""
+    max_distance: float = 8.0
+    """Scans farther from the median position of a log are left out, metres, so that the accumulator stays small."""
+    rho_cell: float = 0.01
+    """Size of a cell along rho, metres."""
+    max_cells: int = 1_000_000
+    """Largest number of cells of the accumulator."""
+    theta_cells: tuple[int, int] = (720, 120)
+    """Rows of the accumulator with and without poses. In the world frame the curve of a distant wall is steep, up to
+    metres per radian; in the robot frame it is not."""
+    point_pitch_deg: tuple[float, float] = (0.5, 1.0)
+    """Angle between points of an arc with and without poses, degrees."""
+    widths: tuple[float, ...] = (1.5, 1.0)
+    """Standard deviations of the low pass along rho from coarse to fine, cells. Larger ones made the calibration from
+    the office trajectory, which hardly turns, converge to a wrong ring."""
+    steps: int = 20
+    """Steps of the ascent for each width."""
+    strides: tuple[float, ...] = (0.1, 0.03)
+    """Length of the first step for each width, prior standard deviations."""
+    momentum: float = 0.8
+    """Decay of the mean gradient per step."""
+    square_decay: float = 0.95
+    """Decay of the mean squared gradient per step."""
+    range_margin: float = 1.05
+    """Factor on the maximum range, so that echoes near it stay when offsets and speed of sound change."""
 
 
-def autofocus_ring(ring: Ring, log: Log, *, poses: bool, speed: bool, scans: int = 40) -> Ring:
-    """The ring with the relative range offsets, and the speed of sound, that make its echoes meet most sharply.
+SETTINGS = AutofocusSettings()
 
-    The mean range offset stays as given. Without poses each scan is looked at alone, and offsets that look like a move
-    of the whole ring are hardly seen: they stay nearly as given. The given ring comes back, the same object, unless
-    the sharpness at the finest scale rose, by more nats than parameters were fitted.
+
+def autofocus_ring(
+    ring: Ring, log: Log, *, poses: bool, speed: bool, scans: int = 40, settings: AutofocusSettings = SETTINGS
+) -> Ring:
+    """The ring whose relative range offsets, and speed of sound, maximise the focus measure of its echoes.
+
+    The mean range offset does not change. Without poses, each scan has an accumulator of its own; offsets that are
+    equivalent to a displacement of the whole ring are then hardly observable and change little. The given ring, the
+    same object, is returned unless the focus measure at the finest scale increased by more nats than there are
+    parameters.
 
     Args:
-        ring: as far as it is known.
-        log: what it heard.
-        poses: trust the poses of the log; scans without one are left out.
-        speed: also find the speed of sound; it takes poses.
-        scans: use this many at most, evenly chosen.
+        ring: the nominal ring.
+        log: its scans.
+        poses: whether the poses of the log are used; scans without a pose are left out then.
+        speed: whether the speed of sound is estimated as well; requires poses.
+        scans: largest number of scans, evenly selected.
+        settings: constants of the algorithm.
 
     Raises:
-        SonarError: speed without poses, no scan to use, fewer than one scan asked for, or a sensor the ring lacks.
+        SonarError: speed without poses, no usable scan, ``scans`` below 1, or a sensor that the ring does not have.
     """
     if speed and not poses:
-        raise SonarError("focus: speed=True with poses=False came; allowed is speed only with poses, which give scale")
+        raise SonarError(
+            "autofocus: speed=True with poses=False came; allowed is speed only with poses, which determine the scale"
+        )
     if scans < 1:
-        raise SonarError(f"focus: scans = {scans} came; allowed is 1 or more")
-    echoes, reach = _chosen(ring, log, poses, scans)
-    # Curves of a far wall run steeply through the world, up to metres a radian; in the robot frame never so.
-    fine = HoughSettings(theta_cells=720 if poses else 120, point_pitch=float(np.radians(0.5 if poses else 1.0)))
-    columns = bucket_size(int(np.ceil((reach + _BEYOND * ring.max_range) / _CELL)), least=64)
-    settings = dataclasses.replace(fine, rho_cell=_CELL, rho_cells=min(columns, 1_000_000 // fine.theta_cells))
-    points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
-    whole = ring.sensors
-    sensors = dataclasses.replace(whole, max_range=whole.max_range * _BEYOND)
-    moved, gain = _momentum_ascent(sensors, echoes, settings=settings, points=points, speed=speed)
+        raise SonarError(f"autofocus: scans = {scans} came; allowed is 1 or more")
+    # 1. Pack the echoes of the selected scans.
+    echoes, radius = _pack_scans(ring, log, poses, scans, settings)
+    # 2. Choose the accumulator.
+    with_poses = 0 if poses else 1
+    rows, pitch = settings.theta_cells[with_poses], float(np.radians(settings.point_pitch_deg[with_poses]))
+    columns = bucket_size(int(np.ceil((radius + settings.range_margin * ring.max_range) / settings.rho_cell)), least=64)
+    accumulator = HoughSettings(
+        theta_cells=rows,
+        point_pitch=pitch,
+        rho_cell=settings.rho_cell,
+        rho_cells=min(columns, settings.max_cells // rows),
+    )
+    points = kernels.points_of_widest_arc(np.asarray(ring.beam), accumulator)
+    # 3. Climb, and keep the result if the focus improved significantly.
+    nominal = ring.sensors
+    sensors = dataclasses.replace(nominal, max_range=nominal.max_range * settings.range_margin)
+    change, gain = _momentum_ascent(
+        sensors, echoes, accumulator=accumulator, points=points, speed=speed, settings=settings
+    )
     if not float(gain) > ring.count - 1 + speed:  # False for NaN
         return ring
-    move = np.asarray(moved, dtype=np.float64)
-    offset = OFFSET_SD * (move[:-1] - move[:-1].mean())
-    factor = np.exp(PRIOR.speed_sd * move[-1]) if speed else 1.0
+    change = np.asarray(change, dtype=np.float64)
+    offset = settings.offset_sd * (change[:-1] - change[:-1].mean())
+    factor = np.exp(PRIOR.speed_sd * change[-1]) if speed else 1.0
     return dataclasses.replace(
         ring, range_offset=ring.range_offset + offset, speed_of_sound=ring.speed_of_sound * factor
     )
 
 
-def _chosen(ring: Ring, log: Log, poses: bool, most: int) -> tuple[kernels.PackedEchoes, float]:
-    """Packed echoes, all in one row if there are poses, and how far from the origin the sensors are, metres."""
+def _pack_scans(
+    ring: Ring, log: Log, poses: bool, max_scans: int, settings: AutofocusSettings
+) -> tuple[kernels.PackedEchoes, float]:
+    """Packed echoes, in one row if there are poses, and the largest distance of a sensor from the origin, metres."""
+    # 1. Select scans.
     flat, _ = FlatEchoes.from_log(ring, log)
     usable = np.diff(flat.start) > 0
     if poses:
         usable &= np.isfinite(log.pose).all(axis=1)
-        middle = np.median(log.pose[usable, :2], axis=0) if usable.any() else np.zeros(2)
+        median = np.median(log.pose[usable, :2], axis=0) if usable.any() else np.zeros(2)
         with np.errstate(invalid="ignore"):
-            usable &= np.hypot(*(log.pose[:, :2] - middle).T) <= WORLD
+            usable &= np.hypot(*(log.pose[:, :2] - median).T) <= settings.max_distance
     index = np.flatnonzero(usable)
     if not len(index):
         needed = "an echo of this ring's paths" + (" and a pose" if poses else "")
         raise SonarError(f"log: {len(log)} scans came, none with {needed}; allowed is a log with at least one")
-    if len(index) > most:
-        index = index[np.round(np.linspace(0, len(index) - 1, most)).astype(int)]
+    if len(index) > max_scans:
+        index = index[np.round(np.linspace(0, len(index) - 1, max_scans)).astype(int)]
+    # 2. Row and column of each of their echoes.
     rank = np.full(len(log), -1)
     rank[index] = np.arange(len(index))
     row = rank[flat.scan]
     echo = np.flatnonzero(row >= 0)
     row, column = row[echo], echo - flat.start[flat.scan[echo]]
-    size = float(np.hypot(*np.asarray(ring.position).T).max())
+    radius = float(np.hypot(*np.asarray(ring.position).T).max())
+    # 3. Padded arrays.
     if poses:
-        at = log.pose[flat.scan[echo]]
-        centre = at[:, :2].mean(axis=0)
-        at = np.column_stack([at[:, :2] - centre, at[:, 2]])
+        echo_pose = log.pose[flat.scan[echo]]
+        centroid = echo_pose[:, :2].mean(axis=0)
+        echo_pose = np.column_stack([echo_pose[:, :2] - centroid, echo_pose[:, 2]])
         row, column = np.zeros_like(row), np.arange(len(echo))
         shape = (1, bucket_size(len(echo), least=512))
-        size += float(np.hypot(*at[:, :2].T).max())
+        radius += float(np.hypot(*echo_pose[:, :2].T).max())
         pose = np.zeros((*shape, 3), np.float32)
-        pose[row, column] = at
+        pose[row, column] = echo_pose
     else:
         pose, shape = None, (bucket_size(len(index), least=8), bucket_size(int(column.max()) + 1, least=64))
     path, reported = np.zeros(shape, np.int32), np.full(shape, np.nan, np.float32)
     path[row, column] = flat.path[echo]
     reported[row, column] = flat.reported[echo]
-    return kernels.PackedEchoes(jnp.asarray(path), jnp.asarray(reported), None if pose is None else jnp.asarray(pose)), size
+    pose = None if pose is None else jnp.asarray(pose)
+    return kernels.PackedEchoes(jnp.asarray(path), jnp.asarray(reported), pose), radius
 
 
-@partial(jax.jit, static_argnames=("settings", "points", "speed"))
+@partial(jax.jit, static_argnames=("accumulator", "points", "speed", "settings"))
 def _momentum_ascent(
-    sensors: SensorArray, echoes: kernels.PackedEchoes, *, settings: HoughSettings, points: int, speed: bool
+    sensors: SensorArray,
+    echoes: kernels.PackedEchoes,
+    *,
+    accumulator: HoughSettings,
+    points: int,
+    speed: bool,
+    settings: AutofocusSettings,
 ) -> tuple[Float[Array, " parameters"], Float[Array, ""]]:
-    """Momentum steps of falling length on sharpness and prior, coarse to fine, in standard deviations of the prior.
+    """Gradient ascent with momentum and decreasing step length on focus measure and prior, from coarse to fine.
 
-    Steps of a bounded length, because votes are piecewise bilinear: their slopes jump from cell to cell.
+    The step length is bounded, because votes are piecewise bilinear and the gradient jumps from cell to cell.
 
     Returns:
-        The offsets' and the speed's move, and by how much the sharpness at the finest scale rose, nats.
+        The change of the offsets and of the log speed of sound in prior standard deviations, and the increase of the
+        focus measure at the finest scale, nats.
     """
     count = sensors.range_offset.shape[0]
 
-    def allowed(move: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
-        offset = move[:count] - move[:count].mean()
-        offset = offset * jnp.minimum(1, MOST_OFFSET / OFFSET_SD / jnp.maximum(jnp.abs(offset).max(), 1e-6))
-        most = jnp.log1p(jnp.asarray([-MOST_SPEED, MOST_SPEED], move.dtype)) / PRIOR.speed_sd * float(speed)
-        return jnp.append(offset, jnp.clip(move[count], most[0], most[1]))
+    def project(change: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
+        """The closest change within the limits and without mean offset."""
+        offset = change[:count] - change[:count].mean()
+        limit = settings.max_offset / settings.offset_sd
+        offset = offset * jnp.minimum(1, limit / jnp.maximum(jnp.abs(offset).max(), 1e-6))
+        bounds = jnp.asarray([-settings.max_speed_change, settings.max_speed_change], change.dtype)
+        low, high = jnp.log1p(bounds) / PRIOR.speed_sd * float(speed)
+        return jnp.append(offset, jnp.clip(change[count], low, high))
 
-    def sharp(move: Float[Array, " parameters"], width: Float[Array, ""]) -> Float[Array, ""]:
-        offset = sensors.range_offset + OFFSET_SD * move[:count]
-        scale = sensors.range_scale * jnp.exp(PRIOR.speed_sd * move[count])
+    def focus(change: Float[Array, " parameters"], width: Float[Array, ""]) -> Float[Array, ""]:
+        offset = sensors.range_offset + settings.offset_sd * change[:count]
+        scale = sensors.range_scale * jnp.exp(PRIOR.speed_sd * change[count])
         changed = dataclasses.replace(sensors, range_offset=offset, range_scale=scale)
-        return ring_focus_measure(changed, echoes, width, settings=settings, points=points)
+        return ring_focus_measure(changed, echoes, width, settings=accumulator, points=points)
 
-    def slope(move: Float[Array, " parameters"], width: Float[Array, ""]) -> Float[Array, " parameters"]:
-        raw = jax.grad(sharp)(move, width) - move  # the prior's is the move itself, in its standard deviations
-        return jnp.append(raw[:count] - raw[:count].mean(), raw[count] * float(speed))
+    def gradient(change: Float[Array, " parameters"], width: Float[Array, ""]) -> Float[Array, " parameters"]:
+        """Gradient of focus measure and log-prior, without mean offset."""
+        full = jax.grad(focus)(change, width) - change
+        return jnp.append(full[:count] - full[:count].mean(), full[count] * float(speed))
 
-    def one_width(move, stage):
+    def one_width(change, stage):
         width, stride = stage
 
         def step(state, k):
-            move, mean, square = state
-            up = slope(move, width)
-            mean = 0.8 * mean + 0.2 * up
-            square = 0.95 * square + 0.05 * jnp.mean(up * up)  # one for all: directions stay as they are
-            length = stride * (1 - k / _STEPS) / jnp.sqrt(square / (1 - 0.95 ** (k + 1)) + 1e-12)
-            return (allowed(move + length * mean / (1 - 0.8 ** (k + 1))), mean, square), None
+            change, mean, square = state
+            slope = gradient(change, width)
+            mean = settings.momentum * mean + (1 - settings.momentum) * slope
+            # One mean square for all parameters, so that the direction of the gradient is kept.
+            square = settings.square_decay * square + (1 - settings.square_decay) * jnp.mean(slope * slope)
+            unbiased = square / (1 - settings.square_decay ** (k + 1))
+            length = stride * (1 - k / settings.steps) / jnp.sqrt(unbiased + 1e-12)
+            change = project(change + length * mean / (1 - settings.momentum ** (k + 1)))
+            return (change, mean, square), None
 
-        start = (move, jnp.zeros_like(move), jnp.zeros((), move.dtype))
-        return jax.lax.scan(step, start, jnp.arange(_STEPS, dtype=move.dtype))[0][0], None
+        start = (change, jnp.zeros_like(change), jnp.zeros((), change.dtype))
+        return jax.lax.scan(step, start, jnp.arange(settings.steps, dtype=change.dtype))[0][0], None
 
     given = jnp.zeros(count + 1, sensors.range_offset.dtype)
-    stages = (jnp.asarray(_WIDTHS, given.dtype), jnp.asarray(_STRIDES, given.dtype))
-    move, _ = jax.lax.scan(one_width, given, stages)
+    stages = (jnp.asarray(settings.widths, given.dtype), jnp.asarray(settings.strides, given.dtype))
+    change, _ = jax.lax.scan(one_width, given, stages)
     finest = stages[0][-1]
-    return move, sharp(move, finest) - sharp(given, finest)
+    return change, focus(change, finest) - focus(given, finest)

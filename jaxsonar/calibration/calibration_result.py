@@ -13,55 +13,56 @@ from jaxsonar.sensors.ring import Ring
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A ring as its own echoes describe it, and how well they do."""
+    """A calibrated ring, its standard deviations, and the residuals."""
 
     ring: Ring
     """The calibrated ring."""
     nominal: Ring
-    """The ring to start from."""
+    """The nominal ring."""
     free: tuple[str, ...]
-    """What was estimated."""
+    """Parameter groups that were estimated."""
     held: dict[str, str]
-    """What was not, and why."""
-    covariance: Float[np.ndarray, "ring ring"]
-    """Of range offsets (sensors, metres), log speed of sound, positions (sensors x 2, metres); 0 where held."""
+    """Parameters that were not estimated, and why."""
+    covariance: Float[np.ndarray, "parameters parameters"]
+    """Covariance of range offsets (sensors, metres), log speed of sound and positions (sensors x 2, metres); 0 for
+    parameters that were held."""
     heading_sd: Float[np.ndarray, " sensors"]
-    """Standard deviations of the headings, radians; 0 where held."""
+    """Standard deviations of the headings, radians; 0 if they were held."""
     sigma: float
-    """Noise of the ranges as reported, metres."""
+    """Standard deviation of the noise of reported ranges, metres."""
     residuals: Float[np.ndarray, " echoes"]
-    """Reported minus expected range of the echoes that reflectors explain, metres."""
+    """Reported minus predicted range of the echoes that landmarks explain, metres."""
     residuals_before: Float[np.ndarray, " echoes"]
-    """The same echoes with the ring to start from (at the measured temperature, if there is one), walls and free poses
-    fitted to it as well as it can be."""
+    """Residuals of the same echoes with the nominal ring (at the measured temperature, if any), after landmarks and
+    free poses were adjusted to it, metres."""
     echoes: int
-    """Echoes that came."""
+    """Number of all echoes."""
     scans: int
-    """Scans that were used."""
+    """Number of scans that were used."""
     poses: tuple[Float[np.ndarray, "_ 3"], ...]
-    """world_from_robot of the scans of every world, given or estimated; NaN where a scan was not used. A log is a
-    world; where poses were estimated, so is every part of a log that could not be laid on the others."""
+    """world_from_robot of the scans of every world, given or estimated; NaN for scans that were not used. A log is a
+    world; if poses were estimated, so is every part of a log that could not be registered with the others."""
     maps: tuple[GlobalMap, ...]
-    """The map of every world with the calibrated ring."""
+    """Map of every world with the calibrated ring."""
     maps_before: tuple[GlobalMap, ...]
-    """The same with the nominal ring."""
+    """Map of every world with the nominal ring."""
     problem: kernels.LeastSquaresProblem
-    """The least squares that the result solves, in double precision: echoes, reflectors, priors. With ``unknowns`` it
-    is what ``kernels.residuals`` and ``kernels.cost`` take, for a loss of one's own on top."""
+    """The least-squares problem in double precision: echoes, landmarks, priors. ``kernels.residuals`` and
+    ``kernels.cost`` take it together with ``unknowns``, for example to add further terms."""
     unknowns: kernels.Unknowns
-    """Its solution."""
+    """Solution of ``problem``."""
 
     @property
     def range_offset_sd(self) -> Float[np.ndarray, " sensors"]:
-        """Standard deviations of the range offsets relative to their mean, metres; 0 where they are held."""
+        """Standard deviations of the range offsets relative to their mean, metres; 0 if they were held."""
         count = self.ring.count
         relative = np.eye(count) - 1 / count
-        own = relative @ self.covariance[:count, :count] @ relative
-        return np.sqrt(np.maximum(np.diag(own), 0))
+        covariance = relative @ self.covariance[:count, :count] @ relative
+        return np.sqrt(np.maximum(np.diag(covariance), 0))
 
     @property
     def mean_offset_sd(self) -> float:
-        """Standard deviation of the mean range offset, metres; 0 where it is held."""
+        """Standard deviation of the mean range offset, metres; 0 if it was held."""
         count = self.ring.count
         return float(np.sqrt(max(self.covariance[:count, :count].mean(), 0)))
 
@@ -77,62 +78,67 @@ class Calibration:
 
     @property
     def radius(self) -> tuple[float, float]:
-        """Mean distance of the sensors from their middle, and its standard deviation, metres."""
+        """Mean distance of the sensors from their centroid, and its standard deviation, metres."""
         outward = np.asarray(self.ring.position) - np.mean(self.ring.position, axis=0)
-        far = np.linalg.norm(outward, axis=1)
-        weight = (outward / np.where(far > 0, far, 1)[:, None]).ravel() / len(far)
-        places = self.covariance[self.ring.count + 1 :, self.ring.count + 1 :]
-        return float(far.mean()), float(np.sqrt(max(weight @ places @ weight, 0)))
+        radius = np.linalg.norm(outward, axis=1)
+        gradient = (outward / np.where(radius > 0, radius, 1)[:, None]).ravel() / len(radius)
+        covariance = self.covariance[self.ring.count + 1 :, self.ring.count + 1 :]
+        return float(radius.mean()), float(np.sqrt(max(gradient @ covariance @ gradient, 0)))
 
     @property
     def effective_correction(self) -> tuple[Float[np.ndarray, " sensors"], Float[np.ndarray, " sensors"]]:
-        """Range correction of every sensor in its own direction, and its standard deviation, metres.
+        """Effective range correction of every sensor along its heading, and its standard deviation, metres.
 
-        The change of its range offset minus that of its place along its heading: a sensor that sits farther out reports
-        as much less. Where both are free only this is well known.
+        It is the change of the range offset minus that of the position along the heading: a sensor farther out reports
+        correspondingly smaller ranges. If both are free, only this difference is well determined.
         """
         count = self.ring.count
-        ahead = unit(np.asarray(self.ring.heading))
-        moved = np.asarray(self.ring.position) - np.asarray(self.nominal.position)
-        change = np.asarray(self.ring.range_offset) - np.asarray(self.nominal.range_offset) - (ahead * moved).sum(-1)
-        along = np.zeros((count, len(self.covariance)))
-        sensor = np.arange(count)
-        along[sensor, sensor] = 1
-        along[sensor, count + 1 + 2 * sensor] = -ahead[:, 0]
-        along[sensor, count + 2 + 2 * sensor] = -ahead[:, 1]
-        return change, np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", along, self.covariance, along), 0))
+        direction = unit(np.asarray(self.ring.heading))
+        shift = np.asarray(self.ring.position) - np.asarray(self.nominal.position)
+        offset = np.asarray(self.ring.range_offset) - np.asarray(self.nominal.range_offset)
+        correction = offset - (direction * shift).sum(-1)
+        jacobian, sensor = np.zeros((count, len(self.covariance))), np.arange(count)
+        jacobian[sensor, sensor] = 1
+        jacobian[sensor, count + 1 + 2 * sensor] = -direction[:, 0]
+        jacobian[sensor, count + 2 + 2 * sensor] = -direction[:, 1]
+        variance = np.einsum("ij,jk,ik->i", jacobian, self.covariance, jacobian)
+        return correction, np.sqrt(np.maximum(variance, 0))
 
     def correlations(self, *, least: float = 0.7, most: int = 12) -> list[tuple[str, str, float]]:
-        """Pairs of parameters that the echoes hardly tell apart, the closest first: two names and their correlation.
+        """Strongly correlated pairs of parameters, the strongest first: two names and their correlation.
 
-        Offsets are meant relative to their mean, which is a parameter of its own.
+        Offsets are relative to their mean, which is a parameter of its own.
+
+        Args:
+            least: smallest absolute correlation.
+            most: largest number of pairs.
         """
         count, size = self.ring.count, len(self.covariance)
-        turn = np.eye(size)
-        turn[:count, :count] -= 1 / count
-        turn = np.vstack([turn, np.where(np.arange(size) < count, 1 / count, 0)])
-        covariance = turn @ self.covariance @ turn.T
-        places = (f"{axis} {k}" for k in range(count) for axis in "xy")
-        names = [*(f"offset {k}" for k in range(count)), "speed", *places, "mean offset"]
+        transform = np.eye(size)
+        transform[:count, :count] -= 1 / count
+        transform = np.vstack([transform, np.where(np.arange(size) < count, 1 / count, 0)])
+        covariance = transform @ self.covariance @ transform.T
+        positions = (f"{axis} {k}" for k in range(count) for axis in "xy")
+        names = [*(f"offset {k}" for k in range(count)), "speed", *positions, "mean offset"]
         sd = np.sqrt(np.maximum(np.diag(covariance), 0))
-        both = np.outer(sd, sd) * (np.outer(sd, sd) > 1e-12 * sd.max(initial=0) ** 2)
-        value = np.where(both > 0, covariance / np.where(both > 0, both, 1), 0)
+        scale = np.outer(sd, sd) * (np.outer(sd, sd) > 1e-12 * sd.max(initial=0) ** 2)
+        value = np.where(scale > 0, covariance / np.where(scale > 0, scale, 1), 0)
         a, b = np.triu_indices(len(sd), k=1)
         order = np.argsort(-np.abs(value[a, b]), kind="stable")[:most]
         pairs = [(names[i], names[j], float(value[i, j])) for i, j in zip(a[order], b[order], strict=True)]
         return [pair for pair in pairs if abs(pair[2]) >= least]
 
     def summary(self) -> tuple[str, ...]:
-        """The result in a few plain lines."""
-        share = 100 * len(self.residuals) / max(self.echoes, 1)
+        """Summary of the result, line by line."""
+        explained = 100 * len(self.residuals) / max(self.echoes, 1)
         lines = [
-            f"{self.scans} scans, {len(self.residuals)} of {self.echoes} echoes explained ({share:.0f} %); "
+            f"{self.scans} scans, {len(self.residuals)} of {self.echoes} echoes explained ({explained:.0f} %); "
             f"residual RMS {1e3 * self.rms_before:.2f} mm before, {1e3 * self.rms:.2f} mm after"
         ]
         if "offset" in self.free:
             change = np.asarray(self.ring.range_offset) - np.asarray(self.nominal.range_offset)
             lines.append(
-                f"range offsets changed by {1e3 * np.sqrt(np.mean(change**2)):.2f} mm RMS, known to "
+                f"range offsets changed by {1e3 * np.sqrt(np.mean(change**2)):.2f} mm RMS, standard deviation "
                 f"{1e3 * np.sqrt(np.mean(self.range_offset_sd**2)):.2f} mm relative to their mean"
             )
         if "speed" in self.free:
@@ -140,12 +146,13 @@ class Calibration:
         if "radius" in self.free:
             radius, sd = self.radius
             lines.append(f"radius {1e3 * radius:.1f} mm ± {1e3 * sd:.1f}")
-        lines += [f"held: {name.replace('_', ' ')}: {why}" for name, why in self.held.items() if "not asked" not in why]
+        unexpected = ((name.replace("_", " "), why) for name, why in self.held.items() if "not asked" not in why)
+        lines += [f"held: {name}: {why}" for name, why in unexpected]
         return tuple(lines)
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residuals, metres."""
+        """Root mean square of the residuals with the calibrated ring, metres."""
         return float(np.sqrt(np.mean(self.residuals**2)))
 
     @property

@@ -1,4 +1,4 @@
-"""A calibrated ring as a file: the ring as ``load_ring`` takes it, and how well its parameters are known."""
+"""Ring files with a calibration: the ring as ``load_ring`` reads it, and the uncertainty of its parameters."""
 
 import os
 from typing import Any
@@ -11,26 +11,27 @@ from jaxsonar.calibration.calibration_result import Calibration
 from jaxsonar.fileio.atomic_files import open_output
 from jaxsonar.sensors.ring_toml import ring_toml
 
-_DIGITS = 8  # behind the point: 10 nm
+DECIMALS = 8
+"""Decimal places of all numbers in the table: 10 nm."""
 
 
-def save_calibration(calibration: Calibration, path: str | os.PathLike[str]) -> None:
-    """Write the ring with its table ``[calibration]``; ``-`` is standard output.
+def save_calibration(calibration: Calibration, filename: str | os.PathLike[str]) -> None:
+    """Write the ring and a table ``[calibration]`` atomically.
 
     Args:
-        calibration: what was found.
-        path: the file, replaced only once all is written.
+        calibration: the result to write.
+        filename: the file; ``-`` is standard output.
 
     Raises:
-        SonarError: the place cannot be written.
+        SonarError: the file cannot be written.
     """
     text = ring_toml(calibration.ring, each=True) + "\n" + tomli_w.dumps({"calibration": as_table(calibration)})
-    with open_output(path) as file:
+    with open_output(filename) as file:
         file.write(text)
 
 
 def as_table(calibration: Calibration) -> dict[str, Any]:
-    """The table ``[calibration]``: plain numbers; metres, metres per second, degrees where the name says so."""
+    """The table ``[calibration]``: metres, metres per second, and degrees where the name ends in ``_deg``."""
     table: dict[str, Any] = {
         "estimated": list(calibration.free),
         "scans": calibration.scans,
@@ -41,7 +42,7 @@ def as_table(calibration: Calibration) -> dict[str, Any]:
         "residual_rms_after": _short(calibration.rms),
     }
     if "offset" in calibration.free:
-        table["range_offset_sd"] = _list(calibration.range_offset_sd)  # relative to their mean, see README
+        table["range_offset_sd"] = _list(calibration.range_offset_sd)  # relative to their mean
         if "mean_offset" not in calibration.held:
             table["mean_offset_sd"] = _short(calibration.mean_offset_sd)
     if "speed" in calibration.free:
@@ -63,7 +64,7 @@ def as_table(calibration: Calibration) -> dict[str, Any]:
 
 
 def _short(value: float) -> float:
-    return round(float(value), _DIGITS)
+    return round(float(value), DECIMALS)
 
 
 def _list(values: Float[np.ndarray, " sensors"]) -> list[float]:

@@ -1,7 +1,7 @@
-"""A map as the scene that echoes are compared with: every wall, corner and edge, and what may be heard of them."""
+"""Landmarks of a map, and the reflections at them that echoes can be associated with."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,93 +26,118 @@ from jaxsonar.mapping.point_landmarks import cluster_points
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
-_MEETS = 0.3  # m; walls that end this near to where their lines cross make a corner
-_SQUARE = float(np.radians(15.0))  # off a right angle; from there on a corner does not reflect back
-_OF_CORNER = 0.08  # m; a corner of the map this near to where two walls meet is theirs
-_TWICE = 2  # scans that see a point
-_ROOM = 16
+
+@dataclass(frozen=True)
+class LandmarkMapSettings:
+    """Constants of the landmark map. All of them were chosen by hand."""
+
+    max_corner_gap: float = 0.3
+    """Walls that end within this distance of the intersection of their lines form a corner, metres."""
+    max_skew: float = float(np.radians(15.0))
+    """Largest deviation from a right angle at which a corner reflects back to the robot, radians."""
+    corner_radius: float = 0.08
+    """A corner of the map within this distance of an intersection of walls is the same corner, metres."""
+    min_point_scans: int = 2
+    """Scans in which a tentative point must have been detected."""
+    min_rows: int = 16
+    """Landmarks, reflections and candidates are padded to a power of two, at least this."""
+
+
+SETTINGS = LandmarkMapSettings()
 
 
 def map_with_tentative_points(
-    ring: Ring, log: Log, *, window: float | None, models: Sequence[LocalModel] | None = None
+    ring: Ring,
+    log: Log,
+    *,
+    window: float | None,
+    models: Sequence[LocalModel] | None = None,
+    settings: LandmarkMapSettings = SETTINGS,
 ) -> GlobalMap:
-    """The map of a log, with every corner and edge that two scans saw, however little they agree where.
+    """The map of a log, with all corners and edges that two scans detected.
 
-    A map keeps only points that stand still; before ring and poses are adjusted they do not.
+    ``build_map`` keeps only points whose detections agree in position. Before ring and poses are adjusted, those of
+    most points do not.
 
     Args:
         ring: the sensors.
         log: scans with poses.
-        window: metres of path for a local model, where single scans are sparse.
-        models: the local models of the log, where they are known already; without a window they need no poses.
+        window: length of trajectory gathered for one local model, metres; None: single scans.
+        models: the local models of the log if they are known; they need no poses. Not with a window.
+        settings: constants of the map.
     """
     if window is not None:
         return build_map(ring, log, window=window)
     evidence = gather_evidence(ring, log, local_models(ring, log) if models is None else models)
-    world = assemble_map(evidence)
+    map_ = assemble_map(evidence)
     found, _ = cluster_points(merge_cells(evidence.points))
-    apart = np.linalg.norm(found.position[:, None] - world.points[None], axis=-1).min(axis=1, initial=np.inf)
-    more = found.take((found.scan_counts() >= _TWICE) & (apart > _OF_CORNER))
+    distance = np.linalg.norm(found.position[:, None] - map_.points[None], axis=-1).min(axis=1, initial=np.inf)
+    more = found.take((found.scan_counts() >= settings.min_point_scans) & (distance > settings.corner_radius))
     return replace(
-        world,
-        points=np.concatenate([world.points, more.position]),
-        point_kinds=(*world.point_kinds, *more.kinds),
-        point_cov=np.concatenate([world.point_cov, more.inflated_cov]),
-        point_echoes=np.concatenate([world.point_echoes, more.echoes]),
-        point_scans=(*world.point_scans, *more.scan_lists()),
+        map_,
+        points=np.concatenate([map_.points, more.position]),
+        point_kinds=(*map_.point_kinds, *more.kinds),
+        point_cov=np.concatenate([map_.point_cov, more.inflated_cov]),
+        point_echoes=np.concatenate([map_.point_echoes, more.echoes]),
+        point_scans=(*map_.point_scans, *more.scan_lists()),
     )
 
 
 class LandmarkMap(NamedTuple):
-    """Reflectors of one or more worlds, and the reflections that may be heard of them; NumPy arrays, padded."""
+    """Landmarks of one or more worlds, and the reflections at them; NumPy arrays, padded."""
 
     landmarks: kernels.Landmarks
-    world: Int[np.ndarray, " reflectors"]
-    """Which map each reflector is from; -1 for padding."""
+    world: Int[np.ndarray, " landmarks"]
+    """Index of the map that each landmark belongs to; -1 for padding."""
     candidates: kernels.CandidateReflections
-    visible: Bool[np.ndarray, "scans reflectors"] | None = None
-    """Which scans may hear each reflector; None: all."""
+    """Reflections that echoes may be associated with."""
+    visible: Bool[np.ndarray, "scans landmarks"] | None = None
+    """Visibility mask: which scans can observe each landmark; None: all of their world."""
 
     def candidates_in_range(
-        self, poses: Float[np.ndarray, "scans 3"], world: Int[np.ndarray, " scans"], reach: float
+        self, poses: Float[np.ndarray, "scans 3"], world: Int[np.ndarray, " scans"], max_range: float
     ) -> Int[np.ndarray, "scans near"]:
-        """Rows of the candidates that scans may hear, -1 for none: those of their world of which a part is in reach.
+        """Rows of the candidates that each scan can observe; -1 for unused entries.
 
         Args:
-            poses: of the scans, where they are now.
-            world: of each scan.
-            reach: how far off an echo may come from, metres.
+            poses: world_from_robot of the scans.
+            world: index of the map of each scan.
+            max_range: largest distance of the closest part of a landmark, metres.
         """
-        scene, reflection = self.landmarks, self.candidates.reflection
-        wall = np.asarray(scene.kind) == kernels.PLANE
-        parameters, anchor, ends = (np.asarray(leaf) for leaf in (scene.parameters, scene.anchor, scene.extent))
+        landmarks, reflection = self.landmarks, self.candidates.reflection
+        is_wall = np.asarray(landmarks.kind) == kernels.PLANE
+        parameters, anchor, extent = (
+            np.asarray(leaf) for leaf in (landmarks.parameters, landmarks.anchor, landmarks.extent)
+        )
         offset = poses[:, None, :2] - anchor
-        theta = np.where(wall, parameters[:, 1], 0.0)
+        theta = np.where(is_wall, parameters[:, 1], 0.0)
         along = (offset * unit(theta + np.pi / 2)).sum(axis=-1)
-        beyond = np.maximum(np.maximum(ends[:, 0] - along, along - ends[:, 1]), 0.0)
+        beyond_end = np.maximum(np.maximum(extent[:, 0] - along, along - extent[:, 1]), 0.0)
         across = (offset * unit(theta)).sum(axis=-1) - parameters[:, 0]
-        distance = np.where(wall, np.hypot(across, beyond), np.linalg.norm(offset - parameters, axis=-1))
-        either = np.minimum(distance[:, np.asarray(reflection.first)], distance[:, np.asarray(reflection.second)])
-        heard = (either < reach) & (np.asarray(self.candidates.world) == world[:, None]) & (world >= 0)[:, None]
-        heard &= np.asarray(reflection.kind) >= 0
+        distance = np.where(is_wall, np.hypot(across, beyond_end), np.linalg.norm(offset - parameters, axis=-1))
+        first, second = np.asarray(reflection.first), np.asarray(reflection.second)
+        in_range = np.minimum(distance[:, first], distance[:, second]) < max_range
+        in_range &= (np.asarray(self.candidates.world) == world[:, None]) & (world >= 0)[:, None]
+        in_range &= np.asarray(reflection.kind) >= 0
         if self.visible is not None:
-            heard &= self.visible[:, np.asarray(reflection.first)]
-        room = min(next_power_of_two(int(heard.sum(axis=1).max(initial=1)), least=_ROOM), heard.shape[1])
-        order = np.argsort(~heard, axis=1, kind="stable")[:, :room]
-        return np.where(np.take_along_axis(heard, order, axis=1), order, -1).astype(np.int32)
+            in_range &= self.visible[:, first]
+        count = int(in_range.sum(axis=1).max(initial=1))
+        width = min(next_power_of_two(count, least=SETTINGS.min_rows), in_range.shape[1])
+        order = np.argsort(~in_range, axis=1, kind="stable")[:, :width]
+        return np.where(np.take_along_axis(in_range, order, axis=1), order, -1).astype(np.int32)
 
 
 def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> LandmarkMap:
-    """The reflectors of maps.
+    """The landmarks of maps, and the reflections at them.
 
     Args:
-        worlds: one map for every world that scans were taken in.
-        tied: corners are where two walls meet, so that wall to wall reflections say how far off the walls are; a corner
-            is a place of its own otherwise.
+        maps: one map per world.
+        tie_corners: whether a corner is the intersection of its walls, with echoes of second order. These depend on the
+            distance of the walls differently than echoes of first order. Otherwise a corner is a landmark of its own.
     """
     parts: list[kernels.Landmarks] = []
     world: list[Int[np.ndarray, " landmarks"]] = [np.zeros(0, int)]
-    meetings: list[tuple[int, int, int]] = []  # first wall, second wall, world
+    wall_pairs: list[tuple[int, int, int]] = []  # first wall, second wall, world
     for number, map_ in enumerate(maps):
         pairs, is_intersection = _wall_intersections(map_)
         first = sum(len(part.kind) for part in parts)
@@ -120,8 +145,8 @@ def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> Landmark
         parts.append(map_landmarks(map_).take(np.flatnonzero(kept)))
         world.append(np.full(len(parts[-1].kind), number))
         if tie_corners:
-            meetings += [(first + a, first + b, number) for a, b in pairs]
-    return _padded(concatenate_landmarks(parts), np.concatenate(world), meetings)
+            wall_pairs += [(first + a, first + b, number) for a, b in pairs]
+    return _padded(concatenate_landmarks(parts), np.concatenate(world), wall_pairs)
 
 
 def map_landmarks(map_: GlobalMap) -> kernels.Landmarks:
@@ -131,48 +156,49 @@ def map_landmarks(map_: GlobalMap) -> kernels.Landmarks:
     return concatenate_landmarks([landmarks_from_segments(map_.rho, map_.theta, map_.segments), points])
 
 
-def _wall_intersections(map_: GlobalMap) -> tuple[list[tuple[int, int]], Bool[np.ndarray, " points"]]:
-    """Pairs of walls that end where they meet at about a right angle, and which corners of the map are these."""
-    count = len(map_)
-    a, b = np.triu_indices(count, k=1)
-    turn = np.abs(np.sin(map_.theta[a] - map_.theta[b]))
-    square = turn > np.cos(_SQUARE)
-    a, b = a[square], b[square]
-    normal = unit(map_.theta)
-    both = np.stack([normal[a], normal[b]], axis=1)
-    cross = np.linalg.solve(both, np.stack([map_.rho[a], map_.rho[b]], axis=-1)[..., None])[..., 0]
-    near = np.ones(len(a), dtype=bool)
+def _wall_intersections(
+    map_: GlobalMap, settings: LandmarkMapSettings = SETTINGS
+) -> tuple[list[tuple[int, int]], Bool[np.ndarray, " points"]]:
+    """Pairs of walls that form a corner of about a right angle, and which points of the map are such corners."""
+    a, b = np.triu_indices(len(map_), k=1)
+    perpendicular = np.abs(np.sin(map_.theta[a] - map_.theta[b])) > np.cos(settings.max_skew)
+    a, b = a[perpendicular], b[perpendicular]
+    normals = np.stack([unit(map_.theta)[a], unit(map_.theta)[b]], axis=1)
+    crossing = np.linalg.solve(normals, np.stack([map_.rho[a], map_.rho[b]], axis=-1)[..., None])[..., 0]
+    meet = np.ones(len(a), dtype=bool)
     for wall in (a, b):
-        near &= np.linalg.norm(map_.segments[wall] - cross[:, None], axis=-1).min(axis=1) < _MEETS
-    cross = cross[near]
-    apart = np.linalg.norm(map_.points[:, None] - cross[None], axis=-1).min(axis=1, initial=np.inf)
-    corner = np.array([name == "corner" for name in map_.point_kinds], dtype=bool)
-    return list(zip(a[near].tolist(), b[near].tolist(), strict=True)), corner & (apart < _OF_CORNER)
+        gap = np.linalg.norm(map_.segments[wall] - crossing[:, None], axis=-1).min(axis=1)
+        meet &= gap < settings.max_corner_gap
+    distance = np.linalg.norm(map_.points[:, None] - crossing[meet][None], axis=-1).min(axis=1, initial=np.inf)
+    is_corner = np.array([kind == "corner" for kind in map_.point_kinds], dtype=bool)
+    pairs = list(zip(a[meet].tolist(), b[meet].tolist(), strict=True))
+    return pairs, is_corner & (distance < settings.corner_radius)
 
 
 def _padded(
-    scene: kernels.Landmarks, world: Int[np.ndarray, " reflectors"], meetings: Sequence[tuple[int, int, int]]
+    landmarks: kernels.Landmarks,
+    world: Int[np.ndarray, " landmarks"],
+    wall_pairs: Sequence[tuple[int, int, int]],
+    settings: LandmarkMapSettings = SETTINGS,
 ) -> LandmarkMap:
-    """With room for a power of two of reflectors, and of candidates, so that few shapes are compiled."""
+    """The map with landmarks and candidates padded to powers of two, so that few shapes are compiled."""
     count = len(world)
-    room = next_power_of_two(count, least=_ROOM)
-    scene = pad_landmarks(scene, room)
-    first, second, of_world = np.array(meetings, dtype=np.int32).reshape(-1, 3).T
+    landmarks = pad_landmarks(landmarks, next_power_of_two(count, least=settings.min_rows))
+    first, second, pair_world = np.array(wall_pairs, dtype=np.int32).reshape(-1, 3).T
     pairs = len(first)
-    size = next_power_of_two(count + 2 * pairs, least=_ROOM)
-    rest = size - count - 2 * pairs
-    alone = np.arange(count, dtype=np.int32)
+    size = next_power_of_two(count + 2 * pairs, least=settings.min_rows)
+    own = np.arange(count, dtype=np.int32)
+    # Second-order reflections at a pair of walls occur in both orders; the two are one group.
+    kind = np.concatenate([landmarks.kind[:count], np.full(2 * pairs, kernels.SECOND_ORDER, np.int32)])
+    group = np.concatenate([own, count + np.tile(np.arange(pairs), 2)]).astype(np.int32)
     candidates = kernels.CandidateReflections(
         reflection=kernels.Reflection(
-            kind=np.concatenate(
-                [scene.kind[:count], np.full(2 * pairs, kernels.SECOND_ORDER, np.int32), np.full(rest, -1, np.int32)]
-            ),
-            first=np.concatenate([alone, first, second, np.zeros(rest, np.int32)]),
-            second=np.concatenate([alone, second, first, np.zeros(rest, np.int32)]),
+            kind=pad_rows(kind, size, fill=-1),
+            first=pad_rows(np.concatenate([own, first, second]), size),
+            second=pad_rows(np.concatenate([own, second, first]), size),
         ),
-        world=np.concatenate([world, of_world, of_world, np.full(rest, -1)]).astype(np.int32),
-        group=np.concatenate(
-            [alone, count + np.tile(np.arange(pairs), 2), np.full(rest, -1)], dtype=np.int32, casting="unsafe"
-        ),
+        world=pad_rows(np.concatenate([world, pair_world, pair_world]).astype(np.int32), size, fill=-1),
+        group=pad_rows(group, size, fill=-1),
     )
-    return LandmarkMap(scene, pad_rows(world.astype(np.int32), room, fill=-1), candidates)
+    world = pad_rows(world.astype(np.int32), len(landmarks.kind), fill=-1)
+    return LandmarkMap(landmarks, world, candidates)
