@@ -1,4 +1,4 @@
-"""The exception family of the project, and the text helpers for its messages. Kept in the lowest layer that raises it."""
+"""The exception family of the project and text helpers for its messages, in the lowest layer that raises it."""
 
 import os
 

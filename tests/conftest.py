@@ -81,7 +81,7 @@ def short_demo(tmp_path_factory):
         return tables
 
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
-        patch.setattr(demo, "RANDOM_ROOMS", 2)
+        patch.setattr(demo, "SETTINGS", demo.DemoSettings(random_rooms=2))
         patch.setattr(demo, "run_demo", run)
         assert main(["demo", "-o", "demo"]) == 0
     return folder, tables, said

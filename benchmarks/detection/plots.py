@@ -1,4 +1,4 @@
-"""Figures and tables of the accuracy benchmark, from its measures: one function, one figure."""
+"""Figures and tables of the detection benchmark."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,17 +13,18 @@ from rich.table import Table
 from jaxsonar.reports import plot_style
 
 KINDS = ("plane", "corner", "edge")
-"""Kinds of reflectors; poles are told like edges."""
+"""Kinds of reflectors; poles are content like edges."""
 ANSWERS = (*KINDS, "undecided", "nothing")
+"""Classes that a method can report for a reflector."""
 Series = dict[float, dict[str, dict[str, float]]]
-"""What was varied: its values, the methods, their measures."""
+"""Measures of each method by the value of the varied parameter."""
 MARKERS = ("o", "s", "^", "v", "D", "P")
 WIDE = 15.0
-"""NEES from which on all count as one."""
+"""Upper limit of the NEES axis."""
 
 
 def crb_figure(rows: dict[str, Series]) -> Figure:
-    """Root mean square errors over the bound against the noise, a row for each kind of scans."""
+    """Root mean square errors over the bound by noise, one row per kind of scans."""
     with plot_style.figure_style():
         figure = Figure(figsize=(7.6, 2.9 * len(rows) + 0.7), layout="constrained")
         grid = figure.subplots(len(rows), 2, sharex=True, sharey="col", squeeze=False)
@@ -45,7 +46,7 @@ def crb_figure(rows: dict[str, Series]) -> Figure:
 
 
 def robustness_figure(columns: dict[str, Series]) -> Figure:
-    """Recall and false lines against what goes wrong, a column for each."""
+    """Recall and false lines by the share of lost or false echoes, one column each."""
     with plot_style.figure_style():
         figure = Figure(figsize=(7.6, 5.6), layout="constrained")
         grid = figure.subplots(2, len(columns), sharex="col", sharey="row", squeeze=False)
@@ -61,7 +62,7 @@ def robustness_figure(columns: dict[str, Series]) -> Figure:
 
 
 def confusion_figure(tables: dict[str, Int[np.ndarray, "4 5"]]) -> Figure:
-    """Shares of each kind's reflectors by what was told of them, and how many reports are of nothing."""
+    """Shares of each kind's reflectors by what was content of them, and how many reports are of nothing."""
     across = 3
     down = -(-len(tables) // across)
     with plot_style.figure_style():
@@ -85,13 +86,13 @@ def confusion_figure(tables: dict[str, Int[np.ndarray, "4 5"]]) -> Figure:
             axes.set_yticks(range(4), [*KINDS[:2], "edge, pole", "nothing"])
             axes.tick_params(length=0)
             axes.spines[:].set_visible(False)
-        figure.supxlabel("told", fontsize=9)
+        figure.supxlabel("reported", fontsize=9)
         figure.supylabel("true", fontsize=9)
     return figure
 
 
 def nees_figure(values: dict[str, Float[np.ndarray, " walls"]]) -> Figure:
-    """Squared errors in units of the reported covariance, against the chi-squared density of two degrees of freedom."""
+    """Histograms of the NEES with the chi-squared density of two degrees of freedom."""
     values = {name: some for name, some in values.items() if len(some)}
     with plot_style.figure_style():
         figure = Figure(figsize=(3.0 * max(len(values), 1) + 0.6, 3.0), layout="constrained")
@@ -115,20 +116,20 @@ def nees_figure(values: dict[str, Float[np.ndarray, " walls"]]) -> Figure:
     return figure
 
 
-def tables(told: dict[str, Any]) -> Iterator[Table]:
-    """What is printed, from what the JSON file holds; the first condition is the base."""
-    v, s, base = told["versions"], told["settings"], told["conditions"][0]
+def tables(content: dict[str, Any]) -> Iterator[Table]:
+    """Tables to print, from the content of the JSON file. The first condition is the base."""
+    v, s, base = content["versions"], content["settings"], content["conditions"][0]
     table = Table(
-        title=f"Walls with {s['clear_echoes']} or more first-order echoes; "
-        f"{s['rooms']} random rooms, {s['poses']} poses in each, seed {s['seed']}",
-        caption=f"base: {_said(base)}; undec.: % of the walls that are seen but undecided; ± standard error; "
-        "/CRB: of root mean squares; 99 %: of |error| / CRB; NEES: mean, 2 is right. "
+        title=f"Walls with {s['clear_echoes']} or more received first-order echoes; "
+        f"{s['rooms']} random rooms, {s['poses']} poses each, seed {s['seed']}",
+        caption=f"base: {_condition_text(base)}; undec.: % of the walls that are undecided; ± standard error; "
+        "/CRB: ratio of root mean squares; 99 %: quantile of |error| / CRB; NEES: mean, 2 is consistent. "
         f"numpy {v['numpy']}, jax {v['jax']} on {v['device']}, OpenCV {v['cv2']}",
     )
     columns = ("", "walls", "recall (%)", "undec.", "false/scan", "RMSE (mm)", "(deg)", "median (mm)", "(deg)")
     for column in (*columns, "ρ/CRB", "θ/CRB", "99 % ρ", "99 % θ", "NEES"):
         table.add_column(column, justify="left" if not column else "right", no_wrap=True)
-    for condition in told["conditions"]:
+    for condition in content["conditions"]:
         table.add_section()
         table.add_row(f"[bold]{condition['name']}[/]")
         for name, got in condition["methods"].items():
@@ -145,11 +146,11 @@ def tables(told: dict[str, Any]) -> Iterator[Table]:
             )
     yield table
     table = Table(
-        title=f"Kinds of reflectors with {s['clear_reflector']} or more echoes: % of those of a kind; {_said(base)}",
-        caption="nothing there: reports a scan at which there is no reflector; echoes of second order and false ones",
+        title=f"Classification of reflectors with {s['clear_reflector']} or more echoes: % of each kind; {_condition_text(base)}",
+        caption="nothing there: reports per scan without a reflector, from second-order and false echoes",
     )
-    for column in ("", "is", "reflectors", *(f"told {answer}" for answer in ANSWERS)):
-        table.add_column(column, justify="left" if column in ("", "is") else "right")
+    for column in ("", "is", "reflectors", *(f"content {answer}" for answer in ANSWERS)):
+        table.add_column(column, justify="left" if column in ("", "true") else "right")
     for name, got in base["methods"].items():
         table.add_section()
         for row, (kind, cells) in enumerate(zip((*KINDS, "nothing there"), got["confusion"], strict=True)):
@@ -160,11 +161,11 @@ def tables(told: dict[str, Any]) -> Iterator[Table]:
     yield table
     table = Table(
         title=f"One reflector at {s['ranges_m'][0]} to {s['ranges_m'][1]} m: a plane, a right-angled corner or an edge",
-        caption="right: of those that were decided",
+        caption="correct: share of the decided ones",
     )
-    for column in ("", "reflectors", "right (%)", "undecided (%)", "nothing (%)"):
+    for column in ("", "reflectors", "correct (%)", "undecided (%)", "missed (%)"):
         table.add_column(column, justify="left" if not column else "right")
-    for condition in told["isolated"]:
+    for condition in content["isolated"]:
         table.add_section()
         table.add_row(f"[bold]{condition['name']}[/]")
         for name, got in condition["methods"].items():
@@ -173,23 +174,23 @@ def tables(told: dict[str, Any]) -> Iterator[Table]:
             table.add_row(f"  {name}", str(got["reflectors"]), right, *shares)
     yield table
     table = Table(
-        title="Worst deviation of three long walls from one scan, sigma 1 mm",
-        caption="of scans in which all three were found; the paper: "
-        f"{told['paper']['rho_mm']} mm, {told['paper']['theta_deg']} deg",
+        title="Largest deviation of three long walls from one scan, sigma 1 mm",
+        caption="scans in which all three were found; the paper: "
+        f"{content['paper']['rho_mm']} mm, {content['paper']['theta_deg']} deg",
     )
     for column in ("", "scans", "all found (%)", "median (mm)", "90 % (mm)", "median (deg)", "90 % (deg)"):
         table.add_column(column, justify="left" if not column else "right")
-    for name, got in told["three"][0]["methods"].items():
+    for name, got in content["three"][0]["methods"].items():
         values = (got[f"{key}_p{share}"] for key in ("rho_mm", "theta_deg") for share in (50, 90))
         table.add_row(name, str(got["scans"]), f"{100 * got['all_found']:.1f}", *(f"{x:.2f}" for x in values))
     yield table
 
 
 def _lines(axes: Axes, series: Series, key: str, *, across: float = 1.0, up: float = 1.0) -> None:
-    """A measure of every method over what was varied, with its standard error."""
+    """Plot a measure of each method over the varied parameter, with standard errors."""
     names = list(dict.fromkeys(name for row in series.values() for name in row))
     values = across * np.array(list(series), dtype=float)
-    beside = 0.008 * np.ptp(values)  # so that bars that would hide one another stand side by side
+    beside = 0.008 * np.ptp(values)  # the error bars of the methods stand side by side
     for k, name in enumerate(names):
         x = values + beside * (k - (len(names) - 1) / 2)
         y, error = (
@@ -208,8 +209,8 @@ def _with_legend(figure: Figure, axes: Axes, *first: str) -> Figure:
     return figure
 
 
-def _said(c: dict[str, Any]) -> str:
-    """A condition in words."""
+def _condition_text(c: dict[str, Any]) -> str:
+    """Text of a condition."""
     return (
         f"{c['sigma'] * 1e3:g} mm, {100 * c['lost']:g} % lost, {100 * c['false']:g} % false, "
         f"cones of {c['cone_deg']:g} deg, {c['sensors']} sensors"

@@ -13,7 +13,7 @@ from jaxsonar.hardware.mcap_recorder import MESSAGES, PROFILE, read_mcap
 from jaxsonar.hardware.protocol import Decoder
 from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler
 from jaxsonar.scans.log_file import load_log
-from jaxsonar.scans.parquet_log import open_parquet, write_parquet_parts
+from jaxsonar.scans.parquet_log import open_parquet, write_parquet_chunks
 from jaxsonar.scans.scan_log import Log, Scan
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -50,13 +50,13 @@ def stage_as_parquet(log: Input, filename: str, *, sensors: int, rows: int) -> N
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             scans = load_log(log.filename)
-        write_parquet_parts([scans], filename)
+        write_parquet_chunks([scans], filename)
     elif log.format == "mcap" and _is_raw_recording(log.filename):
-        write_parquet_parts(_row_groups(_raw_recording_scans(log.filename, log.source, sensors), rows), filename)
+        write_parquet_chunks(_row_groups(_raw_recording_scans(log.filename, log.source, sensors), rows), filename)
     else:
-        from jaxsonar.scans.rosbag_log import bag_scans
+        from jaxsonar.scans.rosbag_log import read_bag_scans
 
-        write_parquet_parts(_row_groups(bag_scans(log.filename, name=log.source), rows), filename)
+        write_parquet_chunks(_row_groups(read_bag_scans(log.filename, name=log.source), rows), filename)
 
 
 def _regroup(log: Input, filename: str, rows: int) -> None:

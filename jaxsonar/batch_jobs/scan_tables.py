@@ -175,9 +175,9 @@ def _empty_reasons(counts: Columns, components: np.ndarray, method: str, setting
     reasons = np.full(len(counts["lines"]), None, object)
     others = counts["points"] + counts["undecided"]
     for k in np.flatnonzero(counts["lines"] == 0):
-        in_range = counts["in_range"][k]
+        in_range = int(counts["in_range"][k])
         if method == "hough":
-            reasons[k] = no_line_reason(in_range, components[k], settings.min_echoes)
+            reasons[k] = no_line_reason(in_range, int(components[k]), settings.min_echoes)
         else:
-            reasons[k] = no_wall_reason(in_range, others[k])
+            reasons[k] = no_wall_reason(in_range, int(others[k]))
     return reasons

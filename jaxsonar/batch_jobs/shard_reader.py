@@ -9,7 +9,7 @@ from jaxtyping import Int
 from jaxsonar.batch_jobs.shards import Shard
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.scans.log_chunks import csv_reader, parquet_reader
+from jaxsonar.scans.log_chunks import csv_chunk_reader, parquet_chunk_reader
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -33,7 +33,7 @@ def read_shard(shard: Shard, ring: Ring) -> tuple[Log, Int[np.ndarray, " scans"]
         raise SonarError(f"{shown(shard.source)}: {reason(failure)}; needed is a readable log") from None
     if (status.st_size, status.st_mtime_ns) != (shard.size, shard.modified_ns):
         raise SonarError(f"{shown(shard.source)}: changed during the batch; needed is a log that does not change")
-    reader = csv_reader if shard.format == "csv" else parquet_reader
+    reader = csv_chunk_reader if shard.format == "csv" else parquet_chunk_reader
     read = reader(shard.filename, shard.part, name=shard.source)
 
     runs, reasons = _readable_runs(read, shard.part.scans)

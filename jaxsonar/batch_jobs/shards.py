@@ -7,7 +7,7 @@ from pathlib import Path
 from jaxsonar.batch_jobs.inputs import Input
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.scans.log_chunks import Part, csv_parts, parquet_parts
+from jaxsonar.scans.log_chunks import LogChunk, csv_chunks, parquet_chunks
 
 SHARD_SCANS = 2048
 """Scans per shard: some seconds of work, so that a lost process costs little, and not too many files."""
@@ -32,7 +32,7 @@ class Shard:
     """Size of that file when the shard was planned, bytes."""
     modified_ns: int
     """Modification time of that file when the shard was planned, nanoseconds."""
-    part: Part
+    part: LogChunk
     """The scans in that file."""
 
 
@@ -59,7 +59,7 @@ def split_input(log: Input, *, staging: Path, sensors: int, scans: int = SHARD_S
         status = os.stat(filename)
     except OSError as failure:
         raise SonarError(f"{shown(log.source)}: {reason(failure)}; needed is a readable log") from None
-    parts = (csv_parts if format_ == "csv" else parquet_parts)(filename, name=log.source, scans=scans)
+    parts = (csv_chunks if format_ == "csv" else parquet_chunks)(filename, name=log.source, scans=scans)
     return [
         Shard(f"{log.key}-{k:06d}", log.source, filename, format_, status.st_size, status.st_mtime_ns, part)
         for k, part in enumerate(parts)

@@ -1,6 +1,6 @@
-"""The command line: the table of commands, the parser, and the answer to errors.
+"""The command line: the list of commands, the parser, and error handling.
 
-Nothing heavy is imported here, so that help is fast. What a command does is in the module of its name.
+Nothing heavy is imported here, so that ``--help`` is fast. Each command is implemented in the module of its name.
 """
 
 import argparse
@@ -29,21 +29,21 @@ COMMANDS = (
     "stream",
     "emulate",
 )
-"""In the order of the help. Each is a module of this package with SUMMARY, ``add_arguments`` and ``run``."""
+"""Commands in the order of the help. Each is a module with SUMMARY, ``add_arguments`` and ``run``."""
 
-COMPILING = ("demo", "lines", "map", "slam", "localize", "calibrate", "check")
-"""Commands for which compiled kernels are cached on disk. ``stream`` and ``batch`` set up the cache themselves."""
+CACHED_COMMANDS = ("demo", "lines", "map", "slam", "localize", "calibrate", "check")
+"""Commands that use the compilation cache. ``stream`` and ``batch`` set it up themselves."""
 
 
 class _Parser(argparse.ArgumentParser):
-    """Answers a wrong call with one line and exit code 2."""
+    """Answers an invalid call with one line and exit code 2."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {' '.join(message.split())}; see {self.prog} --help\n")
 
 
 def parser() -> argparse.ArgumentParser:
-    """The parser of the whole command line."""
+    """Build the parser of the command line."""
     top = _Parser(prog="jaxsonar", description="Maps from the echoes of an ultrasonic ring.", allow_abbrev=False)
     top.add_argument("--version", action="version", version=f"jaxsonar {metadata.version('jaxsonar')}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -55,25 +55,29 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def _joined(arguments: Sequence[str]) -> list[str]:
-    """With negative numbers that follow an option written as one with it: argparse takes -0.1,0,90 for an option."""
-    out: list[str] = []
-    for one in arguments:
-        if out and out[-1] in ("--start", "--odometry") and re.match(r"-[\d.]", one):
-            out[-1] += f"={one}"
+def _join_negative_values(arguments: Sequence[str]) -> list[str]:
+    """Join options with negative values: argparse would read the value ``-0.1,0,90`` as an option."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] in ("--start", "--odometry") and re.match(r"-[\d.]", argument):
+            joined[-1] += f"={argument}"
         else:
-            out.append(one)
-    return out
+            joined.append(argument)
+    return joined
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code: 0 done, 2 the input or the call was wrong, 1 anything else, or a part undone."""
-    options = parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
-    if sys.stdout is None:  # closed by whoever called
+    """Run one command.
+
+    Returns:
+        Exit code: 0 done; 2 invalid input or call; 1 anything else, or incomplete results.
+    """
+    options = parser().parse_args(_join_negative_values(sys.argv[1:] if arguments is None else arguments))
+    if sys.stdout is None:  # the caller closed standard output
         with open(os.devnull, "w") as sys.stdout:
             return main(arguments)
     try:
-        if options.command in COMPILING:
+        if options.command in CACHED_COMMANDS:
             import_module("jaxsonar.fileio.compilation_cache").use_compilation_cache()
         code = import_module(f"jaxsonar.cli.{options.command}").run(options)
         sys.stdout.flush()
@@ -84,10 +88,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jaxsonar {options.command}: interrupted", file=sys.stderr)
         return 1
     except BrokenPipeError:
-        # The reader of our output has gone: what is left goes nowhere, or Python complains about it at the end.
+        # The reader of the output is gone. Discard the rest; otherwise Python reports an error at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except OSError as error:  # a full disk behind standard output
+    except OSError as error:  # for example, standard output is redirected to a full disk
         print(f"jaxsonar {options.command}: {error.strerror or error}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1

@@ -1,4 +1,4 @@
-"""Argument types and options that several commands share. Nothing heavy is imported, so that help is fast."""
+"""Argument types and options shared by several commands. Nothing heavy is imported, so that ``--help`` is fast."""
 
 import argparse
 import math
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from jaxsonar.fileio.atomic_files import FIGURE_FORMATS
 
 if TYPE_CHECKING:
-    from jaxsonar.estimation.odometry_noise import Slip
+    from jaxsonar.estimation.odometry_noise import OdometryNoise
 
 
 RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
@@ -17,11 +17,11 @@ SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for e
 
 SETTINGS_HELP = "accumulator and low pass, for hough also threshold, instead of the paper's"
 
-ODOMETRY_HELP = "how wrong the odometry is after 1 m: %% of the way and deg (default: 3,1.5)"
+ODOMETRY_HELP = "standard deviation of the odometry after 1 m: %% of the distance and deg (default: 3,1.5)"
 
 
 def number(kind: type, least: float | int, most: float | int):
-    """A number from ``least`` to ``most``, or a message that says so."""
+    """An argparse type: a number within [least, most]."""
 
     def parse(text: str):
         try:
@@ -38,19 +38,19 @@ def number(kind: type, least: float | int, most: float | int):
 
 
 def finite(least: float | int, most: float | int = 1e9):
-    """A type for argparse: a finite number within limits."""
+    """An argparse type: a finite number within [least, most]."""
     return number(float, least, most)
 
 
 def filename(text: str) -> str:
-    """A type for argparse: the name of a file, which is not checked to exist."""
+    """An argparse type: a filename. The file need not exist."""
     if not text or "\0" in text:
         raise argparse.ArgumentTypeError(f"{text!r} came; allowed is the name of a file")
     return text
 
 
 def filename_ending_in(*suffixes: str):
-    """A name with one of these suffixes: a wrong one is refused before the work, not after it."""
+    """An argparse type: a filename with one of these suffixes, checked before the computation."""
 
     def parse(text: str) -> str:
         if Path(text).suffix.lower() not in suffixes:
@@ -64,7 +64,7 @@ figure_filename = filename_ending_in(*FIGURE_FORMATS)
 
 
 def odometry_error(text: str) -> tuple[float, float]:
-    """Two numbers, per cent of the way and degrees."""
+    """An argparse type: odometry error after 1 m as PERCENT,DEG."""
     try:
         percent, degrees = map(finite(0, 100), text.split(","))
     except (ValueError, argparse.ArgumentTypeError):
@@ -88,16 +88,18 @@ def add_slam_arguments(command: argparse.ArgumentParser) -> None:
     """Add ``--ring``, ``--sigma`` and ``--odometry`` as ``slam`` and ``localize`` have them."""
     command.add_argument("--ring", type=filename, required=True, help=RING_HELP)
     command.add_argument(
-        "--sigma", type=finite(1e-4, 1), metavar="METRES", help="noise of the ranges (default: found out)"
+        "--sigma", type=finite(1e-4, 1), metavar="METRES", help="standard deviation of the ranges (default: estimated)"
     )
     command.add_argument("--odometry", type=odometry_error, metavar="PERCENT,DEG", help=ODOMETRY_HELP)
 
 
-def odometry_noise_of(given: tuple[float, float] | None) -> "Slip":
-    """From per cent of the way and degrees, after one metre."""
-    from jaxsonar.estimation.odometry_noise import Slip
+def odometry_noise(error: tuple[float, float] | None) -> "OdometryNoise":
+    """Odometry noise from per cent of the distance and degrees, after one metre; None: the default."""
+    from jaxsonar.estimation.odometry_noise import OdometryNoise
 
-    if given is None:
-        return Slip()
-    place, heading = max(given[0] / 100, 1e-4), max(math.radians(given[1]), 1e-4)
-    return Slip(place=place, heading=heading, turn=max(place, heading))
+    if error is None:
+        return OdometryNoise()
+    position, heading = max(error[0] / 100, 1e-4), max(math.radians(error[1]), 1e-4)
+    return OdometryNoise(
+        position_per_meter=position, heading_per_meter=heading, heading_per_radian=max(position, heading)
+    )

@@ -5,9 +5,10 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from jaxsonar.cli.arguments import RING_HELP, SETTINGS_HELP, add_method, filename, number
-from jaxsonar.cli.console import check_sigma_is_used, count, print_left_out, print_status, progress_bar
+from jaxsonar.cli.console import check_sigma_is_used, print_left_out, print_status, progress_bar
+from jaxsonar.reports.text import plural
 
-SUMMARY = "Lines of every scan of many logs, as Parquet; goes on where it was ended."
+SUMMARY = "Lines of every scan of many logs, as Parquet; resumes after an interruption."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,14 +29,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--engine", choices=("local", "dask"), default="local", help="default: local; dask: a cluster (extra cluster)"
     )
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster (default: one on this machine)")
     parser.add_argument(
-        "--workers", type=number(int, 1, 1024), metavar="N", help="processes (default: one a core, or a GPU)"
+        "--scheduler", metavar="ADDRESS", help="address of a Dask cluster (default: start one on this machine)"
+    )
+    parser.add_argument(
+        "--workers",
+        type=number(int, 1, 1024),
+        metavar="N",
+        help="processes (default: one per GPU or, without a GPU, per core)",
     )
 
 
 def run(options: argparse.Namespace) -> int:
-    """``jaxsonar batch``; 1 if anything was set aside."""
+    """Run ``jaxsonar batch``. Returns 1 if anything was set aside."""
     from jaxsonar.batch_jobs.run_batch import batch as run_batch
     from jaxsonar.detection.settings_toml import load_settings
     from jaxsonar.fileio.atomic_files import shown
@@ -64,11 +70,14 @@ def run(options: argparse.Namespace) -> int:
         )
     if report.left_out:
         print_left_out(ring.name, report.left_out)
-    shards = count(report.shards, "shard") + (f", {report.resumed} of them by an earlier run" if report.resumed else "")
+    shards = plural(report.shards, "shard") + (
+        f", {report.resumed} of them by an earlier run" if report.resumed else ""
+    )
     print_status(f"{report.scans} scans, {report.lines} lines, {shards}: {shown(options.output)}")
     if report.set_aside:
         print_status(
-            f"set aside: {report.set_aside_summary}; {shown(report.manifest)} says why; the first: {report.set_aside[0]}"
+            f"set aside: {report.set_aside_summary}; the reasons are in {shown(report.manifest)}; the first: "
+            f"{report.set_aside[0]}"
         )
         return 1
     return 0

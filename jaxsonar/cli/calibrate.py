@@ -3,9 +3,9 @@
 import argparse
 
 from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, finite
-from jaxsonar.cli.console import plain_name, print_status, step_status
+from jaxsonar.cli.console import ascii_name, errors_in, print_status, step_status, write_figure
 
-SUMMARY = "Find out how a ring really is, from ordinary scans of a room nobody measured."
+SUMMARY = "Calibrate a ring from ordinary scans of an unknown room."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -13,7 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "logs", nargs="+", type=filename, metavar="LOG", help="scan logs of this ring, .csv or .parquet"
     )
-    parser.add_argument("--ring", type=filename, required=True, help=f"the ring as it should be: {RING_HELP}")
+    parser.add_argument("--ring", type=filename, required=True, help=f"the nominal ring: {RING_HELP}")
     parser.add_argument(
         "-o", "--output", type=filename, metavar="RING2", required=True, help="the calibrated ring, TOML; - = stdout"
     )
@@ -21,58 +21,54 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--poses",
         choices=("trust", "estimate"),
         default="trust",
-        help="of the logs: right (default), or odometry if anything, and to be estimated",
+        help="poses of the logs: exact (trust, default), or odometry or missing (estimate)",
     )
     parser.add_argument(
         "--free",
         type=lambda text: tuple(name.strip() for name in text.split(",")),
         default=("offset", "speed"),
         metavar="LIST",
-        help="what is estimated: offset, speed, position, radius, heading, with commas (default: offset,speed)",
+        help="estimated parameters: offset, speed, position, radius, heading, with commas (default: offset,speed)",
     )
     parser.add_argument(
         "--odometry",
         type=finite(1e-4, 1),
         default=0.02,
         metavar="SHARE",
-        help="of the way that odometry is wrong by (default: 0.02)",
+        help="relative error of the odometry (default: 0.02)",
     )
-    parser.add_argument("--temperature", type=finite(-60, 85), metavar="DEG_C", help="of the air, if it was measured")
+    parser.add_argument("--temperature", type=finite(-60, 85), metavar="DEG_C", help="measured air temperature")
     parser.add_argument(
-        "--sigma", type=finite(1e-4, 1), metavar="METRES", help="noise of the ranges (default: estimated)"
+        "--sigma", type=finite(1e-4, 1), metavar="METRES", help="standard deviation of the ranges (default: estimated)"
     )
     parser.add_argument(
-        "--window", type=finite(0.01, 100), metavar="METRES", help="gather so much path, for rings of few sensors"
+        "--window",
+        type=finite(0.01, 100),
+        metavar="METRES",
+        help="combine the echoes of this distance driven, for rings with few sensors",
     )
-    parser.add_argument("--figure", type=figure_filename, metavar="FIG", help="report on a page, .svg, .png or .pdf")
+    parser.add_argument("--figure", type=figure_filename, metavar="FIG", help="draw the results, .svg, .png or .pdf")
 
 
 def run(options: argparse.Namespace) -> None:
-    """``jaxsonar calibrate``."""
+    """Run ``jaxsonar calibrate``."""
     from jaxsonar.calibration.calibrate import calibrate as calibrate_ring
     from jaxsonar.calibration.calibration_toml import save_calibration
     from jaxsonar.fileio.atomic_files import check_outputs
-    from jaxsonar.hardware.errors import SonarError
     from jaxsonar.scans.log_file import load_log
     from jaxsonar.sensors.ring_toml import load_ring
 
     check_outputs({"-o": options.output, "--figure": options.figure}, [*options.logs, options.ring])
-    ring, logs = load_ring(options.ring), [load_log(path) for path in options.logs]
+    ring, logs = load_ring(options.ring), [load_log(log) for log in options.logs]
     choices = {key: getattr(options, key) for key in ("free", "poses", "odometry", "temperature", "sigma", "window")}
-    try:
-        with step_status() as step:
-            found = calibrate_ring(ring, logs, **choices, on_step=step)
-    except SonarError as error:
-        raise SonarError(f"{', '.join(plain_name(path) for path in options.logs)}: {error}") from None
+    with errors_in(", ".join(ascii_name(log) for log in options.logs)), step_status() as step:
+        calibration = calibrate_ring(ring, logs, **choices, on_step=step)
     figure = None
     if options.figure:
-        from jaxsonar.reports import plot_calibration as figures_calibration
+        from jaxsonar.reports.plot_calibration import calibration_figure
 
-        figure = figures_calibration.calibration_figure(found)
-    save_calibration(found, options.output)
-    if figure is not None:
-        from jaxsonar.reports import plot_style as figures
-
-        figures.save(figure, options.figure)
-    for line in found.summary():
+        figure = calibration_figure(calibration)
+    save_calibration(calibration, options.output)
+    write_figure(figure, options.figure)
+    for line in calibration.summary():
         print_status(line)

@@ -1,14 +1,21 @@
-"""What the commands print and how they report progress, and checks of options that several commands share."""
+"""Output shared by the commands: status lines, progress, tables, figures and JSON; and shared checks of options."""
 
+import json
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from rich.table import Table
 
 Item = TypeVar("Item")
+PIPE_WIDTH = 140
+"""Width of a table that is not printed on a terminal, characters. Chosen by hand: the widest table fits."""
 
 
 def print_status(text: str) -> None:
@@ -17,13 +24,51 @@ def print_status(text: str) -> None:
 
 
 def print_left_out(ring: str, count: int) -> None:
-    """Report echoes of pairs of sensors that are no echo path of the ring."""
+    """Report echoes whose sensor pairs are not echo paths of the ring."""
     print_status(f"left out {count} echoes of pairs of sensors that {ring!r} does not listen to")
+
+
+def print_tables(*tables: "Table") -> None:
+    """Print tables on standard output."""
+    from rich.console import Console
+
+    console = Console(width=None if sys.stdout.isatty() else PIPE_WIDTH)
+    for table in tables:
+        console.print(table)
+
+
+def write_json(value: Any, filename: str) -> None:
+    """Write a value as JSON; ``-`` is standard output."""
+    from jaxsonar.fileio.atomic_files import open_output
+
+    text = json.dumps(value, allow_nan=False, indent=1)
+    with open_output(filename) as file:
+        file.write(text + "\n")
+
+
+def write_figure(figure: "Figure | None", filename: str) -> None:
+    """Write a figure; None (no figure was requested) writes nothing."""
+    if figure is not None:
+        from jaxsonar.reports.plot_style import save_figure
+
+        save_figure(figure, filename)
+
+
+@contextmanager
+def errors_in(place: str) -> Iterator[None]:
+    """Prepend the place of an error, usually a filename, to the message of a SonarError."""
+    from jaxsonar.fileio.atomic_files import shown
+    from jaxsonar.hardware.errors import SonarError
+
+    try:
+        yield
+    except SonarError as error:
+        raise SonarError(f"{shown(place)}: {error}") from None
 
 
 @contextmanager
 def step_status() -> Iterator[Callable[[str], None]]:
-    """What is being done, on standard error: a line that changes on a terminal, otherwise nothing."""
+    """Show the current step on standard error, if it is a terminal. Yields a function that takes the text."""
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -36,14 +81,18 @@ def step_status() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def stage_status() -> Iterator[Callable[[str, int, int], None]]:
-    """What is being done and how far it is, on standard error: a line that changes on a terminal, otherwise nothing."""
+    """Show the current stage and its progress on standard error, if it is a terminal.
+
+    Yields:
+        A function that takes the text, the number done, and the total number (0: unknown).
+    """
     with step_status() as show:
         yield lambda text, done, total: show(f"{text} {done} of {total}" if total else text)
 
 
 @contextmanager
 def progress_bar(unit: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """A progress bar on standard error, with rate and time left; the function given is told how many are done."""
+    """Show a progress bar on standard error, if it is a terminal. Yields a function that takes the number done."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -74,28 +123,23 @@ def progress_bar(unit: str, total: int | None) -> Iterator[Callable[[int], None]
 
 
 def with_progress(items: Iterable[Item], total: int | None, unit: str) -> Iterator[Item]:
-    """The same items, with a progress bar on standard error."""
+    """Yield the items and show a progress bar on standard error."""
     with progress_bar(unit, total) as show:
         for done, item in enumerate(items, start=1):
             yield item
             show(done)
 
 
-def count(number: int, what: str) -> str:
-    """A number and its noun, in the plural where needed."""
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
-def plain_name(path: str) -> str:
-    """A file's name as a figure's font can show it."""
-    return Path(path).name.encode("ascii", "replace").decode()
+def ascii_name(filename: str) -> str:
+    """The name of a file in ASCII, for the title of a figure."""
+    return Path(filename).name.encode("ascii", "replace").decode()
 
 
 def check_sigma_is_used(sigma: float | None, method: str, window: float | None) -> None:
-    """Refuse ``--sigma`` with a method that does not use it.
+    """Check that the method uses ``--sigma``.
 
     Raises:
-        SonarError: it would be ignored.
+        SonarError: ``--sigma`` would be ignored.
     """
     from jaxsonar.hardware.errors import SonarError
 
@@ -105,32 +149,32 @@ def check_sigma_is_used(sigma: float | None, method: str, window: float | None) 
 
 
 def laser_files(recording: str | None) -> list[Path]:
-    """The files that a corridor8 recording with a laser is read from; a folder, or its laser.txt."""
+    """The files of a corridor8 recording with a laser, given its folder or its laser.txt; none for None."""
     if recording is None:
         return []
     laser = Path(recording) / "laser.txt" if Path(recording).is_dir() else Path(recording)
     return [laser, laser.with_name("poses.txt")]
 
 
-def settings_beside(output: str) -> Path | None:
-    """Where the settings of a result go; none beside standard output, a device or a pipe."""
-    path = Path(output)
-    return None if output == "-" or (path.exists() and not path.is_file()) else path.with_suffix(".settings.toml")
+def settings_filename(output: str) -> Path | None:
+    """The file for the settings of a result, beside it. None for standard output, a device or a pipe."""
+    file = Path(output)
+    return None if output == "-" or (file.exists() and not file.is_file()) else file.with_suffix(".settings.toml")
 
 
 @contextmanager
 def stopped_by_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set; a second one of them ends the process as usual."""
+    """Yield an event that Ctrl-C and SIGTERM set. A second signal ends the process as usual."""
     stop = threading.Event()
     before = {}
 
-    def told(number: int, _: object) -> None:
+    def on_signal(number: int, _: object) -> None:
         stop.set()
         signal.signal(number, before[number])
 
     for number in (signal.SIGINT, signal.SIGTERM):
         before[number] = signal.getsignal(number)
-        signal.signal(number, told)
+        signal.signal(number, on_signal)
     try:
         yield stop
     finally:

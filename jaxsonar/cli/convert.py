@@ -1,10 +1,10 @@
-"""``jaxsonar convert``: scan logs between formats, and recordings into scan logs."""
+"""``jaxsonar convert``: convert scan logs between formats, and recordings to scan logs."""
 
 import argparse
 
 from jaxsonar.cli.console import print_status
 
-SUMMARY = "Scan logs between CSV and Parquet, and recordings of devices into scan logs."
+SUMMARY = "Convert scan logs between CSV and Parquet, and recordings of devices to scan logs."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """``jaxsonar convert``."""
+    """Run ``jaxsonar convert``."""
     from jaxsonar.scans.convert import convert as convert_log
 
     log = convert_log(options.source, options.destination, from_=options.from_)

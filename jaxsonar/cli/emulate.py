@@ -1,4 +1,4 @@
-"""``jaxsonar emulate``: a log or a floor plan, sent as a device would send it."""
+"""``jaxsonar emulate``: a device that sends a log, or the scans of a simulated drive."""
 
 import argparse
 from pathlib import Path
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 from jaxsonar.cli.arguments import RING_HELP, finite, number
 from jaxsonar.cli.console import print_status, stopped_by_signals
 
-SUMMARY = "A log, or a room and a way through it, as a device."
+SUMMARY = "Emulate a device: play a log, or simulate a drive through a room."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,22 +28,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="URL",
         help="tcp://HOST:PORT, udp://HOST:PORT (PORT 0: any), pty: or pty:PATH; without HOST this machine only",
     )
-    parser.add_argument("--speed", type=finite(0, 1e6), default=1.0, metavar="FACTOR", help="0 = as fast as it goes")
-    parser.add_argument("--corrupt", type=finite(0, 1), default=0.0, metavar="P", help="share of frames to damage")
-    parser.add_argument("--drop", type=finite(0, 1), default=0.0, metavar="P", help="share of frames to lose")
-    parser.add_argument("--reorder", type=finite(0, 1), default=0.0, metavar="P", help="share of frames to send late")
-    parser.add_argument("--stall", metavar="S[@EVERY]", help="say nothing for S seconds, every EVERY seconds")
     parser.add_argument(
-        "--seed", type=number(int, 0, 2**32 - 1), default=0, help="of the faults, and of a room's noise"
+        "--speed", type=finite(0, 1e6), default=1.0, metavar="FACTOR", help="playback speed; 0 = as fast as possible"
     )
-    parser.add_argument("--path", metavar="CSV", help="the way through a room: columns x, y (m), theta (rad), [stamp]")
     parser.add_argument(
-        "--sigma", type=finite(0, 1), default=0.0, metavar="M", help="range noise in a room (default: 0)"
+        "--corrupt", type=finite(0, 1), default=0.0, metavar="P", help="probability that a frame is corrupted"
+    )
+    parser.add_argument("--drop", type=finite(0, 1), default=0.0, metavar="P", help="probability that a frame is lost")
+    parser.add_argument(
+        "--reorder",
+        type=finite(0, 1),
+        default=0.0,
+        metavar="P",
+        help="probability that a frame is swapped with the next",
+    )
+    parser.add_argument("--stall", metavar="S[@EVERY]", help="pause for S seconds, every EVERY seconds")
+    parser.add_argument(
+        "--seed", type=number(int, 0, 2**32 - 1), default=0, help="seed of the faults and of the simulated noise"
+    )
+    parser.add_argument(
+        "--path", metavar="CSV", help="trajectory through a room: columns x, y (m), theta (rad), [stamp]"
+    )
+    parser.add_argument(
+        "--sigma", type=finite(0, 1), default=0.0, metavar="M", help="simulated range noise (default: 0)"
     )
 
 
 def run(options: argparse.Namespace) -> None:
-    """``jaxsonar emulate``."""
+    """Run ``jaxsonar emulate``."""
     from jaxsonar.hardware.device_emulator import emulate as emulate_device
     from jaxsonar.hardware.fault_injection import FaultSettings, parse_stall
     from jaxsonar.hardware.transport_servers import listen
@@ -83,7 +95,7 @@ def _messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
 
         return messages_of(options.log, ring)
     if not options.path:
-        raise SonarError("a room came without --path; needed is the way through it, --path CSV")
+        raise SonarError("a room came without --path; needed is a trajectory, --path CSV")
     from jaxsonar.floor_plans.room_geojson import load_room
     from jaxsonar.simulation.device_messages import room_messages
     from jaxsonar.simulation.poses_csv import load_poses

@@ -1,4 +1,4 @@
-"""``jaxsonar lines``: straight lines around the robot, scan by scan."""
+"""``jaxsonar lines``: detected lines around the robot, scan by scan."""
 
 import argparse
 from collections import Counter
@@ -7,12 +7,20 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from jaxsonar.detection.extract import LocalModel
+    from jaxsonar.detection.local_map import LocalModel
 
 from jaxsonar.cli.arguments import RING_HELP, SETTINGS_HELP, add_method, figure_filename, number
-from jaxsonar.cli.console import check_sigma_is_used, print_left_out, print_status, settings_beside, with_progress
+from jaxsonar.cli.console import (
+    check_sigma_is_used,
+    errors_in,
+    print_left_out,
+    print_status,
+    settings_filename,
+    with_progress,
+    write_figure,
+)
 
-SUMMARY = "Straight lines around the robot, from every scan of a log."
+SUMMARY = "Detect lines around the robot, in every scan of a log."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_method(parser)
     parser.add_argument("--settings", metavar="TOML", help=SETTINGS_HELP)
     parser.add_argument(
-        "-o", "--output", metavar="LINES", required=True, help="JSON Lines, an object a scan; - = stdout"
+        "-o", "--output", metavar="LINES", required=True, help="JSON Lines, one object per scan; - = stdout"
     )
     parser.add_argument(
         "--figure", type=figure_filename, metavar="FIG", help="draw arcs and lines of one scan, .svg, .png or .pdf"
@@ -31,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """``jaxsonar lines``."""
+    """Run ``jaxsonar lines``."""
     from jaxsonar.detection.extract import local_models
     from jaxsonar.detection.local_map import save_models
     from jaxsonar.detection.settings import hough_settings
@@ -48,10 +56,10 @@ def run(options: argparse.Namespace) -> None:
     ring, log = load_ring(options.ring), load_log(options.log)
     settings = hough_settings(ring, load_settings(options.settings) if options.settings else None)
     if options.scan is not None and options.scan not in log.scan:
-        held = f"numbers from {log.scan.min()} to {log.scan.max()}" if len(log) else "none"
-        raise SonarError(f"--scan {options.scan}: no such scan in {shown(options.log)}; it holds {len(log)}, {held}")
+        numbers = f"numbers from {log.scan.min()} to {log.scan.max()}" if len(log) else "none"
+        raise SonarError(f"--scan {options.scan}: no such scan in {shown(options.log)}; it holds {len(log)}, {numbers}")
 
-    try:
+    with errors_in(options.log):
         models = local_models(
             ring,
             log,
@@ -60,45 +68,45 @@ def run(options: argparse.Namespace) -> None:
             sigma=options.sigma,
             on_left_out=partial(print_left_out, ring.name),
         )
-    except SonarError as error:
-        raise SonarError(f"{shown(options.log)}: {error}") from None
-    tally = RunSummary(options.scan)
-    save_models(tally.watch(with_progress(models, len(log), "scans")), options.output)
-    if beside := settings_beside(options.output):
-        save_settings(settings, beside)
-    model = tally.wanted
+    summary = RunSummary(options.scan)
+    save_models(summary.observe(with_progress(models, len(log), "scans")), options.output)
+    if settings_file := settings_filename(options.output):
+        save_settings(settings, settings_file)
+    model = summary.model_to_draw
     if options.figure and model is None:
         print_status(f"no scan to draw: {options.figure} is not written")
     elif options.figure and model is not None:
-        from jaxsonar.reports import plot_scan as figures_scan
-        from jaxsonar.reports import plot_style as figures
+        from jaxsonar.reports.plot_scan import lines_figure
 
         scan = log[int((log.scan == model.scan).argmax())]
-        figures.save(figures_scan.lines_figure(ring, scan, model), options.figure)
-    print_status(tally.summary())
+        write_figure(lines_figure(ring, scan, model), options.figure)
+    print_status(summary.text())
 
 
 class RunSummary:
-    """What a run over many scans came to, and the model that a figure is wanted of."""
+    """Counts lines over all scans, and keeps the local model that is to be drawn."""
 
-    def __init__(self, scan: int | None):
-        self.scans = self.lines = self.with_lines = 0
+    def __init__(self, scan_to_draw: int | None):
+        self.scans = self.lines = self.scans_with_lines = 0
         self.reasons: Counter[str] = Counter()
-        self.scan = scan
-        self.wanted: LocalModel | None = None
+        """Number of scans without lines, by reason."""
+        self.scan_to_draw = scan_to_draw
+        self.model_to_draw: LocalModel | None = None
 
-    def watch(self, models: "Iterable[LocalModel]") -> "Iterator[LocalModel]":
+    def observe(self, models: "Iterable[LocalModel]") -> "Iterator[LocalModel]":
+        """Yield the same models, and count them."""
         for model in models:
             self.scans += 1
             self.lines += len(model.lines)
-            self.with_lines += bool(model.lines)
+            self.scans_with_lines += bool(model.lines)
             if model.empty:
                 self.reasons[model.empty] += 1
-            if self.wanted is None and self.scan in (None, model.scan):
-                self.wanted = model
+            if self.model_to_draw is None and self.scan_to_draw in (None, model.scan):
+                self.model_to_draw = model
             yield model
 
-    def summary(self) -> str:
-        share = f" ({100 * self.with_lines / self.scans:.1f} %)" if self.scans else ""
-        reasons = "".join(f"; {count} without: {why}" for why, count in self.reasons.most_common())
-        return f"{self.scans} scans, {self.lines} lines, {self.with_lines} scans with lines{share}{reasons}"
+    def text(self) -> str:
+        """One line for the user."""
+        share = f" ({100 * self.scans_with_lines / self.scans:.1f} %)" if self.scans else ""
+        reasons = "".join(f"; {count} without: {reason}" for reason, count in self.reasons.most_common())
+        return f"{self.scans} scans, {self.lines} lines, {self.scans_with_lines} scans with lines{share}{reasons}"

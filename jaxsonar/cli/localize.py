@@ -6,15 +6,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from jaxsonar.mapping.global_map import GlobalMap
 
-from jaxsonar.cli.arguments import add_slam_arguments, figure_filename, filename, odometry_noise_of
-from jaxsonar.cli.console import count, plain_name, print_status, stage_status
+from jaxsonar.cli.arguments import add_slam_arguments, figure_filename, filename, odometry_noise
+from jaxsonar.cli.console import ascii_name, errors_in, print_status, stage_status, write_figure
+from jaxsonar.reports.text import plural
 
-SUMMARY = "Where the robot is in a known map."
+SUMMARY = "Localize the robot in a known map."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar localize``."""
-    parser.add_argument("log", type=filename, metavar="LOG", help="scan log of a short path, .csv or .parquet")
+    parser.add_argument("log", type=filename, metavar="LOG", help="scan log of a short drive, .csv or .parquet")
     parser.add_argument(
         "--map", type=filename, required=True, metavar="MAP", help="the known map, or a floor plan: GeoJSON"
     )
@@ -23,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--start",
         type=_pose,
         metavar="X,Y,DEG",
-        help="about where the first scan was taken (m, m, deg): within 0.5 m and 20 deg (default: anywhere)",
+        help="approximate pose of the first scan (m, m, deg), within 0.5 m and 20 deg (default: unknown)",
     )
     parser.add_argument(
         "--trajectory", type=filename, required=True, metavar="TRAJ", help="poses, TUM format; - = stdout"
@@ -32,10 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """``jaxsonar localize``; 1 if the place is not certain."""
+    """Run ``jaxsonar localize``. Returns 1 if the pose is not certain."""
     from jaxsonar.estimation.trajectory import save_trajectory
-    from jaxsonar.fileio.atomic_files import check_outputs, shown
-    from jaxsonar.hardware.errors import SonarError
+    from jaxsonar.fileio.atomic_files import check_outputs
     from jaxsonar.localization.localize import localize as run_localize
     from jaxsonar.scans.log_file import load_log
     from jaxsonar.sensors.ring_toml import load_ring
@@ -44,47 +44,41 @@ def run(options: argparse.Namespace) -> int:
         {"--trajectory": options.trajectory, "--figure": options.figure}, [options.log, options.ring, options.map]
     )
     ring, log, world = load_ring(options.ring), load_log(options.log), _load_known_map(options.map)
-    try:
-        with stage_status() as progress:
-            found = run_localize(
-                ring,
-                world,
-                log,
-                start=options.start,
-                sigma=options.sigma,
-                odometry_noise=odometry_noise_of(options.odometry),
-                progress=progress,
-            )
-    except SonarError as error:
-        raise SonarError(f"{shown(options.log)}: {error}") from None
-    if not found.is_certain:
-        print_status(found.reason)
+    with errors_in(options.log), stage_status() as progress:
+        result = run_localize(
+            ring,
+            world,
+            log,
+            start=options.start,
+            sigma=options.sigma,
+            odometry_noise=odometry_noise(options.odometry),
+            progress=progress,
+        )
+    if not result.is_certain:
+        print_status(result.reason)
         return 1
-    trajectory = found.trajectory
+    trajectory = result.trajectory
     figure = None
     if options.figure:
-        from jaxsonar.reports import plot_slam as figures_slam
+        from jaxsonar.reports.plot_slam import slam_figure
 
-        figure = figures_slam.slam_figure(
+        figure = slam_figure(
             world,
             trajectory,
-            title=f"{count(len(trajectory), 'pose')} in {plain_name(options.map)}",
+            title=f"{plural(len(trajectory), 'pose')} in {ascii_name(options.map)}",
         )
     save_trajectory(trajectory, options.trajectory)
-    if figure is not None:
-        from jaxsonar.reports import plot_style as figures
-
-        figures.save(figure, options.figure)
-    print_status(found.reason)
+    write_figure(figure, options.figure)
+    print_status(result.reason)
     if len(trajectory) < len(log):
         print_status(
-            f"{len(log) - len(trajectory)} of {count(len(log), 'scan')} could not be registered to the others: no pose"
+            f"{len(log) - len(trajectory)} of {plural(len(log), 'scan')} have no pose: they could not be registered"
         )
     return 0
 
 
-def _load_known_map(path: str) -> "GlobalMap":
-    """A map, or a floor plan as one; what is neither is refused as a map."""
+def _load_known_map(map_filename: str) -> "GlobalMap":
+    """Load a map, or a floor plan as a map."""
     from jaxsonar.fileio.atomic_files import shown
     from jaxsonar.floor_plans.room_geojson import load_room
     from jaxsonar.hardware.errors import SonarError
@@ -92,19 +86,19 @@ def _load_known_map(path: str) -> "GlobalMap":
     from jaxsonar.mapping.map_geojson import load_map
 
     try:
-        world = load_map(path)
-    except SonarError as no_map:
+        world = load_map(map_filename)
+    except SonarError as not_a_map:
         try:
-            world = map_from_room(load_room(path))
+            world = map_from_room(load_room(map_filename))
         except SonarError:
-            raise no_map from None
+            raise not_a_map from None
     if not len(world):
-        raise SonarError(f"{shown(path)}: no wall; allowed is a map with walls")
+        raise SonarError(f"{shown(map_filename)}: no wall; allowed is a map with walls")
     return world
 
 
 def _pose(text: str) -> tuple[float, float, float]:
-    """Three numbers: metres, metres, degrees."""
+    """An argparse type: a pose as X,Y,DEG (metres, metres, degrees)."""
     import math
 
     try:

@@ -1,4 +1,4 @@
-"""``jaxsonar map``: a global line map from scans with known poses."""
+"""``jaxsonar map``: a map from scans with known poses."""
 
 import argparse
 from pathlib import Path
@@ -19,17 +19,19 @@ from jaxsonar.cli.arguments import (
     finite,
 )
 from jaxsonar.cli.console import (
+    ascii_name,
     check_sigma_is_used,
-    count,
+    errors_in,
     laser_files,
-    plain_name,
     print_left_out,
     print_status,
-    settings_beside,
+    settings_filename,
     with_progress,
+    write_figure,
 )
+from jaxsonar.reports.text import plural
 
-SUMMARY = "The walls of the world, from a log of scans with poses."
+SUMMARY = "Build a map of walls, from a log of scans with poses."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,10 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--window",
         type=finite(0.01, 100),
         metavar="METRES",
-        help="gather the echoes of this much path into one local model, for rings of few sensors (try 1.5)",
+        help="combine the echoes of this distance driven into one local model, for rings with few sensors (try 1.5)",
     )
     parser.add_argument(
-        "--merging", choices=("fused", "paper"), default="fused", help="how segments become walls (default: fused)"
+        "--merging",
+        choices=("fused", "paper"),
+        default="fused",
+        help="method that merges segments to walls (default: fused)",
     )
     parser.add_argument(
         "-o", "--output", type=filename, metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout"
@@ -69,13 +74,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """``jaxsonar map``."""
+    """Run ``jaxsonar map``."""
     import numpy as np
 
     from jaxsonar.detection.extract import local_models
     from jaxsonar.detection.settings import hough_settings
     from jaxsonar.detection.settings_toml import load_settings
-    from jaxsonar.fileio.atomic_files import check_outputs, shown, write_toml
+    from jaxsonar.fileio.atomic_files import check_outputs, write_toml
     from jaxsonar.hardware.errors import SonarError
     from jaxsonar.mapping.build_map import assemble_map, check_poses, required_scans
     from jaxsonar.mapping.map_evidence import gather_evidence
@@ -84,13 +89,13 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.scans.sliding_windows import check_window
     from jaxsonar.sensors.ring_toml import load_ring
 
-    beside = settings_beside(options.output)
-    if beside is not None and options.settings is not None and Path(options.settings).resolve() == beside.resolve():
-        beside = None  # the settings that were given are there already
+    settings_file = settings_filename(options.output)
+    if settings_file and options.settings and Path(options.settings).resolve() == settings_file.resolve():
+        settings_file = None  # it already holds these settings
     check_outputs(
         {
             "-o": options.output,
-            "settings beside the map:": beside,
+            "settings beside the map:": settings_file,
             "--figure": options.figure,
             "--grid": options.grid,
             "--grid's image": options.grid and Path(options.grid).with_suffix(".pgm"),
@@ -110,7 +115,7 @@ def run(options: argparse.Namespace) -> None:
     given = None if options.settings is None else load_settings(options.settings)
     settings = hough_settings(ring, given, window=options.window)
     left_out: list[int] = []
-    try:
+    with errors_in(options.log):
         check_poses(log)
         models = local_models(
             ring,
@@ -121,43 +126,35 @@ def run(options: argparse.Namespace) -> None:
             window=options.window,
             on_left_out=left_out.append,
         )
-    except SonarError as error:
-        raise SonarError(f"{shown(options.log)}: {error}") from None
     points = None if options.laser is None else _laser_points(options.laser)
     models = list(with_progress(models, len(log) if options.window is None else None, "local models"))
     evidence = gather_evidence(ring, log, models)
     world = assemble_map(evidence, merging=options.merging, min_scans=required_scans(options.window))
 
-    # Everything is made before anything is written.
+    # Compute everything before the first file is written.
     grid = figure = None
+    has_pose = np.all(np.isfinite(log.pose), axis=1)
     if options.grid:
         from jaxsonar.occupancy.nav2_map import check_grid
         from jaxsonar.occupancy.occupancy_grid import occupancy
 
-        try:
+        with errors_in(f"--grid {options.grid}"):
             grid = occupancy(ring, log, walls=world.segments)
             check_grid(grid)
-        except SonarError as error:
-            raise SonarError(f"--grid {shown(options.grid)}: {error}") from None
     if options.figure:
-        from jaxsonar.reports import plot_map as figures_map
+        from jaxsonar.reports.plot_map import map_figure
 
-        placed = log.pose[np.all(np.isfinite(log.pose), axis=1)]
-        figure = figures_map.map_figure(
+        figure = map_figure(
             world,
             aggregated=evidence.segments.endpoints,
-            poses=placed,
+            poses=log.pose[has_pose],
             laser_points=points,
-            title=f"{count(len(world), 'wall')} from {plain_name(options.log)}",
+            title=f"{plural(len(world), 'wall')} from {ascii_name(options.log)}",
         )
     save_map(world, options.output)
-    if beside is not None:
-        write_toml(
-            _run_settings(
-                settings, method=options.method, sigma=options.sigma, window=options.window, merging=options.merging
-            ),
-            beside,
-        )
+    if settings_file is not None:
+        names = ("method", "sigma", "window", "merging")
+        write_toml(_run_settings(settings, {name: getattr(options, name) for name in names}), settings_file)
     if grid is not None:
         from jaxsonar.occupancy.nav2_map import save_nav2
 
@@ -166,17 +163,14 @@ def run(options: argparse.Namespace) -> None:
         from jaxsonar.mapping.map_dxf import save_dxf
 
         save_dxf(world, options.dxf)
-    if figure is not None:
-        from jaxsonar.reports import plot_style as figures
-
-        figures.save(figure, options.figure)
+    write_figure(figure, options.figure)
     if left_out:
         print_left_out(ring.name, left_out[0])
-    homeless = int((~np.all(np.isfinite(log.pose), axis=1)).sum())
-    without = f"; {count(homeless, 'scan')} without a pose left out" if homeless else ""
+    without_pose = int((~has_pose).sum())
+    remark = f"; {plural(without_pose, 'scan')} without a pose left out" if without_pose else ""
     print_status(
-        f"{count(len(log), 'scan')}, {count(len(models), 'local model')}, "
-        f"{count(len(evidence.segments), 'segment')}, {count(len(world), 'wall')}, {world.length.sum():.1f} m{without}"
+        f"{plural(len(log), 'scan')}, {plural(len(models), 'local model')}, "
+        f"{plural(len(evidence.segments), 'segment')}, {plural(len(world), 'wall')}, {world.length.sum():.1f} m{remark}"
     )
 
 
@@ -187,10 +181,10 @@ def _laser_points(recording: str) -> "np.ndarray":
     return laser_points(read_corridor8_laser(recording), reach=5.0, every=4)
 
 
-def _run_settings(settings: "HoughSettings", **choices: object) -> dict[str, object]:
-    """Settings and what else a result was made with, as a table for TOML."""
+def _run_settings(settings: "HoughSettings", options: dict[str, object]) -> dict[str, object]:
+    """The settings and options of a run, as a table for TOML."""
     from dataclasses import asdict
 
-    said: dict[str, object] = asdict(settings)
-    said["command"] = {key: value for key, value in choices.items() if value is not None}
-    return said
+    table: dict[str, object] = asdict(settings)
+    table["command"] = {name: value for name, value in options.items() if value is not None}
+    return table

@@ -1,9 +1,10 @@
-"""``jaxsonar reference``: reference walls from the laser that rode along."""
+"""``jaxsonar reference``: reference walls from a laser on the same robot."""
 
 import argparse
 
 from jaxsonar.cli.arguments import figure_filename, filename, finite, number
-from jaxsonar.cli.console import count, laser_files, print_status
+from jaxsonar.cli.console import laser_files, print_status, write_figure
+from jaxsonar.reports.text import plural
 
 SUMMARY = "Reference walls of a run, from the laser of the same robot."
 
@@ -13,19 +14,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=filename, metavar="RECORDING", help="folder with laser.txt and poses.txt")
     parser.add_argument("--from", dest="from_", choices=("corridor8",), default="corridor8", help="its format")
     parser.add_argument(
-        "--reach", type=finite(0.1, 100), default=3.5, metavar="M", help="of what came this near (default: 3.5 m)"
+        "--reach", type=finite(0.1, 100), default=3.5, metavar="M", help="maximum laser range (default: 3.5 m)"
     )
     parser.add_argument(
-        "--scan", type=number(int, 0, 2**62), metavar="N", help="the polygonal model of this scan alone, laser frame"
+        "--scan", type=number(int, 0, 2**62), metavar="N", help="polygonal model of this scan only, laser frame"
     )
     parser.add_argument(
         "-o", "--output", type=filename, metavar="REF", required=True, help="GeoJSON, metres; - = stdout"
     )
-    parser.add_argument("--figure", type=figure_filename, metavar="FIG", help="draw it, .svg, .png or .pdf")
+    parser.add_argument("--figure", type=figure_filename, metavar="FIG", help="draw the walls, .svg, .png or .pdf")
 
 
 def run(options: argparse.Namespace) -> None:
-    """``jaxsonar reference``."""
+    """Run ``jaxsonar reference``."""
     import numpy as np
 
     from jaxsonar.evaluation.laser_map import laser_points, reference_map, save_reference
@@ -34,8 +35,7 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.geometry.se2 import unit
     from jaxsonar.hardware.errors import SonarError
     from jaxsonar.hardware.laser_datasets import read_corridor8_laser
-    from jaxsonar.reports import plot_map as figures_map
-    from jaxsonar.reports import plot_style as figures
+    from jaxsonar.reports.plot_map import laser_figure
 
     check_outputs({"-o": options.output, "--figure": options.figure}, laser_files(options.recording))
     laser = read_corridor8_laser(options.recording)
@@ -48,17 +48,16 @@ def run(options: argparse.Namespace) -> None:
         except SonarError as error:
             raise SonarError(f"{shown(options.recording)}: {error}") from None
         length = np.hypot(*(walls[:, 1] - walls[:, 0]).T).sum()
-        what = f"{count(len(laser.stamp), 'scan')}, {count(len(walls), 'wall')}, {length:.1f} m"
+        what = f"{plural(len(laser.stamp), 'scan')}, {plural(len(walls), 'wall')}, {length:.1f} m"
     else:
         ranges = laser.ranges[options.scan]
         walls = polygonal_model(laser.bearing, ranges)
         points = (ranges[:, None] * unit(laser.bearing))[np.isfinite(ranges)]
         what = (
-            f"{count(len(walls.segments), 'segment')}, {count(len(walls.pseudo), 'pseudo segment')}, "
-            f"{count(len(walls.intersections), 'intersection')}"
+            f"{plural(len(walls.segments), 'segment')}, {plural(len(walls.pseudo), 'pseudo segment')}, "
+            f"{plural(len(walls.intersections), 'intersection')}"
         )
-    figure = figures_map.laser_figure(walls, points) if options.figure else None
+    figure = laser_figure(walls, points) if options.figure else None
     save_reference(walls, options.output)
-    if figure is not None:
-        figures.save(figure, options.figure)
+    write_figure(figure, options.figure)
     print_status(what)

@@ -8,9 +8,9 @@ if TYPE_CHECKING:
     import numpy as np
 
 from jaxsonar.cli.arguments import RING_HELP, filename, finite, number, odometry_error
-from jaxsonar.cli.console import print_status, progress_bar, settings_beside
+from jaxsonar.cli.console import print_status, progress_bar, settings_filename
 
-SUMMARY = "The echoes that a ring hears along a path through a room."
+SUMMARY = "Simulate the echoes of a ring along a trajectory through a room."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,24 +20,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--path", required=True, metavar="CSV", help="poses: columns x, y (m), theta (rad), [stamp]")
     parser.add_argument("-o", "--output", metavar="LOG", required=True, help=".csv or .parquet; - = CSV on stdout")
     parser.add_argument("--sigma", type=finite(0), default=0.0, metavar="M", help="range noise, metres (default: 0)")
-    parser.add_argument("--drift", type=finite(0), default=0.0, metavar="M", help="slow drift, metres (default: 0)")
-    parser.add_argument("--dropout", type=finite(0, 1), default=0.0, metavar="P", help="echoes lost (default: 0)")
-    parser.add_argument("--clutter", type=finite(0, 100), default=0.0, metavar="P", help="false echoes per real one")
-    parser.add_argument("--seed", type=number(int, 0, 2**32 - 1), default=0, help="of the noise (default: 0)")
-    parser.add_argument("--max-echoes", type=number(int, 1, 64), default=3, metavar="N", help="a path (default: 3)")
+    parser.add_argument(
+        "--drift", type=finite(0), default=0.0, metavar="M", help="slow drift of the ranges, metres (default: 0)"
+    )
+    parser.add_argument(
+        "--dropout", type=finite(0, 1), default=0.0, metavar="P", help="probability that an echo is lost (default: 0)"
+    )
+    parser.add_argument(
+        "--clutter", type=finite(0, 100), default=0.0, metavar="P", help="false echoes per real echo (default: 0)"
+    )
+    parser.add_argument("--seed", type=number(int, 0, 2**32 - 1), default=0, help="seed of the noise (default: 0)")
+    parser.add_argument(
+        "--max-echoes",
+        type=number(int, 1, 64),
+        default=3,
+        metavar="N",
+        help="maximum number of echoes per path (default: 3)",
+    )
     logged = parser.add_mutually_exclusive_group()
     logged.add_argument(
         "--odometry",
         type=odometry_error,
         metavar="PERCENT,DEG",
-        help="poses of the log drift as from wheels: %% of the way and deg after 1 m, growing with its root (try 2,1)",
+        help="poses of the log as from wheel odometry, with this error after 1 m: %% of the distance and deg (try 2,1)",
     )
     logged.add_argument("--no-odometry", action="store_true", help="no poses in the log")
     parser.add_argument("--truth", type=filename, metavar="TRAJ", help="the true poses, for evo: TUM; - = stdout")
 
 
 def run(options: argparse.Namespace) -> None:
-    """``jaxsonar simulate``."""
+    """Run ``jaxsonar simulate``."""
     from jaxsonar.estimation.trajectory import Trajectory, save_trajectory
     from jaxsonar.fileio.atomic_files import check_outputs, write_toml
     from jaxsonar.floor_plans.room_geojson import load_room
@@ -49,13 +61,13 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.simulation.poses_csv import load_poses
     from jaxsonar.simulation.simulator import simulate as simulate_scans
 
-    beside = settings_beside(options.output)
-    outputs = {"-o": options.output, "settings beside the log:": beside, "--truth": options.truth}
+    settings_file = settings_filename(options.output)
+    outputs = {"-o": options.output, "settings beside the log:": settings_file, "--truth": options.truth}
     check_outputs(outputs, [options.room, options.ring, options.path])
     if options.output == "-" and options.truth == "-":
         raise SonarError("--truth -: the log goes to standard output, too; allowed are different places")
     if options.output != "-":
-        log_format(options.output)  # complain before the work, not after it
+        log_format(options.output)  # checks the suffix before the simulation
     ring, room = load_ring(options.ring), load_room(options.room)
     poses, stamps = load_poses(options.path)
     with progress_bar("scans", len(poses)) as show:
@@ -79,14 +91,17 @@ def run(options: argparse.Namespace) -> None:
         save_log(log, options.output)
     if options.truth:
         save_trajectory(Trajectory(stamps, poses), options.truth)
-    if beside:
-        said = {key: value for key, value in vars(options).items() if key not in ("command", "output", "truth")}
-        write_toml({key: value for key, value in said.items() if value is not None and value is not False}, beside)
+    if settings_file:
+        used_options = {key: value for key, value in vars(options).items() if key not in ("command", "output", "truth")}
+        write_toml(
+            {key: value for key, value in used_options.items() if value is not None and value is not False},
+            settings_file,
+        )
     print_status(f"{len(log)} scans, {len(log.range)} echoes")
 
 
 def _logged_poses(poses: "np.ndarray", options: argparse.Namespace) -> "np.ndarray":
-    """The poses that a simulated log has in it: the true ones, none, or those of odometry."""
+    """The poses of the simulated log: true poses, none, or simulated odometry."""
     import numpy as np
 
     from jaxsonar.simulation.wheel_odometry import simulate_odometry

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, NoReturn
 from jaxsonar.hardware.errors import SonarError
 
 if TYPE_CHECKING:
-    from jaxsonar.hardware.transport_base import Event
-    from jaxsonar.live.stream import Status
+    from jaxsonar.hardware.transport_base import LinkEvent
+    from jaxsonar.live.status import Status
 
 
 from jaxsonar.cli.arguments import (
@@ -24,14 +24,14 @@ from jaxsonar.cli.arguments import (
     finite,
     number,
     odometry_error,
-    odometry_noise_of,
+    odometry_noise,
 )
 from jaxsonar.cli.console import check_sigma_is_used, print_status, stopped_by_signals
 
-ON_TERMINAL, ELSEWHERE = 1.0, 10.0
-"""Seconds between two status lines."""
+TERMINAL_INTERVAL, LOG_INTERVAL = 1.0, 10.0
+"""Seconds between two status lines, on a terminal and elsewhere. Chosen by hand."""
 
-SUMMARY = "Lines and a growing map from a device, live."
+SUMMARY = "Detect lines and build a map from a device, live."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,12 +51,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--record",
         type=filename_ending_in(".csv", ".parquet", ".mcap"),
         metavar="LOG",
-        help="keep everything: .csv, .parquet: a scan log; .mcap: the raw messages (extra live)",
+        help="record everything: .csv, .parquet: a scan log; .mcap: the raw messages (extra live)",
     )
     parser.add_argument(
         "--map", type=filename_ending_in(".geojson", ".json"), metavar="MAP", help="GeoJSON, written every 2 s"
     )
-    parser.add_argument("--slam", action="store_true", help="the device's poses are odometry: estimate the robot's own")
+    parser.add_argument(
+        "--slam", action="store_true", help="treat the device's poses as odometry, and estimate the robot's poses"
+    )
     parser.add_argument(
         "--trajectory",
         type=filename_ending_in(".tum", ".txt"),
@@ -65,16 +67,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--odometry", type=odometry_error, metavar="PERCENT,DEG", help=ODOMETRY_HELP)
     parser.add_argument(
-        "--scans", type=number(int, 1, 2**62), metavar="N", help="end after N scans (default: with the device)"
+        "--scans",
+        type=number(int, 1, 2**62),
+        metavar="N",
+        help="stop after N scans (default: at the end of the stream)",
     )
-    parser.add_argument("--view", action="store_true", help="show it (extra viz), on this machine only")
+    parser.add_argument("--view", action="store_true", help="show the stream (extra viz), on this machine only")
     parser.add_argument(
         "--rrd", type=filename_ending_in(".rrd"), metavar="FILE", help="the view as a file for rerun (extra viz)"
     )
 
 
 def run(options: argparse.Namespace) -> None:
-    """``jaxsonar stream``."""
+    """Run ``jaxsonar stream``."""
     from jaxsonar.detection.settings_toml import load_settings
     from jaxsonar.fileio.atomic_files import check_outputs
     from jaxsonar.fileio.compilation_cache import use_compilation_cache
@@ -84,7 +89,7 @@ def run(options: argparse.Namespace) -> None:
 
     check_sigma_is_used(options.sigma, options.method, None)
     url = parse_url(options.url)
-    played = url.path if url.scheme == "file" else None
+    replayed = url.path if url.scheme == "file" else None
     if (options.trajectory or options.odometry) and not options.slam:
         raise SonarError("--trajectory or --odometry came without --slam; allowed are they with --slam")
     outputs = {
@@ -93,16 +98,16 @@ def run(options: argparse.Namespace) -> None:
         "--rrd": options.rrd,
         "--trajectory": options.trajectory,
     }
-    check_outputs(outputs, [options.ring, options.settings, played])
+    check_outputs(outputs, [options.ring, options.settings, replayed])
     ring = load_ring(options.ring)
     settings = load_settings(options.settings) if options.settings else None
     view = None
     if options.view or options.rrd:
-        from jaxsonar.live.rerun_viewer import View
+        from jaxsonar.live.rerun_viewer import RerunViewer
 
-        view = View(ring, file=options.rrd, say=print_status)
+        view = RerunViewer(ring, file=options.rrd, print_status=print_status)
     use_compilation_cache()
-    show = StatusLine()
+    status_line = StatusLine()
     try:
         with stopped_by_signals() as stop:
             status = stream_scans(
@@ -112,61 +117,64 @@ def run(options: argparse.Namespace) -> None:
                 settings=settings,
                 sigma=options.sigma,
                 record=options.record,
-                map_path=options.map,
-                slip=odometry_noise_of(options.odometry) if options.slam else None,
+                map_filename=options.map,
+                odometry_noise=odometry_noise(options.odometry) if options.slam else None,
                 trajectory=options.trajectory,
                 scans=options.scans,
                 view=view,
-                on_status=show.status,
-                on_event=show.event,
+                on_status=status_line.status,
+                on_event=status_line.event,
                 stop=stop,
             )
     except KeyboardInterrupt:
         print_status("jaxsonar stream: interrupted")
-        _end(1)
-    show.last(status)
+        _exit_now(1)
+    status_line.last(status)
     if not status.warm:
-        _end(0)
+        _exit_now(0)
 
 
 class StatusLine:
-    """One line that is written over on a terminal, now and then a new one elsewhere; events at once."""
+    """Prints the status: an overwritten line on a terminal, new lines at intervals elsewhere; events at once."""
 
     def __init__(self):
-        self._terminal = sys.stderr.isatty()
-        self._at = 0.0
+        self._is_terminal = sys.stderr.isatty()
+        self._printed_at = 0.0
         self._ending = False
-        self._began = time.monotonic()
+        self._start = time.monotonic()
         self._lock = threading.Lock()
 
     def status(self, status: "Status") -> None:
-        """How it goes."""
+        """Print the status if it is due."""
         now = time.monotonic()
-        told, self._ending = self._ending, status.ending
-        if now - self._at >= (ON_TERMINAL if self._terminal else ELSEWHERE) or self._ending > told:
-            first, self._at = self._at == 0.0, now
-            if self._terminal or self._ending or not first:
-                self._write(status.line(), over=True)
+        was_ending, self._ending = self._ending, status.ending
+        if (
+            now - self._printed_at >= (TERMINAL_INTERVAL if self._is_terminal else LOG_INTERVAL)
+            or self._ending > was_ending
+        ):
+            first, self._printed_at = self._printed_at == 0.0, now
+            if self._is_terminal or self._ending or not first:
+                self._write(status.text(), overwrite=True)
 
-    def event(self, event: "Event") -> None:
-        """Something about the link, told by the thread that reads."""
+    def event(self, event: "LinkEvent") -> None:
+        """Print a link event; called in the reading thread."""
         self._write(event.text)
 
     def last(self, status: "Status") -> None:
-        """What came of it."""
-        seconds = time.monotonic() - self._began
-        self._write(f"{status.line()}; {seconds:.1f} s")
+        """Print the final status."""
+        seconds = time.monotonic() - self._start
+        self._write(f"{status.text()}; {seconds:.1f} s")
 
-    def _write(self, text: str, *, over: bool = False) -> None:
+    def _write(self, text: str, *, overwrite: bool = False) -> None:
         with self._lock:
-            if self._terminal:
-                print(f"\r\x1b[2K{text}", end="" if over else "\n", file=sys.stderr, flush=True)
+            if self._is_terminal:
+                print(f"\r\x1b[2K{text}", end="" if overwrite else "\n", file=sys.stderr, flush=True)
             else:
                 print_status(text)
 
 
-def _end(code: int) -> NoReturn:
-    """Leave without waiting for the compiler, which cannot be told to stop; everything is written."""
+def _exit_now(code: int) -> NoReturn:
+    """Exit without waiting for a compilation, which cannot be cancelled. All files are written already."""
     for file in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             file.flush()

@@ -1,1 +1,13 @@
-"""live."""
+"""Live processing: from a device to lines and a growing map, scan by scan.
+
+Entry points: ``stream.stream`` runs the whole loop; ``live_map.LiveMap`` processes raw scans without it;
+``rerun_viewer.RerunViewer`` shows a stream; ``replay`` plays logs and raw recordings as devices.
+
+Design decisions:
+
+- A robot that moves during a scan moves the echo paths, not the echoes. Each path fires once per scan, so a moved scan
+  is a scan of a ring of another shape: the same compiled programs with other arrays. Missed detections are still
+  evaluated as if the robot had stood where the last group fired.
+- Lines are computed at once; the map is updated when no scan waits.
+- The compiler runs in the background while the first scans are recorded and queued.
+"""

@@ -1,4 +1,4 @@
-"""Reports: text, figures and tables on one HTML page that needs nothing else, no network and no script."""
+"""HTML pages with text, figures and tables in one file, without network access and scripts."""
 
 import base64
 import html
@@ -12,12 +12,11 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from jaxsonar.fileio.atomic_files import atomic_write
-from jaxsonar.reports.plot_style import rendered
+from jaxsonar.reports.plot_style import render_figure
+from jaxsonar.reports.text import NO_VALUE
 
 PAGE_BYTES = 8_000_000
-"""Figures share what a page may weigh: one that is too large as SVG becomes PNG."""
-NOTHING = "–"
-"""A cell without a value."""
+"""Maximum size of a page. A figure that exceeds its part of it as SVG is embedded as PNG."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Picture:
 
     figure: Figure
     alt: str
-    """What it shows, for readers who do not see it."""
+    """Alternative text for readers who cannot see the figure."""
     caption: str = ""
 
 
@@ -35,52 +34,52 @@ class Column:
     """A column of a table."""
 
     key: str
-    """Of the rows' values."""
+    """Key of the values in the rows."""
     title: str
     unit: str = ""
-    """Of the values as they are given, shown in the header."""
+    """Unit of the values, shown in the header."""
     digits: int | None = None
-    """Behind the point; four significant ones if left out. Whole numbers are shown as they are."""
+    """Number of decimals; by default four significant digits. Integers are shown unchanged."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of numbers (to the right) and text (to the left); the first column names the rows."""
+    """A table. Numbers are right-aligned, text is left-aligned; the first column names the rows."""
 
     columns: Sequence[Column]
     rows: Sequence[Mapping[str, Any]]
-    """Values by the columns' keys; None, NaN or none at all is shown as a dash."""
+    """Values by column key. A missing value, None and NaN are shown as a dash."""
     caption: str = ""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page with a title."""
+    """A section of the page with a title."""
 
     title: str
     parts: Sequence[str | Picture | Table]
-    """In this order; a string is text, an empty line in it begins a paragraph."""
+    """Parts in order. A string is text; an empty line in it starts a new paragraph."""
 
 
-def save_report(path: str | os.PathLike[str], *, title: str, intro: str, sections: Sequence[Section]) -> None:
-    """Write a page, whole or not at all; the same content gives the same bytes.
+def save_report(filename: str | os.PathLike[str], *, title: str, intro: str, sections: Sequence[Section]) -> None:
+    """Write a page, atomically. The same content gives the same bytes.
 
     Args:
-        path: the HTML file.
-        title: of the page.
-        intro: text below it, as in a section.
-        sections: what follows; with more than one, links to them come first.
+        filename: the HTML file.
+        title: title of the page.
+        intro: text below the title, as in a section.
+        sections: the sections; if there are several, links to them come first.
 
     Raises:
-        SonarError: the place cannot be written to.
+        SonarError: the file cannot be written.
     """
-    with atomic_write(path) as file:
+    with atomic_write(filename) as file:
         file.writelines(f"{line}\n" for line in _page(title, intro, sections))
 
 
 def _page(title: str, intro: str, sections: Sequence[Section]) -> Iterator[str]:
     pictures = sum(isinstance(part, Picture) for section in sections for part in section.parts)
-    limit = PAGE_BYTES * 3 // 4 // max(pictures, 1)  # three bytes are four characters
+    limit = PAGE_BYTES * 3 // 4 // max(pictures, 1)  # base64 turns 3 bytes into 4 characters
     yield '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">'
     yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
     yield f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
@@ -114,10 +113,10 @@ def _paragraphs(text: str) -> Iterator[str]:
 
 
 def _picture(picture: Picture, limit: int) -> Iterator[str]:
-    # As an image of its own: names inside one SVG cannot meet those of another on the page.
-    kind, data = "svg+xml", rendered(picture.figure, "svg")
+    # Embedded as an image, so that ids in one SVG cannot collide with those of another.
+    kind, data = "svg+xml", render_figure(picture.figure, "svg")
     if len(data) > limit:
-        kind, data = "png", rendered(picture.figure, "png")
+        kind, data = "png", render_figure(picture.figure, "png")
     width, height = (round(96 * inches) for inches in picture.figure.get_size_inches())
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
     yield f'<figure>\n<img src="{source}" alt="{_text(picture.alt)}" width="{width}" height="{height}">'
@@ -128,21 +127,26 @@ def _picture(picture: Picture, limit: int) -> Iterator[str]:
 
 def _table(table: Table) -> Iterator[str]:
     values = [[row.get(column.key) for column in table.columns] for row in table.rows]
-    sides = ["" if _is_text(column) else ' class="number"' for column in zip(*values, strict=True)]
-    sides = sides or [""] * len(table.columns)  # no rows
-    # Wide tables scroll by themselves, also by keyboard.
+    alignments = ["" if _is_text(column) else ' class="number"' for column in zip(*values, strict=True)]
+    alignments = alignments or [""] * len(table.columns)  # no rows
+    # tabindex: wide tables can be scrolled by keyboard.
     yield f'<div class="table" role="region" tabindex="0" aria-label="{_text(table.caption or "Table")}">\n<table>'
     if table.caption:
         yield f"<caption>{_text(table.caption)}</caption>"
     yield "<thead>\n<tr>"
-    for column, side in zip(table.columns, sides, strict=True):
+    for column, alignment in zip(table.columns, alignments, strict=True):
         unit = f' <span class="unit">({_text(column.unit)})</span>' if column.unit else ""
-        yield f'<th scope="col"{side}>{_text(column.title)}{unit}</th>'
+        yield f'<th scope="col"{alignment}>{_text(column.title)}{unit}</th>'
     yield "</tr>\n</thead>\n<tbody>"
     for row in values:
         cells = [_cell(value, column.digits) for value, column in zip(row, table.columns, strict=True)]
-        first = f'<th scope="row"{sides[0]}>{cells[0]}</th>'
-        yield "<tr>" + first + "".join(f"<td{s}>{c}</td>" for c, s in zip(cells[1:], sides[1:], strict=True)) + "</tr>"
+        first = f'<th scope="row"{alignments[0]}>{cells[0]}</th>'
+        yield (
+            "<tr>"
+            + first
+            + "".join(f"<td{s}>{c}</td>" for c, s in zip(cells[1:], alignments[1:], strict=True))
+            + "</tr>"
+        )
     yield "</tbody>\n</table>\n</div>"
 
 
@@ -152,7 +156,7 @@ def _is_text(values: Sequence[Any]) -> bool:
 
 def _cell(value: Any, digits: int | None) -> str:
     if value is None or (isinstance(value, Real) and math.isnan(value)):
-        return NOTHING
+        return NO_VALUE
     if not isinstance(value, Real):
         return _text(str(value))
     whole = isinstance(value, Integral)
@@ -161,7 +165,7 @@ def _cell(value: Any, digits: int | None) -> str:
 
 
 def _text(text: str) -> str:
-    """Text as it goes between tags and into quoted attributes; what cannot be printed is shown as an escape."""
+    """Escape text for HTML content and quoted attributes. Unprintable characters become escape sequences."""
     return html.escape("".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text))
 
 

@@ -1,4 +1,4 @@
-"""The health of a ring on one page: residuals, echoes heard, cones, and where the suspicious sensors sit."""
+"""The figure of a health check: residuals, detection rate, detection cones, and the faulty sensors."""
 
 import textwrap
 
@@ -13,23 +13,24 @@ from jaxsonar.diagnostics.beam_width import detection_probability
 from jaxsonar.diagnostics.health_report import Health
 from jaxsonar.reports.plot_style import CROSS_COLOR, DIRECT_COLOR, FAINT_COLOR, LINE_COLOR, ROBOT_COLOR, figure_style
 
-_LINES = 7  # of findings on the page
+_MAX_LINES = 7
+"""Maximum number of text lines for findings."""
 
 
 def health_figure(health: Health) -> Figure:
-    """Residuals and echoes of each sensor, share heard by the angle off the axis, and the ring; findings below."""
+    """Draw residuals and detection rate of each sensor, detection probability by off-axis angle, ring, and findings."""
     with figure_style():
         figure = Figure(figsize=(11.0, 8.2), layout="constrained")
         grid = figure.add_gridspec(3, 2, width_ratios=(1.75, 1), height_ratios=(1, 1, 0.42))
         residuals, ring = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
-        share, cone = figure.add_subplot(grid[1, 0], sharex=residuals), figure.add_subplot(grid[1, 1])
-        words = figure.add_subplot(grid[2, :])
+        rate, beam_pattern = figure.add_subplot(grid[1, 0], sharex=residuals), figure.add_subplot(grid[1, 1])
+        text = figure.add_subplot(grid[2, :])
         _draw_residuals(residuals, health)
-        _draw_share(share, health)
-        _draw_cone(cone, health)
+        _draw_detection_rate(rate, health)
+        _draw_beam_pattern(beam_pattern, health)
         _draw_ring(ring, health)
-        _write(words, health)
-        walls = "sightings of a map's walls" if health.source == "map" else "walls from single scans"
+        _write_findings(text, health)
+        walls = "observations of a map's walls" if health.source == "map" else "walls from single scans"
         figure.suptitle(
             f"{health.ring.name}: {health.scans} scans, {health.walls} {walls}", x=0.01, ha="left", parse_math=False
         )
@@ -37,18 +38,18 @@ def health_figure(health: Health) -> Figure:
 
 
 def _draw_residuals(axes: Axes, health: Health) -> None:
-    axes.set_title("Direct echoes against walls that the other echoes tell of")
+    axes.set_title("Residuals of direct echoes against walls from the other echoes")
     known = np.flatnonzero(np.isfinite(health.median))
     low, first, third, high = 1e3 * health.quartiles[known].T
     axes.axhline(0, color=FAINT_COLOR, lw=1, zorder=0)
     axes.vlines(known, low, high, color=DIRECT_COLOR, lw=1, alpha=0.5)
     axes.vlines(known, first, third, color=DIRECT_COLOR, lw=5, alpha=0.5)
     axes.plot(known, 1e3 * health.median[known], "_", color=DIRECT_COLOR, ms=9, mew=2)
-    sure = np.flatnonzero(np.isfinite(health.offset))
+    has_offset = np.flatnonzero(np.isfinite(health.offset))
     axes.errorbar(
-        sure + 0.3,
-        1e3 * health.offset[sure],
-        2e3 * health.offset_error[sure],
+        has_offset + 0.3,
+        1e3 * health.offset[has_offset],
+        2e3 * health.offset_error[has_offset],
         fmt="o",
         color=ROBOT_COLOR,
         ms=3,
@@ -65,17 +66,17 @@ def _draw_residuals(axes: Axes, health: Health) -> None:
         Line2D([], [], color=ROBOT_COLOR, marker="o", ms=3, lw=1, label="offset ± 2 standard errors"),
     ]
     if len(bad):
-        handles.append(Line2D([], [], color=LINE_COLOR, marker="o", ls="", label="suspicious"))
+        handles.append(Line2D([], [], color=LINE_COLOR, marker="o", ls="", label="finding"))
     if len(known):
-        reach = max(1.0, float(np.abs([low, high]).max()), float(np.nanmax(1e3 * np.abs(health.offset), initial=0)))
-        axes.set_ylim(-1.1 * reach, 1.5 * reach)
+        limit = max(1.0, float(np.abs([low, high]).max()), float(np.nanmax(1e3 * np.abs(health.offset), initial=0)))
+        axes.set_ylim(-1.1 * limit, 1.5 * limit)
         axes.legend(handles=handles, loc="upper right", ncols=3, fontsize=8)
     else:
-        _nothing(axes)
+        _write_no_data(axes)
 
 
-def _draw_share(axes: Axes, health: Health) -> None:
-    axes.set_title("Share heard of what should be heard")
+def _draw_detection_rate(axes: Axes, health: Health) -> None:
+    axes.set_title("Detection rate")
     columns = (
         (DIRECT_COLOR, "direct echoes", -0.27, health.expected[:, 0], health.heard[:, 0]),
         (CROSS_COLOR, "cross, as transmitter", 0.0, health.expected[:, 1], health.heard[:, 1]),
@@ -83,13 +84,13 @@ def _draw_share(axes: Axes, health: Health) -> None:
     )
     shown = [column for column in columns if column[3].any()]
     width = 0.27 if len(shown) > 1 else 0.6
-    for colour, label, shift, expected, heard in shown:
+    for color, label, shift, expected, heard in shown:
         there = np.flatnonzero(expected)
         height = 100 * heard[there] / expected[there]
-        axes.bar(there + (shift if len(shown) > 1 else 0), height, width * 0.9, color=colour, label=label)
+        axes.bar(there + (shift if len(shown) > 1 else 0), height, width * 0.9, color=color, label=label)
     axes.set_ylim(0, 125)
     axes.set_yticks(range(0, 101, 25))
-    axes.set_ylabel("heard (%)")
+    axes.set_ylabel("detected (%)")
     axes.set_xlabel("sensor")
     axes.xaxis.set_major_locator(MaxNLocator(24, integer=True))
     for k, remark in enumerate(health.remarks):
@@ -98,10 +99,10 @@ def _draw_share(axes: Axes, health: Health) -> None:
     if shown:
         axes.legend(loc="upper right", ncols=3, fontsize=8)
     else:
-        _nothing(axes)
+        _write_no_data(axes)
 
 
-def _draw_cone(axes: Axes, health: Health) -> None:
+def _draw_beam_pattern(axes: Axes, health: Health) -> None:
     width, error = np.degrees(health.beam)
     nominal = np.degrees(health.nominal)
     measured = (
@@ -113,10 +114,14 @@ def _draw_cone(axes: Axes, health: Health) -> None:
     enough = health.asked >= 3
     share = 100 * health.answered / np.maximum(health.asked, 1)
     size = np.clip(4 * np.sqrt(health.asked / max(1, health.asked.max())), 1.5, None) ** 2
-    axes.scatter(middle[enough], share[enough], size[enough] * 1.6, color=DIRECT_COLOR, label="walls heard, by angle")
+    axes.scatter(
+        middle[enough], share[enough], size[enough] * 1.6, color=DIRECT_COLOR, label="detected walls, by angle"
+    )
     if np.isfinite(width):
         fine = np.linspace(-90, 90, 721)
-        axes.plot(fine, 100 * detection_probability(health.curve, np.radians(fine)), color=LINE_COLOR, lw=1.4, label="fitted")
+        axes.plot(
+            fine, 100 * detection_probability(health.curve, np.radians(fine)), color=LINE_COLOR, lw=1.4, label="fitted"
+        )
     for side in (-1, 1):
         label = "nominal border" if side == 1 else None
         axes.plot([side * nominal / 2] * 2, [0, 100], color=ROBOT_COLOR, lw=1, ls=(0, (4, 3)), label=label)
@@ -124,27 +129,29 @@ def _draw_cone(axes: Axes, health: Health) -> None:
     axes.set_ylim(0, 135)
     axes.xaxis.set_major_locator(MultipleLocator(30))
     axes.set_yticks(range(0, 101, 25))
-    axes.set_xlabel("angle off the axis (deg)")
-    axes.set_ylabel("heard (%)")
+    axes.set_xlabel("off-axis angle (deg)")
+    axes.set_ylabel("detected (%)")
     axes.legend(loc="upper center", ncols=2, fontsize=8)
 
 
 def _draw_ring(axes: Axes, health: Health) -> None:
     ring = health.ring
     position, heading = np.asarray(ring.position, np.float64), np.asarray(ring.heading, np.float64)
-    axes.set_title("The ring; suspicious sensors red")
+    axes.set_title("The ring; sensors with a finding in red")
     extent = max(0.1, float(np.abs(position).max()))
     for (x, y), direction, beam in zip(position, np.degrees(heading), np.degrees(np.asarray(ring.beam)), strict=True):
         axes.add_patch(
-            Wedge((x, y), 0.45 * extent, direction - beam / 2, direction + beam / 2, color=FAINT_COLOR, alpha=0.25, lw=0)
+            Wedge(
+                (x, y), 0.45 * extent, direction - beam / 2, direction + beam / 2, color=FAINT_COLOR, alpha=0.25, lw=0
+            )
         )
     bad = np.array([bool(remark) for remark in health.remarks])
     axes.plot(*position[~bad].T, "o", color=ROBOT_COLOR, ms=4)
     axes.plot(*position[bad].T, "o", color=LINE_COLOR, ms=8)
     inward = position - 0.16 * extent * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     for k, (x, y) in enumerate(inward):
-        weight, colour = ("bold", LINE_COLOR) if bad[k] else ("normal", ROBOT_COLOR)
-        axes.text(x, y, str(k), ha="center", va="center", fontsize=7, color=colour, fontweight=weight)
+        weight, color = ("bold", LINE_COLOR) if bad[k] else ("normal", ROBOT_COLOR)
+        axes.text(x, y, str(k), ha="center", va="center", fontsize=7, color=color, fontweight=weight)
     axes.annotate(
         "",
         xy=(0.35 * extent, 0),
@@ -159,20 +166,20 @@ def _draw_ring(axes: Axes, health: Health) -> None:
     axes.set_ylabel("y (m), left")
 
 
-def _write(axes: Axes, health: Health) -> None:
-    """The findings in words, as many as there is room for."""
+def _write_findings(axes: Axes, health: Health) -> None:
+    """Write the findings, as many as fit."""
     axes.axis("off")
-    words = list(health.findings) or ["nothing to complain of" if health.source else ""]
+    words = list(health.findings) or ["no findings" if health.source else ""]
     if health.empty:
         words.insert(0, f"sensors are not compared with walls: {health.empty}")
     if health.source == "map":
         words.append("walls from a map: residuals hold errors of the poses and the delay of the sensors, too")
     lines = [line for word in words if word for line in textwrap.wrap(f"• {word}", 150, subsequent_indent="   ")]
-    if len(lines) > _LINES:
-        lines = [*lines[: _LINES - 1], f"… and more: {len(health.findings)} findings in all"]
-    colour = LINE_COLOR if health.findings else ROBOT_COLOR
-    axes.text(0, 1, "\n".join(lines), va="top", fontsize=9, color=colour, parse_math=False, transform=axes.transAxes)
+    if len(lines) > _MAX_LINES:
+        lines = [*lines[: _MAX_LINES - 1], f"… and more: {len(health.findings)} findings in all"]
+    color = LINE_COLOR if health.findings else ROBOT_COLOR
+    axes.text(0, 1, "\n".join(lines), va="top", fontsize=9, color=color, parse_math=False, transform=axes.transAxes)
 
 
-def _nothing(axes: Axes) -> None:
-    axes.text(0.5, 0.5, "too little to tell", transform=axes.transAxes, ha="center", va="center", color=ROBOT_COLOR)
+def _write_no_data(axes: Axes) -> None:
+    axes.text(0.5, 0.5, "not enough data", transform=axes.transAxes, ha="center", va="center", color=ROBOT_COLOR)

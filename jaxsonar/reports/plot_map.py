@@ -1,7 +1,4 @@
-"""Figures of many scans: line elements, their segments in the world frame, global maps (paper, figures 5 to 7).
-
-Each function draws one figure and returns it; ``figures.save`` writes it.
-"""
+"""Figures of many scans: segments in the world frame, maps, laser references, grids (paper, figures 5 to 7)."""
 
 from collections.abc import Sequence
 
@@ -21,26 +18,30 @@ from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.mapping.global_map import POINT_KINDS, GlobalMap
 from jaxsonar.occupancy.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from jaxsonar.reports.plot_style import (
-    CROSS,
-    DIRECT,
-    LINE,
+    CROSS_COLOR,
+    DIRECT_COLOR,
+    LINE_COLOR,
     PALETTE,
-    ROBOT,
-    WALL,
+    ROBOT_COLOR,
+    WALL_COLOR,
+    draw_map_points,
     draw_robot,
-    draw_walls,
-    finish,
-    plan,
+    draw_room,
+    finish_plan_view,
+    plan_view,
     pole_handles,
     robot_handle,
     wall_handle,
 )
+from jaxsonar.reports.text import plural
 from jaxsonar.sensors.ring import Ring
 
-MOST_NUMBERS = 40
-"""More robot positions than this are drawn as a path without numbers."""
-_POINT_MARKERS = {"corner": ("s", 5.5), "edge": ("D", 4.5)}  # marker, points
-_MARGIN = 0.25  # m around what a cut-out shows
+MAX_NUMBERED_POSES = 40
+"""Up to this many robot positions are numbered; more are drawn as a trajectory."""
+_POINT_SIZES = {"corner": 5.5, "edge": 4.5}
+"""Marker sizes, points."""
+_MARGIN = 0.25
+"""Margin around the shown points of a detail, metres."""
 
 
 def modeling_figure(
@@ -53,87 +54,90 @@ def modeling_figure(
     within: float = np.inf,
     room: Room | None = None,
 ) -> Figure:
-    """How line elements get their extent: the outermost perpendicular reflection lines (paper, figure 5).
+    """Draw how segments get their endpoints from the outermost perpendicular reflection lines (paper, figure 5).
 
     Args:
         ring: the sensors.
-        models: the lines found in each scan.
+        models: local model of each scan.
         poses: world_from_robot (x, y, theta) of each scan.
-        scans: which of the models to draw, counted from 0.
-        near: a place (x, y) in the world frame, metres, such as a corner; everywhere if left out.
-        within: how far from there the middle of a line element may be, metres.
-        room: the true walls, if they are known.
+        scans: indices of the models to draw.
+        near: centre (x, y) of a detail in the world frame, metres; by default everything is drawn.
+        within: maximum distance of a segment's middle from ``near``, metres.
+        room: the true walls, if known.
     """
-    figure, axes = plan("Line elements; the outermost reflection lines give their extent")
+    figure, axes = plan_view("Segments; their endpoints are the outermost reflection points")
     handles, shown = [], [np.zeros((0, 2))]
     for order, scan in enumerate(scans):
-        colour, pose = PALETTE[order % len(PALETTE)], poses[scan]
+        color, pose = PALETTE[order % len(PALETTE)], poses[scan]
         for line in models[scan].lines:
             segment = transform_points(pose, line.segment.astype(float))
             if near is not None and np.linalg.norm(segment.mean(axis=0) - near) > within:
                 continue
             rays = transform_points(pose, reflection_lines(ring, line))
-            axes.add_collection(LineCollection(list(rays[1:-1]), colors=colour, linewidths=0.35, zorder=4))
+            axes.add_collection(LineCollection(list(rays[1:-1]), colors=color, linewidths=0.35, zorder=4))
             outer = [*rays[:1], *rays[-1:]]
-            axes.add_collection(LineCollection(outer, colors=colour, linewidths=1.1, zorder=4))
-            axes.plot(*segment.T, color=colour, lw=4, solid_capstyle="butt", zorder=5)
+            axes.add_collection(LineCollection(outer, colors=color, linewidths=1.1, zorder=4))
+            axes.plot(*segment.T, color=color, lw=4, solid_capstyle="butt", zorder=5)
             shown.append(segment)
         draw_robot(axes, ring, pose)
         axes.text(
-            pose[0], pose[1], str(scan + 1), color=colour, fontweight="bold", ha="center", va="center", zorder=7,
+            pose[0], pose[1], str(scan + 1), color=color, fontweight="bold", ha="center", va="center", zorder=7,
             path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )  # fmt: skip
         shown.append(transform_points(pose, np.asarray(ring.position)))
-        handles.append(Line2D([], [], color=colour, lw=4, label=f"line elements from position {scan + 1}"))
+        handles.append(Line2D([], [], color=color, lw=4, label=f"segments from position {scan + 1}"))
     handles += [
-        Line2D([], [], color=WALL, lw=1.1, label="outermost reflection lines"),
-        Line2D([], [], color=WALL, lw=0.35, label="those of the other sensors"),
+        Line2D([], [], color=WALL_COLOR, lw=1.1, label="outermost reflection lines"),
+        Line2D([], [], color=WALL_COLOR, lw=0.35, label="reflection lines of the other sensors"),
         robot_handle(),
     ]
     if room is not None:
-        draw_walls(axes, room)
+        draw_room(axes, room)
         handles.append(wall_handle())
     points = np.concatenate(shown)
     if len(points):
         low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    return finish(figure, axes, handles)
+    return finish_plan_view(figure, axes, handles)
 
 
 def reflection_lines(ring: Ring, line: Line) -> Float[np.ndarray, "paths 2 2"]:
-    """From each involved sensor square to the line: (sensor, its foot), robot frame, metres, in order along the line.
+    """The perpendiculars from the involved (virtual) sensors to a line.
 
-    A virtual sensor is in the middle of the two that make up the cross echo path (paper, section 5).
+    A virtual sensor is the midpoint of transmitter and receiver of a cross path (paper, section 5).
+
+    Returns:
+        Sensor and footpoint of each path, robot frame, metres, sorted along the line.
     """
     sensors = ring.position[line.paths].mean(axis=1)
     normal = np.array([np.cos(line.theta), np.sin(line.theta)])
-    feet = sensors + (line.rho - sensors @ normal)[:, None] * normal
+    footpoints = sensors + (line.rho - sensors @ normal)[:, None] * normal
     along = sensors @ np.array([-normal[1], normal[0]])
-    return np.stack([sensors, feet], axis=1)[np.argsort(along, kind="stable")]
+    return np.stack([sensors, footpoints], axis=1)[np.argsort(along, kind="stable")]
 
 
 def aggregate_figure(
     ring: Ring, models: Sequence[LocalModel], poses: Float[np.ndarray, "scans 3"], *, room: Room | None = None
 ) -> Figure:
-    """The segments of all scans at their poses, in the world frame (paper, figure 6)."""
+    """Draw the segments of all scans in the world frame (paper, figure 6)."""
     found = sum(len(model.lines) for model in models)
-    figure, axes = plan(f"{found} segments from {len(models)} scans")
-    handles = [Line2D([], [], color=LINE, lw=2.2, label="segment from one scan")]
+    figure, axes = plan_view(f"{found} segments from {len(models)} scans")
+    handles = [Line2D([], [], color=LINE_COLOR, lw=2.2, label="segment from one scan")]
     if room is not None:
-        draw_walls(axes, room)
+        draw_room(axes, room)
         handles += [wall_handle(), *pole_handles(room)]
     segments = aggregated_segments(models, poses)
     axes.add_collection(
-        LineCollection(list(segments), colors=LINE, linewidths=2.2, alpha=0.75, capstyle="butt", zorder=4)
+        LineCollection(list(segments), colors=LINE_COLOR, linewidths=2.2, alpha=0.75, capstyle="butt", zorder=4)
     )
-    handles.append(_draw_path(axes, poses))
-    return finish(figure, axes, handles, width=8.4)
+    handles.append(_draw_trajectory(axes, poses))
+    return finish_plan_view(figure, axes, handles, width=8.4)
 
 
 def aggregated_segments(
     models: Sequence[LocalModel], poses: Float[np.ndarray, "scans 3"]
 ) -> Float[np.ndarray, "segments 2 2"]:
-    """The segments of all scans in the world frame, metres, scan by scan (paper, section 5)."""
+    """The segments of all scans in the world frame, metres, in order of the scans (paper, section 5)."""
     found = [
         transform_points(pose, line.segment.astype(float))
         for model, pose in zip(models, poses, strict=True)
@@ -152,70 +156,72 @@ def map_figure(
     laser_points: Float[np.ndarray, "points 2"] | None = None,
     title: str | None = None,
 ) -> Figure:
-    """The merged segments in bold over whatever else is known of the place (paper, figure 7).
+    """Draw a map over the other known data of the same environment (paper, figure 7).
 
     Args:
-        world: the merged segments.
-        aggregated: the segments of all scans that they were merged from.
-        poses: world_from_robot (x, y, theta); numbered if there are at most ``MOST_NUMBERS``.
-        room: the true walls, if they are known.
-        reference: walls by another sensor, both ends of each.
-        laser_points: where a laser saw something.
-        title: above the figure; the numbers of segments, corners and edges if left out.
+        world: the map.
+        aggregated: the segments of all scans before merging.
+        poses: world_from_robot (x, y, theta); numbered if there are at most ``MAX_NUMBERED_POSES``.
+        room: the true walls, if known.
+        reference: endpoints of walls measured by another sensor.
+        laser_points: laser measurements.
+        title: title of the figure; by default the numbers of segments, corners and edges.
 
     All coordinates are in the world frame, metres.
     """
-    count = f"{len(world)} merged segment{'' if len(world) == 1 else 's'}"
-    for kind in POINT_KINDS:
-        found = world.point_kinds.count(kind)
-        count += f", {found} {kind}{'' if found == 1 else 's'}" if found else ""
-    figure, axes = plan(count if title is None else title)
+    if title is None:
+        counts = {kind: world.point_kinds.count(kind) for kind in POINT_KINDS}
+        points = [plural(count, kind) for kind, count in counts.items() if count]
+        title = ", ".join([plural(len(world), "merged segment"), *points])
+    figure, axes = plan_view(title)
     handles = _draw_map(axes, world)
     if aggregated is not None:
-        axes.add_collection(LineCollection(list(aggregated), colors=CROSS, linewidths=1, alpha=0.7, zorder=4))
-        handles.append(Line2D([], [], color=CROSS, lw=1, label="segment of a local model"))
+        axes.add_collection(LineCollection(list(aggregated), colors=CROSS_COLOR, linewidths=1, alpha=0.7, zorder=4))
+        handles.append(Line2D([], [], color=CROSS_COLOR, lw=1, label="segment of a local model"))
     if room is not None:
-        draw_walls(axes, room)
+        draw_room(axes, room)
         handles += [wall_handle(), *pole_handles(room)]
     if reference is not None:
-        axes.add_collection(LineCollection(list(reference), colors=ROBOT, linewidths=0.6, zorder=3))
-        handles.append(Line2D([], [], color=ROBOT, lw=0.6, label="reference wall"))
+        axes.add_collection(LineCollection(list(reference), colors=ROBOT_COLOR, linewidths=0.6, zorder=3))
+        handles.append(Line2D([], [], color=ROBOT_COLOR, lw=0.6, label="reference wall"))
     if laser_points is not None:
-        # Thousands of dots are an image within the SVG, not as many elements.
-        axes.plot(*laser_points.T, ".", color=WALL, ms=1.5, mew=0, alpha=0.5, zorder=1, rasterized=True)
-        handles.append(Line2D([], [], color=WALL, marker=".", ls="", label="laser points"))
+        # Thousands of dots are rasterized within the SVG.
+        axes.plot(*laser_points.T, ".", color=WALL_COLOR, ms=1.5, mew=0, alpha=0.5, zorder=1, rasterized=True)
+        handles.append(Line2D([], [], color=WALL_COLOR, marker=".", ls="", label="laser points"))
     if poses is not None:
-        handles.append(_draw_path(axes, poses))
-    return finish(figure, axes, handles, width=8.4)
+        handles.append(_draw_trajectory(axes, poses))
+    return finish_plan_view(figure, axes, handles, width=8.4)
 
 
 def laser_figure(
     walls: Float[np.ndarray, "walls 2 2"] | PolygonalModel, points: Float[np.ndarray, "points 2"]
 ) -> Figure:
-    """Walls from a laser over its points: of a whole run, or the polygonal model of one scan (paper, figure 2).
+    """Draw walls from a laser over its points, of a whole run or of one scan (paper, figure 2).
 
     Args:
-        walls: both ends of each, or the model with its pseudo segments and intersections, metres.
-        points: where the laser saw something, the same frame, metres.
+        walls: endpoints of the walls, or the polygonal model of a scan, metres.
+        points: laser measurements in the same frame, metres.
     """
     model = walls if isinstance(walls, PolygonalModel) else PolygonalModel(walls)
-    figure, axes = plan(f"{len(model.segments)} line segments from a laser")
-    axes.add_collection(LineCollection(list(model.segments), colors=ROBOT, linewidths=1.6, zorder=3))
-    handles = [Line2D([], [], color=ROBOT, lw=1.6, label="line segment")]
+    figure, axes = plan_view(f"{len(model.segments)} line segments from a laser")
+    axes.add_collection(LineCollection(list(model.segments), colors=ROBOT_COLOR, linewidths=1.6, zorder=3))
+    handles = [Line2D([], [], color=ROBOT_COLOR, lw=1.6, label="line segment")]
     if len(model.pseudo):
-        dashes = LineCollection(list(model.pseudo), colors=DIRECT, linewidths=0.9, linestyles=(0, (4, 3)), zorder=2)
+        dashes = LineCollection(
+            list(model.pseudo), colors=DIRECT_COLOR, linewidths=0.9, linestyles=(0, (4, 3)), zorder=2
+        )
         axes.add_collection(dashes)
-        handles.append(Line2D([], [], color=DIRECT, lw=0.9, ls=(0, (4, 3)), label="pseudo line segment"))
+        handles.append(Line2D([], [], color=DIRECT_COLOR, lw=0.9, ls=(0, (4, 3)), label="pseudo line segment"))
     if len(model.intersections):
-        axes.plot(*model.intersections.T, "o", color=LINE, ms=4, zorder=4)
-        handles.append(Line2D([], [], color=LINE, marker="o", ls="", ms=4, label="intersection"))
+        axes.plot(*model.intersections.T, "o", color=LINE_COLOR, ms=4, zorder=4)
+        handles.append(Line2D([], [], color=LINE_COLOR, marker="o", ls="", ms=4, label="intersection"))
     corners = np.concatenate([model.segments, model.pseudo]).reshape(-1, 2)
     if len(corners):
         low, high = corners.min(axis=0) - 1, corners.max(axis=0) + 1
         points = points[((points > low) & (points < high)).all(axis=1)]
-    axes.plot(*points.T, ".", color=WALL, ms=1.5, mew=0, alpha=0.5, zorder=1, rasterized=True)
-    handles.append(Line2D([], [], color=WALL, marker=".", ls="", label="laser points"))
-    return finish(figure, axes, handles, width=8.4)
+    axes.plot(*points.T, ".", color=WALL_COLOR, ms=1.5, mew=0, alpha=0.5, zorder=1, rasterized=True)
+    handles.append(Line2D([], [], color=WALL_COLOR, marker=".", ls="", label="laser points"))
+    return finish_plan_view(figure, axes, handles, width=8.4)
 
 
 def grid_figure(
@@ -225,66 +231,60 @@ def grid_figure(
     origin: tuple[float, float],
     world: GlobalMap | None = None,
 ) -> Figure:
-    """An occupancy grid, and the merged segments over it.
+    """Draw an occupancy grid, and a map over it.
 
     Args:
-        image: 0 occupied, 205 unknown, 254 free, as ROS has them; row 0 is the top.
-        resolution: side of a cell, metres.
+        image: 0 occupied, 205 unknown, 254 free (ROS); row 0 is the top.
+        resolution: size of a cell, metres.
         origin: the lower left corner (x, y) of the image in the world frame, metres.
-        world: the segments, if they are to be seen.
+        world: the map, if it is to be drawn.
     """
     rows, columns = image.shape
-    figure, axes = plan(f"Occupancy grid: {columns} x {rows} cells of {resolution:g} m")
+    figure, axes = plan_view(f"Occupancy grid: {columns} x {rows} cells of {resolution:g} m")
     (left, low), width, height = origin, columns * resolution, rows * resolution
     box = (left, left + width, low, low + height)
     axes.imshow(image, cmap="gray", vmin=OCCUPIED, vmax=FREE, extent=box, interpolation="nearest")
     axes.grid(visible=False)
     handles = [
-        Line2D([], [], marker="s", ls="", ms=8, mec=WALL, mew=0.6, mfc=str(value / FREE), label=label)
+        Line2D([], [], marker="s", ls="", ms=8, mec=WALL_COLOR, mew=0.6, mfc=str(value / FREE), label=label)
         for value, label in ((OCCUPIED, "occupied"), (UNKNOWN, "unknown"), (FREE, "free"))
     ]
     if world is not None:
         handles += _draw_map(axes, world)
-    return finish(figure, axes, handles, width=8.4)
+    return finish_plan_view(figure, axes, handles, width=8.4)
 
 
 def _draw_map(axes: Axes, world: GlobalMap) -> list[Line2D]:
-    """Segments in bold, a tick across each end, so that neighbors on one wall can be told apart; corners and edges."""
+    """Draw segments with a tick across each end, so that adjacent segments can be distinguished, and points."""
     axes.add_collection(
-        LineCollection(list(world.segments), colors=LINE, linewidths=2.6, capstyle="butt", zorder=5),
+        LineCollection(list(world.segments), colors=LINE_COLOR, linewidths=2.6, capstyle="butt", zorder=5),
     )
     along = world.segments[:, 1] - world.segments[:, 0]
     across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
     across = across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
-    # Lengths in points at places in metres: a tick has the same size in a cupboard and in a corridor.
+    # Positions in metres, lengths in points: the ticks have the same size at every scale.
     ticks = 4 * np.repeat(across, 2, axis=0)[:, None] * np.array([[-1.0], [1.0]])
     figure = axes.figure
     axes.add_collection(
         LineCollection(
-            list(ticks), colors=LINE, linewidths=1, zorder=5, offsets=world.segments.reshape(-1, 2),
+            list(ticks), colors=LINE_COLOR, linewidths=1, zorder=5, offsets=world.segments.reshape(-1, 2),
             offset_transform=axes.transData, transform=Affine2D().scale(1 / 72) + figure.dpi_scale_trans,
         ),
         autolim=False,
     )  # fmt: skip
-    handles = [Line2D([], [], color=LINE, lw=2.6, marker="|", ms=8, mew=1, label="merged segment and its ends")]
-    for kind, (marker, size) in _POINT_MARKERS.items():
-        places = world.points[np.array(world.point_kinds, dtype=np.str_) == kind]
-        if len(places):
-            look = {"marker": marker, "ls": "", "ms": size, "mfc": "white", "mec": LINE, "mew": 1.2}
-            axes.plot(*places.T, **look, zorder=6)
-            handles.append(Line2D([], [], **look, label=kind))
-    return handles
+    handles = [Line2D([], [], color=LINE_COLOR, lw=2.6, marker="|", ms=8, mew=1, label="merged segment and its ends")]
+    return handles + draw_map_points(axes, world, sizes=_POINT_SIZES, edge_width=1.2, zorder=6)
 
 
-def _draw_path(axes: Axes, poses: Float[np.ndarray, "scans 3"]) -> Line2D:
-    """Robot positions: numbered crosses if they are few, else a path with a cross here and there."""
-    step = -(-len(poses) // MOST_NUMBERS) or 1
-    axes.plot(*poses[:, :2].T, color=DIRECT, lw=0.7, zorder=2)
-    axes.plot(*poses[::step, :2].T, "+", color=DIRECT, ms=7 if step == 1 else 4, zorder=3)
+def _draw_trajectory(axes: Axes, poses: Float[np.ndarray, "scans 3"]) -> Line2D:
+    """Draw robot positions: numbered crosses, or a trajectory with a cross at regular intervals."""
+    step = -(-len(poses) // MAX_NUMBERED_POSES) or 1
+    axes.plot(*poses[:, :2].T, color=DIRECT_COLOR, lw=0.7, zorder=2)
+    axes.plot(*poses[::step, :2].T, "+", color=DIRECT_COLOR, ms=7 if step == 1 else 4, zorder=3)
     for number, (x, y, theta) in enumerate(poses if step == 1 else poses[:0], start=1):
         axes.annotate(
-            str(number), (x, y), xytext=(4 * np.sin(theta), -8), textcoords="offset points", fontsize=6.5, color=DIRECT,
-            ha="center", va="center",
+            str(number), (x, y), xytext=(4 * np.sin(theta), -8), textcoords="offset points", fontsize=6.5,
+            color=DIRECT_COLOR, ha="center", va="center",
         )  # fmt: skip
-    each = "robot positions" if step == 1 else f"robot path, a cross every {step} positions"
-    return Line2D([], [], color=DIRECT, marker="+", lw=0.7, ms=7, label=each)
+    label = "robot positions" if step == 1 else f"trajectory, a cross every {step} positions"
+    return Line2D([], [], color=DIRECT_COLOR, marker="+", lw=0.7, ms=7, label=label)

@@ -1,10 +1,10 @@
-"""What all figures share: their style, plan views in metres, and how a figure becomes a file.
+"""Common parts of all figures: colours and style, plan views in metres, legends, and saving.
 
-Each function of ``figures_scan`` and ``figures_map`` draws one figure and returns it; ``save`` writes it. Colours stay
-distinct for colour-blind readers.
+Each function of the other ``plot_*`` modules draws one figure and returns it; ``save_figure`` writes it.
 """
 
 import io
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,28 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxsonar.fileio.atomic_files import FIGURE_FORMATS as FORMATS
-from jaxsonar.fileio.atomic_files import atomic_write, shown
+from jaxsonar.fileio.atomic_files import FIGURE_FORMATS, atomic_write, shown
 from jaxsonar.floor_plans.room import Room
-from jaxsonar.geometry.se2 import to_world
+from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.sensors.ring import Ring
 
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
-"""Okabe and Ito's colours, told apart by colour-blind readers too."""
-DIRECT, CROSS, LINE, WALL, FAINT, ROBOT = PALETTE[0], PALETTE[1], "#B5123E", "#8C8C8C", "#DDDDDD", "#222222"
+"""Colours of Okabe and Ito, distinct for colour-blind readers."""
+DIRECT_COLOR, CROSS_COLOR = PALETTE[0], PALETTE[1]
+"""Direct and cross echoes."""
+LINE_COLOR = "#B5123E"
+"""Detected lines and walls."""
+POINT_COLOR = LINE_COLOR
+"""Outline of corners and edges; they are filled with white."""
+WALL_COLOR = "#8C8C8C"
+"""True walls."""
+FAINT_COLOR = "#DDDDDD"
+"""Paths without an echo, and detection cones."""
+ROBOT_COLOR = "#222222"
+POINT_MARKERS = {"corner": "s", "edge": "D"}
+"""Matplotlib markers of corners and edges."""
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -36,44 +48,49 @@ STYLE: dict[Any, Any] = {
     "axes.titlelocation": "left",
     "legend.frameon": False,
     "savefig.dpi": 160,
-    "svg.hashsalt": "jaxsonar",  # the same figure gives the same file
+    "svg.hashsalt": "jaxsonar",  # makes files reproducible
 }
-_LONG_PLAN, _LONG_WIDTH, _TALLEST, _NARROWEST = 0.45, 10.0, 8.5, 4.2  # height / width; inches
+_LONG_PLAN_ASPECT = 0.45
+"""Height over width of a plan; a flatter plan gets a wider figure."""
+_LONG_PLAN_WIDTH, _MAX_HEIGHT, _MIN_WIDTH = 10.0, 8.5, 4.2
+"""Inches."""
 
 
-def styled() -> AbstractContextManager[None]:
-    """The context in which figures of this house are made and written."""
+def figure_style() -> AbstractContextManager[None]:
+    """Context with the matplotlib settings for drawing and saving a figure."""
     return rc_context(STYLE)
 
 
-def save(figure: Figure, path: Path | str) -> None:
-    """Write a figure as .svg, .png or .pdf, whole or not at all.
+def save_figure(figure: Figure, filename: Path | str) -> None:
+    """Write a figure as .svg, .png or .pdf, atomically.
 
     Raises:
-        SonarError: another suffix, or a place that cannot be written to.
+        SonarError: another suffix, or a file that cannot be written.
     """
-    path = Path(path)
-    if path.suffix.lower() not in FORMATS:
-        raise SonarError(f"{shown(path)}: figure format {path.suffix!r}; allowed are {', '.join(FORMATS)}")
-    with atomic_write(path, binary=True) as file:
-        file.write(rendered(figure, path.suffix.lower()[1:]))
+    filename = Path(filename)
+    if filename.suffix.lower() not in FIGURE_FORMATS:
+        raise SonarError(
+            f"{shown(filename)}: figure format {filename.suffix!r}; allowed are {', '.join(FIGURE_FORMATS)}"
+        )
+    with atomic_write(filename, binary=True) as file:
+        file.write(render_figure(figure, filename.suffix.lower()[1:]))
 
 
-def rendered(figure: Figure, kind: str) -> bytes:
-    """A figure as the bytes of an svg, png or pdf file; the same figure gives the same bytes."""
+def render_figure(figure: Figure, kind: str) -> bytes:
+    """Render a figure to the bytes of an svg, png or pdf file. The same figure gives the same bytes."""
     metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
     file = io.BytesIO()
-    with styled():
+    with figure_style():
         figure.savefig(file, format=kind, metadata=metadata)
     return file.getvalue()
 
 
-def plan(title: str) -> tuple[Figure, Axes]:
+def plan_view(title: str) -> tuple[Figure, Axes]:
     """An empty plan view in metres."""
-    with styled():
+    with figure_style():
         figure = Figure(layout="constrained")
         axes = figure.add_subplot()
-        axes.set_title(title, parse_math=False)  # names of files may hold dollars
+        axes.set_title(title, parse_math=False)  # filenames may contain dollar signs
     axes.set_aspect("equal")
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
@@ -82,21 +99,21 @@ def plan(title: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def finish(figure: Figure, axes: Axes, handles: list[Line2D], *, width: float = 6.8) -> Figure:
-    """Paper to the size of the plan, and the legend below it, where it covers nothing.
+def finish_plan_view(figure: Figure, axes: Axes, handles: list[Line2D], *, width: float = 6.8) -> Figure:
+    """Fit the figure size to the plan, and add the legend below the axes.
 
     Args:
         figure: the figure.
         axes: its only axes, with everything drawn.
-        handles: of the legend.
-        width: of the paper, inches; long corridors get more, tall plans less.
+        handles: handles of the legend.
+        width: width of the figure, inches; long corridors get more, tall plans less.
     """
     axes.autoscale_view()
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     aspect = (high - low) / (right - left)
-    width = max(width, _LONG_WIDTH) if aspect < _LONG_PLAN else width
-    across = min(width - 0.7, _TALLEST / aspect)
-    width = max(across + 0.7, _NARROWEST)
+    width = max(width, _LONG_PLAN_WIDTH) if aspect < _LONG_PLAN_ASPECT else width
+    across = min(width - 0.7, _MAX_HEIGHT / aspect)
+    width = max(across + 0.7, _MIN_WIDTH)
     columns = max(int(width / 2.1), 1)
     legend_rows = -(-len(handles) // columns)
     figure.set_size_inches(width, across * aspect + 1.0 + 0.22 * legend_rows)
@@ -104,32 +121,56 @@ def finish(figure: Figure, axes: Axes, handles: list[Line2D], *, width: float = 
     return figure
 
 
-def draw_walls(axes: Axes, room: Room) -> None:
-    """The true walls, grey, and poles as crosses."""
-    axes.add_collection(LineCollection(list(room.walls), colors=WALL, linewidths=1.4, zorder=3))
+def draw_room(axes: Axes, room: Room) -> None:
+    """Draw the true walls of a floor plan in grey, and its poles as crosses."""
+    axes.add_collection(LineCollection(list(room.walls), colors=WALL_COLOR, linewidths=1.4, zorder=3))
     if len(room.poles):
-        axes.plot(*room.poles.T, "x", color=WALL, ms=6, mew=1.6, zorder=3)
+        axes.plot(*room.poles.T, "x", color=WALL_COLOR, ms=6, mew=1.6, zorder=3)
 
 
 def draw_robot(axes: Axes, ring: Ring, pose: Float[np.ndarray, "3"]) -> None:
-    """The sensors at a pose, and an arrow that points forward."""
-    sensors = to_world(pose, np.asarray(ring.position))
-    axes.plot(*sensors.T, "o", color=ROBOT, ms=2.2, zorder=6)
-    nose = to_world(pose, np.array([[0.0, 0.0], [0.18, 0.0]]))
+    """Draw the sensors at a pose (world_from_robot), and an arrow in driving direction."""
+    sensors = transform_points(pose, np.asarray(ring.position))
+    axes.plot(*sensors.T, "o", color=ROBOT_COLOR, ms=2.2, zorder=6)
+    nose = transform_points(pose, np.array([[0.0, 0.0], [0.18, 0.0]]))
     axes.update_datalim(nose)
-    axes.annotate("", xy=tuple(nose[1]), xytext=tuple(nose[0]), arrowprops={"arrowstyle": "-|>", "color": ROBOT})
+    axes.annotate("", xy=tuple(nose[1]), xytext=tuple(nose[0]), arrowprops={"arrowstyle": "-|>", "color": ROBOT_COLOR})
+
+
+def draw_map_points(
+    axes: Axes, world: GlobalMap, *, sizes: Mapping[str, float], edge_width: float, zorder: int
+) -> list[Line2D]:
+    """Draw the corners and edges of a map. Returns the legend handles.
+
+    Args:
+        axes: axes of a plan view.
+        world: the map.
+        sizes: marker size of each kind, points.
+        edge_width: line width of the markers, points.
+        zorder: drawing order.
+    """
+    handles = []
+    for kind, marker in POINT_MARKERS.items():
+        points = world.points[np.array(world.point_kinds, dtype=np.str_) == kind]
+        if len(points):
+            style: dict[str, Any] = {
+                "marker": marker, "ls": "", "ms": sizes[kind], "mfc": "white", "mec": POINT_COLOR, "mew": edge_width
+            }  # fmt: skip
+            axes.plot(*points.T, **style, zorder=zorder)
+            handles.append(Line2D([], [], **style, label=kind))
+    return handles
 
 
 def wall_handle() -> Line2D:
-    """Legend of the true walls."""
-    return Line2D([], [], color=WALL, lw=1.4, label="true wall")
+    """Legend handle of the true walls."""
+    return Line2D([], [], color=WALL_COLOR, lw=1.4, label="true wall")
 
 
 def pole_handles(room: Room) -> list[Line2D]:
-    """Legend of the poles, if there are any."""
-    return [Line2D([], [], color=WALL, marker="x", ls="", mew=1.6, label="pole")] if len(room.poles) else []
+    """Legend handle of the poles, if there are any."""
+    return [Line2D([], [], color=WALL_COLOR, marker="x", ls="", mew=1.6, label="pole")] if len(room.poles) else []
 
 
 def robot_handle() -> Line2D:
-    """Legend of the robot."""
-    return Line2D([], [], color=ROBOT, marker="o", ls="", ms=3, label="sensors; the arrow is forward")
+    """Legend handle of the robot."""
+    return Line2D([], [], color=ROBOT_COLOR, marker="o", ls="", ms=3, label="sensors; arrow: forward")

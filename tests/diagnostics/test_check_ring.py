@@ -17,7 +17,7 @@ from jaxsonar.diagnostics.range_offsets import remove_gauge_freedom
 from jaxsonar.kernels.measurement_model import predict_all_echoes
 from jaxsonar.reports import plot_style
 from jaxsonar.reports.plot_health import health_figure
-from jaxsonar.reports.terminal_tables_health import health_table
+from jaxsonar.reports.terminal_tables import health_table
 from jaxsonar.simulation.office import load_office
 
 RING = Ring.circular()

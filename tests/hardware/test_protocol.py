@@ -145,7 +145,9 @@ def cut(data, where):
     return [data[a:b] for a, b in pairwise(edges)]
 
 
-noise = st.one_of(st.binary(max_size=60), st.binary(max_size=9).map(encode_frame), st.just(b"\0"), st.just(encode_end(1, 2)))
+noise = st.one_of(
+    st.binary(max_size=60), st.binary(max_size=9).map(encode_frame), st.just(b"\0"), st.just(encode_end(1, 2))
+)
 
 
 @settings(max_examples=300)
@@ -160,7 +162,7 @@ def test_how_bytes_are_cut_makes_no_difference(parts, where):
     apart = []
     for piece in cut(data, where):
         apart += pieces.feed(piece)
-        assert len(pieces._held) <= MAX_FRAME_BYTES
+        assert len(pieces._buffer) <= MAX_FRAME_BYTES
     assert contents(apart) == contents(together)
     assert (pieces.counts, pieces.ended, pieces.version) == (whole.counts, whole.ended, whole.version)
 
@@ -302,7 +304,7 @@ def test_an_endless_frame_takes_no_memory_and_counts_once(step):
     decoder = Decoder()
     for begin in range(0, 10_000_000, step):
         assert decoder.feed(b"\7" * step) == []
-        assert len(decoder._held) <= MAX_FRAME_BYTES
+        assert len(decoder._buffer) <= MAX_FRAME_BYTES
         assert decoder.counts.oversized == (begin + step > MAX_FRAME_BYTES)
     assert contents(decoder.feed(b"\0" + encode(group()))) == contents([group()])
     assert decoder.counts == protocol.DecoderCounts(frames=1, oversized=1)

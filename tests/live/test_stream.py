@@ -36,8 +36,9 @@ from jaxsonar.hardware.messages import ECHO
 from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler
 from jaxsonar.hardware.transport_servers import listen
 from jaxsonar.live.live_map import LiveMap
-from jaxsonar.live.stream import Status, stream
-from jaxsonar.scans.recording_journal import open_record
+from jaxsonar.live.status import Status
+from jaxsonar.live.stream import stream
+from jaxsonar.scans.recording_journal import open_log_recorder
 from jaxsonar.simulation.device_messages import log_messages, room_messages
 from jaxsonar.simulation.office import load_office
 
@@ -111,7 +112,7 @@ def expected(office, log):
 def test_a_stream_is_the_log(link, record, office, log, log_file, expected, tmp_path):
     """Echoes within 0.1 mm, the same map, and nothing lost, over every link; and the record is the log again."""
     path, map_path = tmp_path / record, tmp_path / "map.geojson"
-    choices = {"method": "hough", "record": path, "map_path": map_path}
+    choices = {"method": "hough", "record": path, "map_filename": map_path}
     if link == "file":
         status = stream(f"file:{log_file}?speed=0", office.ring, **choices)
     else:
@@ -131,7 +132,7 @@ def test_a_stream_is_the_log(link, record, office, log, log_file, expected, tmp_
 def test_method_ml_gives_the_map_of_the_log(office, log, tmp_path):
     path = tmp_path / "map.geojson"
     with Device("tcp://127.0.0.1:0", log_messages(log, office.ring)) as device:
-        status = stream(device.sink.url, office.ring, map_path=path)
+        status = stream(device.sink.url, office.ring, map_filename=path)
     mapper = Mapper(ring=office.ring)  # which gives the map of build_map, as its own tests have it
     state = mapper.start()
     for scan in log:
@@ -143,7 +144,7 @@ def test_method_ml_gives_the_map_of_the_log(office, log, tmp_path):
 @pytest.mark.slow
 def test_a_raw_record_is_the_device_again(office, log, expected, tmp_path):
     raw, path, again = tmp_path / "raw.mcap", tmp_path / "map.geojson", tmp_path / "again.csv"
-    stream_of = {"method": "hough", "map_path": path}
+    stream_of = {"method": "hough", "map_filename": path}
     with Device("tcp://127.0.0.1:0", log_messages(log, office.ring)) as device:
         stream(device.sink.url, office.ring, method="hough", record=raw)
     status = stream(f"file:{raw}?speed=0", office.ring, record=again, **stream_of)
@@ -160,7 +161,7 @@ def test_scans_without_a_pose_stay_without_one_when_played(office, log, tmp_path
     save_log(part, tmp_path / "part.csv")
     status = stream(f"file:{tmp_path}/part.csv?speed=0", office.ring, method="hough", record=tmp_path / "again.csv")
     np.testing.assert_array_equal(load_log(tmp_path / "again.csv").pose, pose)
-    assert status.unplaced == 4
+    assert status.without_pose == 4
 
 
 @pytest.mark.slow
@@ -168,7 +169,7 @@ def test_a_bad_link_gives_less_and_never_anything_else(office, log, tmp_path):
     """Every echo of the record was sent; what is damaged is counted."""
     faults = FaultSettings(corrupt=0.1, drop=0.05, reorder=0.1, seed=5)
     with Device("tcp://127.0.0.1:0", log_messages(log, office.ring), faults=faults) as device:
-        status = stream(device.sink.url, office.ring, method="hough", record=tmp_path / "rec.csv", map_path=None)
+        status = stream(device.sink.url, office.ring, method="hough", record=tmp_path / "rec.csv", map_filename=None)
     found = load_log(tmp_path / "rec.csv")
     row_of = {int(number): row for row, number in enumerate(log.scan)}
     row = np.array([row_of[int(number)] for number in found.scan])[found.echo_scan]
@@ -182,7 +183,7 @@ def test_a_bad_link_gives_less_and_never_anything_else(office, log, tmp_path):
     for scan in found:
         if np.isfinite(scan.pose).all():
             np.testing.assert_array_equal(scan.pose, log.pose[row_of[scan.scan]])
-    line = status.line()
+    line = status.text()
     assert f"{status.counts['rejected']} damaged" in line
     assert "\n" not in line
 
@@ -241,14 +242,19 @@ def test_the_end_waits_for_the_compiler_only_where_a_map_does(mapping, office, l
     record, map_path = tmp_path / "r.csv", tmp_path / "m.geojson"
 
     def on_status(status):
-        if status.waiting == len(log):
+        if status.queued == len(log):
             stop.set()
         if status.ending and not ending:
-            ending.append((len(load_log(record)), os.listdir(tmp_path), status.line()))
+            ending.append((len(load_log(record)), os.listdir(tmp_path), status.text()))
             compiled.set()
 
     with Device("tcp://127.0.0.1:0", log_messages(log, office.ring)) as device:
-        choices = {"record": record, "map_path": map_path if mapping else None, "stop": stop, "on_status": on_status}
+        choices = {
+            "record": record,
+            "map_filename": map_path if mapping else None,
+            "stop": stop,
+            "on_status": on_status,
+        }
         status = stream(device.sink.url, office.ring, method="hough", **choices)
     assert len(load_log(record)) == len(log)
     assert status.warm == compiled.is_set() == mapping
@@ -280,12 +286,12 @@ def test_errors_come_after_everything_was_written(office, log, tmp_path, monkeyp
     original = LogPlayer.read
     monkeypatch.setattr(LogPlayer, "read", read)
     save_log(log, tmp_path / "log.csv")
-    paths = {"record": tmp_path / "r.csv", "map_path": tmp_path / "m.geojson"}
+    paths = {"record": tmp_path / "r.csv", "map_filename": tmp_path / "m.geojson"}
     with pytest.raises(ValueError, match="the driver broke"):
         stream(f"file:{tmp_path}/log.csv?speed=0", office.ring, method="hough", **paths)
     assert issubclass(LogPlayer, real)
     assert 0 < len(load_log(paths["record"])) < len(log)
-    assert len(load_map(paths["map_path"])) > 0
+    assert len(load_map(paths["map_filename"])) > 0
 
 
 # A robot that moves while the groups fire
@@ -320,9 +326,9 @@ def test_a_moving_robot_is_as_exact_as_one_at_rest():
     """The groups' own poses give the walls back to the bound; without them they are off many times more."""
     raws, poses = moving_scans(0.001)
     live = LiveMap(RING, sigma=0.001, mapping=False)
-    taken = live.take(raws)
+    taken = live.process(raws)
     with_motion, covs = wall_errors([scan.model for scan in taken], poses)
-    ignoring = [local_model(RING, live.scan_of(raw), sigma=0.001) for raw in raws]
+    ignoring = [local_model(RING, live.as_scan(raw), sigma=0.001) for raw in raws]
     without, _ = wall_errors(ignoring, poses)
     still = simulate(RING, WALLS, poses, sigma=0.001, seed=2).as_log(RING, poses)
     at_rest, _ = wall_errors([local_model(RING, scan, sigma=0.001) for scan in still], poses)
@@ -342,7 +348,7 @@ def test_moved_paths_are_those_of_moved_sensors():
     pose = np.array([0.12, -0.07, 0.4])
     settings = hough_settings(RING, None)
     poses = np.broadcast_to(pose, (len(RING.paths), 3)).astype(np.float32)
-    moved = kernels.moved_arcs(arc_tables(RING, settings).arcs, jax.numpy.asarray(poses), settings=settings)
+    moved = kernels.transform_arcs(arc_tables(RING, settings).arcs, jax.numpy.asarray(poses), settings=settings)
     there = Ring(
         transform_points(pose, np.asarray(RING.position)),
         RING.heading + pose[2],
@@ -371,10 +377,10 @@ def test_a_robot_at_rest_needs_no_moved_paths(office, log):
 def test_moved_scans_compile_nothing_anew():
     raws, _ = moving_scans(0.001, count=4)
     live = LiveMap(RING, method="hough", mapping=False)
-    live.take(raws[:1])
-    programs = getattr(kernels.moved_arcs, "_cache_size")  # noqa: B009
+    live.process(raws[:1])
+    programs = getattr(kernels.transform_arcs, "_cache_size")  # noqa: B009
     before = programs()
-    live.take(raws)
+    live.process(raws)
     assert programs() == before
 
 
@@ -388,9 +394,9 @@ def raw_scan(temperature):
 @pytest.mark.parametrize("temperature", [-20.0, 0.0, 35.0])
 def test_a_measured_temperature_changes_the_speed_and_not_the_range(temperature):
     live = LiveMap(RING, method="hough", mapping=False)
-    live.take([raw_scan(float("nan"))])
+    live.process([raw_scan(float("nan"))])
     assert live.ring is RING
-    (taken,) = live.take([raw_scan(temperature)])
+    (taken,) = live.process([raw_scan(temperature)])
     np.testing.assert_allclose(taken.scan.range, [1.0], rtol=1e-6)
     assert live.ring.speed_of_sound == pytest.approx(331.3 * np.sqrt(1 + temperature / 273.15))
 
@@ -545,12 +551,12 @@ def test_a_view_as_a_file_and_a_clear_word_without_the_extra(office, log, log_fi
 
 def test_status_lines_are_lines():
     status = Status(scans=3, counts={"rejected": 2, "impossible": 1, "oversized": 1, "gaps": 1}, event="gone\n")
-    assert "2 damaged (1 oversized, 1 impossible)" in status.line()
-    assert "1 gaps" in status.line()
+    assert "2 damaged (1 oversized, 1 impossible)" in status.text()
+    assert "1 gaps" in status.text()
 
 
 @pytest.mark.slow
 def test_records_need_a_place(tmp_path, office, log_file):
     with pytest.raises(SonarError, match="allowed"):
         stream(f"file:{log_file}?speed=0", office.ring, record=tmp_path / "no" / "x.csv")
-    assert open_record(tmp_path / "x.csv").close() is None
+    assert open_log_recorder(tmp_path / "x.csv").close() is None

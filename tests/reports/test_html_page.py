@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from jaxsonar import SonarError
 from jaxsonar.reports import html_page as report
-from jaxsonar.reports.html_page import NOTHING, Column, Picture, Section, Table, save_report
+from jaxsonar.reports.html_page import Column, Picture, Section, Table, save_report
+from jaxsonar.reports.text import NO_VALUE
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 HOSTILE = """</title></style><script src="https://example.com/x.js">alert('1')</script> & "quoted" 'too' \0 \udc80"""
@@ -138,7 +139,7 @@ def test_numbers_stand_on_the_right_with_units_in_the_header(page):
     assert header == [("what", None), ("scans", "number"), ("max Δρ ", "number"), ("ratio", "number")]
     assert page.texts("span") == ["(mm)"]
     assert [text for _, text in page.all("th")[4:]] == ["office", "corridor", "nothing"]
-    cells = ["17", "8.3", "−0.01235", "1200", *[NOTHING] * 5]
+    cells = ["17", "8.3", "−0.01235", "1200", *[NO_VALUE] * 5]
     assert page.all("td") == [({"class": "number"}, cell) for cell in cells]
 
 

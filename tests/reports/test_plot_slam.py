@@ -10,8 +10,8 @@ from matplotlib.patches import Ellipse
 
 from jaxsonar import GlobalMap, Room, SonarError
 from jaxsonar.estimation.trajectory import Trajectory
-from jaxsonar.reports import plot_style as figures
-from jaxsonar.reports.plot_slam import HELD, MOST_ELLIPSES, SIGMAS, ellipses, slam_figure
+from jaxsonar.reports import plot_style
+from jaxsonar.reports.plot_slam import ELLIPSE_PROBABILITY, ELLIPSE_SIGMAS, MAX_ELLIPSES, ellipses, slam_figure
 
 WALLS = np.array([[[0.0, 1.0], [9.0, 1.0]], [[0.0, -1.0], [9.0, -1.0]], [[9.0, -1.0], [9.0, 1.0]]])
 
@@ -47,7 +47,15 @@ def test_everything_given_is_in_the_legend():
         room=Room(WALLS, poles=np.array([[4.0, 0.5]])),
     )
     told = " | ".join(labels(figure))
-    for name in ("odometry", "true path", "estimated path", "start", "2 sigma (86 %)", "loop closure", "withdrawn"):
+    for name in (
+        "odometry",
+        "true trajectory",
+        "estimated trajectory",
+        "start",
+        "2 sigma (86 %)",
+        "loop closure",
+        "withdrawn",
+    ):
         assert name in told
     for name in ("wall", "corner", "edge", "true wall", "pole"):
         assert name in labels(figure)
@@ -61,10 +69,10 @@ def test_everything_given_is_in_the_legend():
 
 def test_what_is_not_given_is_not():
     figure = slam_figure(world(), Trajectory(np.arange(2.0), np.zeros((2, 3))))
-    assert labels(figure) == ["estimated path", "start", "wall", "corner", "edge"]
+    assert labels(figure) == ["estimated trajectory", "start", "wall", "corner", "edge"]
     empty = slam_figure(world(WALLS[:0]), Trajectory(np.zeros(0), np.zeros((0, 3))), title="none $of it")
-    assert labels(empty) == ["estimated path", "wall"]
-    assert figures.rendered(empty, "png").startswith(b"\x89PNG")
+    assert labels(empty) == ["estimated trajectory", "wall"]
+    assert plot_style.render_figure(empty, "png").startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("sd", [0.0, 1e-4, 0.02, 0.5])
@@ -72,11 +80,11 @@ def test_ellipses_are_as_large_as_they_say(sd):
     run = out_and_back(sd)
     figure = slam_figure(world(), run)
     drawn = [one for one in figure.axes[0].patches if isinstance(one, Ellipse)]
-    assert 0 < len(drawn) <= MOST_ELLIPSES
+    assert 0 < len(drawn) <= MAX_ELLIPSES
     (told,) = [label for label in labels(figure) if "sigma" in label]
     times = int(told.split(", ")[1].split()[0]) if "," in told else 1
     last = drawn[-1]
-    np.testing.assert_allclose(last.get_width(), 2 * SIGMAS * times * sd * np.sqrt(79 / 80), rtol=1e-9)
+    np.testing.assert_allclose(last.get_width(), 2 * ELLIPSE_SIGMAS * times * sd * np.sqrt(79 / 80), rtol=1e-9)
     assert times == {0.0: 1, 1e-4: 500, 0.02: 5, 0.5: 1}[sd], "of a path of 7.5 m"
 
 
@@ -88,13 +96,13 @@ def test_so_many_are_within(rng):
     c, s = np.cos(turn[0]), np.sin(turn[0])
     own = points @ np.array([[c, -s], [s, c]])
     assert halves[0, 0] >= halves[0, 1]
-    np.testing.assert_allclose(np.mean(((own / halves[0]) ** 2).sum(axis=1) <= 1), HELD, atol=0.01)
+    np.testing.assert_allclose(np.mean(((own / halves[0]) ** 2).sum(axis=1) <= 1), ELLIPSE_PROBABILITY, atol=0.01)
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi / 2])
 def test_nothing_leaves_the_paper(turn):
     """The legend of a narrow plan, too."""
-    run = out_and_back(0.002).moved(np.array([0.0, 0.0, turn]))
+    run = out_and_back(0.002).transform(np.array([0.0, 0.0, turn]))
     c, s = np.cos(turn), np.sin(turn)
     segments = WALLS @ np.array([[c, s], [-s, c]])
     figure = slam_figure(world(segments), run, odometry=run.poses, truth=run.poses, withdrawn=np.array([[0, 9]]))
@@ -114,10 +122,10 @@ def test_nothing_leaves_the_paper(turn):
 def test_files_are_what_their_names_say(tmp_path):
     figure = slam_figure(world(), out_and_back())
     for suffix in ("svg", "png"):
-        figures.save(figure, tmp_path / f"a.{suffix}")
+        plot_style.save_figure(figure, tmp_path / f"a.{suffix}")
     assert ElementTree.parse(tmp_path / "a.svg").getroot().tag.endswith("svg")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     again = slam_figure(world(), out_and_back())
-    assert figures.rendered(again, "svg") == (tmp_path / "a.svg").read_bytes()
+    assert plot_style.render_figure(again, "svg") == (tmp_path / "a.svg").read_bytes()
     with pytest.raises(SonarError, match="gif"):
-        figures.save(figure, tmp_path / "a.gif")
+        plot_style.save_figure(figure, tmp_path / "a.gif")

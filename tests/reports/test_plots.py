@@ -14,9 +14,7 @@ from jaxsonar import LocalModel, Log, Ring, Room, Scan, SonarError, local_model,
 from jaxsonar.evaluation.laser_segments import PolygonalModel
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.occupancy.occupancy_grid import FREE, OCCUPIED, UNKNOWN
-from jaxsonar.reports import plot_map as figures_map
-from jaxsonar.reports import plot_scan as figures_scan
-from jaxsonar.reports import plot_style as figures
+from jaxsonar.reports import plot_map, plot_scan, plot_style
 from jaxsonar.simulation.office import load_office
 
 BUMPER = Ring(
@@ -87,7 +85,7 @@ def map_of(segments):
 
 
 def a_map(case):
-    return map_of(figures_map.aggregated_segments([case.model], case.pose[None]))
+    return map_of(plot_map.aggregated_segments([case.model], case.pose[None]))
 
 
 GRID = np.full((30, 40), UNKNOWN, np.uint8)
@@ -103,21 +101,21 @@ CASES = {
     "beyond": beyond,
 }
 DRAW = {
-    "ring": lambda case: figures_scan.ring_figure(case.ring),
-    "last sensor fires": lambda case: figures_scan.ring_figure(case.ring, transmitter=case.ring.count - 1, reach=0.9),
-    "arcs": lambda case: figures_scan.arcs_figure(case.ring, case.scan),
-    "arcs in the room": lambda case: figures_scan.arcs_figure(case.ring, case.scan, room=case.room, pose=case.pose),
-    "lines": lambda case: figures_scan.lines_figure(case.ring, case.scan, case.model),
-    "lines in the room": lambda case: figures_scan.lines_figure(
+    "ring": lambda case: plot_scan.ring_figure(case.ring),
+    "last sensor fires": lambda case: plot_scan.ring_figure(case.ring, transmitter=case.ring.count - 1, arc_range=0.9),
+    "arcs": lambda case: plot_scan.arcs_figure(case.ring, case.scan),
+    "arcs in the room": lambda case: plot_scan.arcs_figure(case.ring, case.scan, room=case.room, pose=case.pose),
+    "lines": lambda case: plot_scan.lines_figure(case.ring, case.scan, case.model),
+    "lines in the room": lambda case: plot_scan.lines_figure(
         case.ring, case.scan, case.model, room=case.room, pose=case.pose
     ),
-    "accumulator": lambda case: figures_scan.accumulator_figure(case.ring, case.scan, case.model),
-    "aggregate": lambda case: figures_map.aggregate_figure(case.ring, [case.model] * 2, np.stack([case.pose] * 2)),
-    "aggregate in the room": lambda case: figures_map.aggregate_figure(
+    "accumulator": lambda case: plot_scan.accumulator_figure(case.ring, case.scan, case.model),
+    "aggregate": lambda case: plot_map.aggregate_figure(case.ring, [case.model] * 2, np.stack([case.pose] * 2)),
+    "aggregate in the room": lambda case: plot_map.aggregate_figure(
         case.ring, [case.model], case.pose[None], room=case.room
     ),
-    "modeling": lambda case: figures_map.modeling_figure(case.ring, [case.model], case.pose[None], scans=[0]),
-    "modeling in the room": lambda case: figures_map.modeling_figure(
+    "modeling": lambda case: plot_map.modeling_figure(case.ring, [case.model], case.pose[None], scans=[0]),
+    "modeling in the room": lambda case: plot_map.modeling_figure(
         case.ring,
         [case.model] * 2,
         np.stack([case.pose] * 2),
@@ -126,22 +124,22 @@ DRAW = {
         within=1.7,
         room=case.room,
     ),
-    "map": lambda case: figures_map.map_figure(a_map(case)),
-    "map with all": lambda case: figures_map.map_figure(
+    "map": lambda case: plot_map.map_figure(a_map(case)),
+    "map with all": lambda case: plot_map.map_figure(
         a_map(case),
-        aggregated=figures_map.aggregated_segments([case.model], case.pose[None]),
+        aggregated=plot_map.aggregated_segments([case.model], case.pose[None]),
         poses=case.pose[None],
         room=case.room,
         reference=case.room.walls + 0.1,
         laser_points=case.room.walls.reshape(-1, 2),
         title="All",
     ),
-    "laser": lambda case: figures_map.laser_figure(case.room.walls, case.room.walls.reshape(-1, 2)),
-    "laser scan": lambda case: figures_map.laser_figure(
+    "laser": lambda case: plot_map.laser_figure(case.room.walls, case.room.walls.reshape(-1, 2)),
+    "laser scan": lambda case: plot_map.laser_figure(
         PolygonalModel(case.room.walls, case.room.walls + 0.2, case.room.walls[:, 0]), case.room.walls[:, 1]
     ),
-    "grid": lambda case: figures_map.grid_figure(GRID, resolution=0.1, origin=(-1.0, 2.0)),
-    "grid and map": lambda case: figures_map.grid_figure(GRID, resolution=0.1, origin=(-1.0, 2.0), world=a_map(case)),
+    "grid": lambda case: plot_map.grid_figure(GRID, resolution=0.1, origin=(-1.0, 2.0)),
+    "grid and map": lambda case: plot_map.grid_figure(GRID, resolution=0.1, origin=(-1.0, 2.0), world=a_map(case)),
 }
 
 
@@ -182,14 +180,14 @@ def test_drawing_leaves_no_trace_in_the_style():
     import matplotlib
 
     before = dict(matplotlib.rcParams)
-    figures_scan.ring_figure(LONE)
+    plot_scan.ring_figure(LONE)
     assert dict(matplotlib.rcParams) == before
 
 
 def test_arcs_of_a_scan_are_all_paths_that_can_hear(faw_ring):
     """As many curves as there are paths with overlapping cones and no echo, plus the echoes."""
     here = office()
-    axes = figures_scan.arcs_figure(here.ring, here.scan).axes[0]
+    axes = plot_scan.arcs_figure(here.ring, here.scan).axes[0]
     silent, cross, direct = (len(collection.get_paths()) for collection in axes.collections)
     heard = set(zip(here.scan.tx.tolist(), here.scan.rx.tolist(), strict=True))
     assert silent == len(here.ring.paths) - len(heard)
@@ -205,7 +203,7 @@ def test_outermost_reflection_lines_end_where_the_segment_ends():
     case = office()
     assert case.model.lines
     for line in case.model.lines:
-        rays = figures_map.reflection_lines(case.ring, line)
+        rays = plot_map.reflection_lines(case.ring, line)
         assert len(rays) == len(line.paths)
         feet = rays[[0, -1], 1]
         feet = (
@@ -224,7 +222,7 @@ def test_a_place_leaves_out_what_is_farther_away():
     shipped = load_office()
     heard = simulate(shipped.ring, shipped.room, shipped.poses, sigma=0.003, seed=1)
     models = list(local_models(shipped.ring, heard.as_log(shipped.ring, shipped.poses)))
-    draw = partial(figures_map.modeling_figure, shipped.ring, models, shipped.poses, scans=(0, 1, 2))
+    draw = partial(plot_map.modeling_figure, shipped.ring, models, shipped.poses, scans=(0, 1, 2))
 
     def bold(figure):
         return sum(line.get_linewidth() == 4 for line in figure.axes[0].lines)
@@ -237,11 +235,11 @@ def test_a_place_leaves_out_what_is_farther_away():
 @pytest.mark.parametrize(("poses", "numbers"), [(0, 0), (1, 1), (40, 40), (41, 0), (2000, 0)])
 def test_many_positions_are_a_path_without_numbers(poses, numbers):
     path = np.stack([np.linspace(0, 25, poses), np.ones(poses), np.zeros(poses)], axis=-1)
-    axes = figures_map.map_figure(map_of([[[0, 0], [25, 0]]]), poses=path).axes[0]
+    axes = plot_map.map_figure(map_of([[[0, 0], [25, 0]]]), poses=path).axes[0]
     assert len(axes.texts) == numbers
     line, crosses = axes.lines
     assert np.size(line.get_xdata()) == poses
-    assert np.size(crosses.get_xdata()) <= figures_map.MOST_NUMBERS
+    assert np.size(crosses.get_xdata()) <= plot_map.MAX_NUMBERED_POSES
 
 
 @pytest.mark.parametrize("size", [(25, 4), (4, 25), (4, 4), (200, 1), (1, 200), (0.3, 0.3)])
@@ -249,7 +247,7 @@ def test_paper_suits_the_place(size):
     """Corridors along x get wide paper, along y a page's height; a metre is as long in both directions."""
     x, y = size
     walls = [[[0, 0], [x, 0]], [[0, y], [x, y]], [[0, 0], [0, y]]]
-    figure = figures_map.map_figure(map_of(walls), poses=np.array([[0.0, 0.0, 0.0]]), room=Room(np.array(walls, float)))
+    figure = plot_map.map_figure(map_of(walls), poses=np.array([[0.0, 0.0, 0.0]]), room=Room(np.array(walls, float)))
     width, height = figure.get_size_inches()
     assert 4 <= width <= 10
     assert 1.2 < height <= 11
@@ -263,7 +261,7 @@ def test_paper_suits_the_place(size):
 
 def test_every_end_of_a_segment_has_a_tick_across():
     world = map_of([[[0, 0], [2, 0]], [[2, 0], [2, 3]]])
-    axes = figures_map.map_figure(world).axes[0]
+    axes = plot_map.map_figure(world).axes[0]
     _, ticks = axes.collections
     np.testing.assert_array_equal(ticks.get_offsets(), world.segments.reshape(-1, 2))
     across = np.array([np.diff(path.vertices, axis=0)[0] for path in ticks.get_paths()])
@@ -276,9 +274,9 @@ def test_a_thousand_segments_are_few_elements(rng, tmp_path):
     """What is drawn grows with the number of scans, the number of artists does not."""
     ends = rng.uniform(0, 20, (1000, 2, 2))
     points = rng.uniform(0, 20, (100_000, 2))
-    figure = figures_map.map_figure(map_of(ends[:100]), aggregated=ends, reference=ends, laser_points=points)
+    figure = plot_map.map_figure(map_of(ends[:100]), aggregated=ends, reference=ends, laser_points=points)
     assert len(figure.axes[0].get_children()) < 30
-    figures.save(figure, tmp_path / "a.svg")
+    plot_style.save_figure(figure, tmp_path / "a.svg")
     assert (tmp_path / "a.svg").stat().st_size < 3e6
 
 
@@ -286,7 +284,7 @@ def test_the_grid_lies_where_the_map_says():
     """Row 0 is at the top: the cell at the lower left corner is the last row's first."""
     image = np.full((3, 5), FREE, np.uint8)
     image[2, 0] = OCCUPIED
-    figure = figures_map.grid_figure(image, resolution=0.5, origin=(10.0, -4.0))
+    figure = plot_map.grid_figure(image, resolution=0.5, origin=(10.0, -4.0))
     (shown,) = figure.axes[0].images
     assert shown.get_extent() == [10.0, 12.5, -4.0, -2.5]
     pixels = np.asarray(drawn(figure).buffer_rgba())[::-1, :, 0]
@@ -300,7 +298,7 @@ def test_the_grid_lies_where_the_map_says():
 
 @pytest.fixture(scope="module")
 def figure():
-    return figures_scan.ring_figure(BUMPER)
+    return plot_scan.ring_figure(BUMPER)
 
 
 def svg_names(path):
@@ -308,8 +306,8 @@ def svg_names(path):
 
 
 def test_svg_is_xml_and_the_same_twice(figure, tmp_path):
-    figures.save(figure, tmp_path / "a.svg")
-    figures.save(figures_scan.ring_figure(BUMPER), tmp_path / "b.svg")
+    plot_style.save_figure(figure, tmp_path / "a.svg")
+    plot_style.save_figure(plot_scan.ring_figure(BUMPER), tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     assert {"svg", "path", "g"} <= svg_names(tmp_path / "a.svg")
 
@@ -328,18 +326,18 @@ def test_svg_is_xml_and_the_same_twice(figure, tmp_path):
 def test_every_svg_is_the_same_twice(tmp_path, name):
     case = office()
     for file in ("a.svg", "b.svg"):
-        figures.save(DRAW[name](case), tmp_path / file)
+        plot_style.save_figure(DRAW[name](case), tmp_path / file)
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
 
 
 def test_png_and_pdf(figure, tmp_path):
-    figures.save(figure, str(tmp_path / "a.PNG"))
+    plot_style.save_figure(figure, str(tmp_path / "a.PNG"))
     head = (tmp_path / "a.PNG").read_bytes()
     assert head.startswith(b"\x89PNG\r\n\x1a\n")
     assert head[12:16] == b"IHDR"
     width, height = (int.from_bytes(head[k : k + 4], "big") for k in (16, 20))
     np.testing.assert_allclose([width, height], figure.get_size_inches() * 160, atol=1)
-    figures.save(figure, tmp_path / "a.pdf")
+    plot_style.save_figure(figure, tmp_path / "a.pdf")
     body = (tmp_path / "a.pdf").read_bytes()
     assert body.startswith(b"%PDF")
     assert body.rstrip().endswith(b"%%EOF")
@@ -348,13 +346,13 @@ def test_png_and_pdf(figure, tmp_path):
 @pytest.mark.parametrize("name", ["a.gif", "a", "svg", "a.svg.txt"])
 def test_another_suffix_is_refused(figure, tmp_path, name):
     with pytest.raises(SonarError, match=r"allowed are \.svg, \.png, \.pdf"):
-        figures.save(figure, tmp_path / name)
+        plot_style.save_figure(figure, tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_place_that_cannot_be_written_is_named(figure, tmp_path):
     with pytest.raises(SonarError, match=r"no/a\.png.*cannot write"):
-        figures.save(figure, tmp_path / "no" / "a.png")
+        plot_style.save_figure(figure, tmp_path / "no" / "a.png")
 
 
 def test_a_failure_leaves_the_old_figure(tmp_path):
@@ -365,7 +363,7 @@ def test_a_failure_leaves_the_old_figure(tmp_path):
 
     (tmp_path / "a.svg").write_text("old")
     with pytest.raises(RuntimeError, match="no more ink"):
-        figures.save(Broken(), tmp_path / "a.svg")
+        plot_style.save_figure(Broken(), tmp_path / "a.svg")
     assert [path.name for path in tmp_path.iterdir()] == ["a.svg"]
     assert (tmp_path / "a.svg").read_text() == "old"
 
@@ -378,7 +376,7 @@ def test_arc_points_lie_at_the_path_length(ring, rng):
     """From transmitter to point to receiver it is twice the range, wherever on the arc."""
     rows = np.flatnonzero(np.asarray(ring.echo_paths.width) > 0)
     reach = rng.uniform(0.6, ring.max_range, len(rows))
-    points = figures_scan.arc_points(ring, rows, reach, points=9)
+    points = plot_scan.arc_points(ring, rows, reach, points=9)
     assert points.shape == (len(rows), 9, 2)
     for row, length, arc in zip(rows, reach, points, strict=True):
         tx, rx = np.asarray(ring.position)[ring.paths[row]]
@@ -389,7 +387,7 @@ def test_arc_points_lie_at_the_path_length(ring, rng):
 def test_arcs_span_the_detection_range(faw_ring):
     """A plane square to the arc at its ends is heard from just there: the normal halves the angle at the point."""
     rows = np.arange(len(faw_ring.paths))
-    points = figures_scan.arc_points(faw_ring, rows, np.full(len(rows), 1.3), points=5)
+    points = plot_scan.arc_points(faw_ring, rows, np.full(len(rows), 1.3), points=5)
     for row, arc in zip(rows, points, strict=True):
         tx, rx = faw_ring.position[faw_ring.paths[row]]
         for end, wanted in zip((arc[0], arc[-1]), np.asarray(faw_ring.detection_ranges)[row], strict=True):
@@ -402,7 +400,7 @@ def test_arcs_span_the_detection_range(faw_ring):
 def test_arcs_turn_with_the_ring(faw_ring):
     """One sensor further along, an arc is the same one turned by 15 degrees."""
     rows = faw_ring.path_index[[3, 4, 4, 5], [3, 4, 6, 7]]
-    a, b, c, d = figures_scan.arc_points(faw_ring, rows, np.full(4, 1.1))
+    a, b, c, d = plot_scan.arc_points(faw_ring, rows, np.full(4, 1.1))
     cos, sin = np.cos(np.radians(15)), np.sin(np.radians(15))
     turn = np.array([[cos, sin], [-sin, cos]])
     np.testing.assert_allclose(a @ turn, b, atol=1e-6)
@@ -412,5 +410,5 @@ def test_arcs_turn_with_the_ring(faw_ring):
 def test_swapped_sensors_share_an_arc(faw_ring):
     for tx, rx in itertools.pairwise(range(6)):
         rows = faw_ring.path_index[[tx, rx], [rx, tx]]
-        there, back = figures_scan.arc_points(faw_ring, rows, np.full(2, 0.9))
+        there, back = plot_scan.arc_points(faw_ring, rows, np.full(2, 0.9))
         np.testing.assert_allclose(there, back, atol=1e-6)

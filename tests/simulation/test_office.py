@@ -72,13 +72,13 @@ def chair_of(office):
     return office.room.walls[office.room.wall_names.index(CHAIR)]
 
 
-def test_the_ring_is_the_papers(office):
+def test_the_ring_is_the_ring_of_the_paper(office):
     assert (office.ring.count, office.ring.neighbors, office.ring.max_range) == (24, 3, 2.0)
     np.testing.assert_allclose(office.ring.position, Ring.circular().position, atol=1e-12)
     assert len(office.ring.paths) == 24 + 144
 
 
-def test_the_way_has_17_poses_and_the_papers_steps(office):
+def test_the_trajectory_has_17_poses_and_the_steps_of_the_paper(office):
     assert office.poses.shape == (17, 3)
     steps = np.hypot(*np.diff(office.poses[:, :2], axis=0).T)
     allowed = np.array([0.25, 0.30, 0.50])
@@ -89,7 +89,7 @@ def test_the_way_has_17_poses_and_the_papers_steps(office):
     np.testing.assert_array_equal(office.poses[0], 0)
 
 
-def test_three_walls_are_within_reach_of_the_first_pose(office):
+def test_three_walls_are_in_range_of_the_first_pose(office):
     near = {
         name
         for wall, name in zip(office.room.walls, office.room.wall_names, strict=True)
@@ -98,7 +98,7 @@ def test_three_walls_are_within_reach_of_the_first_pose(office):
     assert near == {"left wall", "right wall", "back wall"}
 
 
-def test_the_chair_stands_where_the_paper_has_it(office):
+def test_the_chair_is_at_the_position_of_the_paper(office):
     chair = chair_of(office)
     np.testing.assert_allclose(in_frame(office.poses[0], chair.mean(axis=0)), [0.99, -0.63], atol=1e-3)
     assert 0.3 < np.linalg.norm(chair[1] - chair[0]) < 0.6
@@ -108,7 +108,7 @@ def test_there_are_recesses_for_a_door_and_a_cupboard(office):
     assert {"door", "cupboard", "door jamb", "cupboard side"} <= set(office.room.wall_names)
 
 
-def test_the_robot_fits_everywhere(office):
+def test_all_poses_have_clearance(office):
     for x, y, _ in office.poses:
         assert min(gap(np.array([x, y]), wall) for wall in office.room.walls) > 0.3
         assert all(math.dist((x, y), pole) > 0.3 for pole in office.room.poles)
@@ -123,7 +123,7 @@ def test_the_robot_crosses_no_wall(office):
             assert min(gap(point, wall) for wall in office.room.walls) > 0.25
 
 
-def test_the_room_is_closed_and_not_square_to_the_ring(office):
+def test_the_room_is_closed_and_not_aligned_with_the_ring(office):
     """Every end of an outer wall is the end of another one; no wall is square to a sensor at the first pose."""
     outer = [wall for wall, name in zip(office.room.walls, office.room.wall_names, strict=True) if name != CHAIR]
     ends = [tuple(end) for wall in outer for end in wall.tolist()]
@@ -133,7 +133,7 @@ def test_the_room_is_closed_and_not_square_to_the_ring(office):
         assert min(turn, 15 - turn) > 1
 
 
-def test_the_chair_is_no_line_at_the_first_pose_but_later(office, noisy):
+def test_the_chair_is_detected_at_later_poses_only(office, noisy):
     """With every seed: none at the first pose, one from at least one later pose."""
     chair = chair_of(office)
     for _, models in noisy:
@@ -145,7 +145,7 @@ def test_the_chair_is_no_line_at_the_first_pose_but_later(office, noisy):
         assert any(seen[1:])
 
 
-def test_three_walls_at_the_first_pose_as_near_as_in_the_paper(office, noisy):
+def test_three_walls_at_the_first_pose_with_deviations_as_in_the_paper(office, noisy):
     """In 8 of 10 seeds all three walls have a line within the paper's deviations, and nothing else has one."""
     good = 0
     for _, models in noisy:
@@ -162,7 +162,7 @@ def test_three_walls_at_the_first_pose_as_near_as_in_the_paper(office, noisy):
     assert good >= 8
 
 
-def test_most_clear_walls_of_all_poses_are_found(office, noisy):
+def test_most_clearly_visible_walls_are_detected(office, noisy):
     for heard, models in noisy:
         result = line_accuracy(office.ring, models, heard, office.room, office.poses, sigma=SIGMA)
         assert result.walls >= 2 * 17
@@ -204,7 +204,7 @@ def written(short_demo):
 
 
 @pytest.mark.slow
-def test_the_demo_writes_what_it_promises(written):
+def test_the_demo_writes_all_documented_files(written):
     folder, _, said = written
     assert {path.name for path in folder.iterdir()} == FILES
     assert all(path.stat().st_size > 100 for path in folder.iterdir())
@@ -213,7 +213,7 @@ def test_the_demo_writes_what_it_promises(written):
 
 
 @pytest.mark.slow
-def test_the_table_holds_numbers(written):
+def test_the_table_contains_finite_numbers(written):
     def refuse(constant):
         raise ValueError(f"{constant} is no JSON")
 
@@ -248,7 +248,7 @@ def test_the_table_holds_numbers(written):
 
 
 @pytest.mark.slow
-def test_the_map_has_one_segment_for_every_wall_in_reach(written, office):
+def test_the_map_has_one_segment_for_every_wall_in_range(written, office):
     """The chair back-rest included, and nothing else; nearer to the truth than the segments it is made of."""
     folder, (_, maps), _ = written
     assert json.loads((folder / "map-table.json").read_text()) == maps
@@ -262,7 +262,7 @@ def test_the_map_has_one_segment_for_every_wall_in_reach(written, office):
 
 
 @pytest.mark.slow
-def test_the_demos_files_give_its_map_again(written, tmp_path, capsys):
+def test_the_commands_reproduce_the_map_of_the_demo(written, tmp_path, capsys):
     folder, _, _ = written
     again = tmp_path / "again.geojson"
     call = ["map", str(folder / "office.csv"), "--ring", str(folder / "ring.toml"), "-o", str(again)]
@@ -272,13 +272,13 @@ def test_the_demos_files_give_its_map_again(written, tmp_path, capsys):
     capsys.readouterr()
 
 
-def test_a_folder_that_is_not_there_is_made(tmp_path):
+def test_a_missing_output_folder_is_created(tmp_path):
     make_folder(tmp_path / "new" / "folder")
     assert (tmp_path / "new" / "folder").is_dir()
 
 
 @pytest.mark.slow
-def test_the_page_shows_everything(written):
+def test_the_page_contains_all_figures(written):
     folder, _, _ = written
     page = (folder / "index.html").read_text()
     assert page.count("<img") == len(FIGURES)
@@ -287,7 +287,7 @@ def test_the_page_shows_everything(written):
 
 
 @pytest.mark.slow
-def test_the_demos_files_give_its_lines_again(written, tmp_path, capsys):
+def test_the_commands_reproduce_the_lines_of_the_demo(written, tmp_path, capsys):
     folder, _, _ = written
     again = tmp_path / "again.jsonl"
     assert cli.main(["lines", str(folder / "office.csv"), "--ring", str(folder / "ring.toml"), "-o", str(again)]) == 0
@@ -298,7 +298,7 @@ def test_the_demos_files_give_its_lines_again(written, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_demos_files_give_its_log_again(written, tmp_path, office, capsys):
+def test_the_commands_reproduce_the_log_of_the_demo(written, tmp_path, office, capsys):
     folder, _, _ = written
     path = tmp_path / "path.csv"
     poses = np.column_stack([office.stamps, office.poses]).tolist()
@@ -311,7 +311,7 @@ def test_the_demos_files_give_its_log_again(written, tmp_path, office, capsys):
 
 
 @pytest.mark.slow
-def test_the_demos_files_load(written, office):
+def test_the_files_of_the_demo_can_be_loaded(written, office):
     folder, _, _ = written
     assert len(load_log(folder / "office.csv")) == 17
     np.testing.assert_array_equal(load_room(folder / "office.geojson").walls, office.room.walls)
@@ -322,7 +322,7 @@ def test_the_demos_files_load(written, office):
     assert tomllib.loads((folder / "ring.toml").read_text())["ring"]["count"] == 24
 
 
-def test_the_conventional_ring_hears_itself_only(office):
+def test_the_conventional_ring_receives_direct_echoes_only(office):
     usual = demo.conventional_ring(office.ring)
     assert (usual.paths[:, 0] == usual.paths[:, 1]).all()
     np.testing.assert_allclose(np.degrees(usual.beam), 30)
