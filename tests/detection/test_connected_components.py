@@ -16,7 +16,7 @@ def partition(labels):
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.02, 0.6), st.integers(1, 4))
-def test_components_of_batches(seed, density, scans):
+def test_components_agree_with_the_oracle(seed, density, scans):
     masks = np.random.default_rng(seed).random((scans, 12, 7)) < density
     labels, counts = label_components(masks)
     assert not labels[:, -1].any()  # the row after the last
@@ -34,13 +34,13 @@ def cells(*where):
 
 
 @pytest.mark.parametrize("column", range(7))
-def test_theta_wraps(column):
+def test_components_join_across_theta_pi(column):
     assert cells((0, column), (11, column))[1] == [1]
     assert cells((0, column), (11, min(column + 1, 6)))[1] == [1]
     assert cells((1, column), (11, column))[1] == [2]
 
 
-def test_rho_zero_is_half_a_turn_further():
+def test_components_join_across_rho_zero():
     labels, counts = cells((2, 0), (8, 0))
     assert counts == [1]
     assert labels[0, 2, 0] * labels[0, 8, 0] == -1  # one component, its two sides marked apart
@@ -50,14 +50,14 @@ def test_rho_zero_is_half_a_turn_further():
     assert cells((11, 0), (6, 0))[1] == [1]
 
 
-def test_no_scans_and_empty_scans():
+def test_empty_batches_and_empty_scans():
     assert label_components(np.zeros((0, 12, 7), bool))[0].shape == (0, 13, 7)
     labels, counts = label_components(np.zeros((3, 12, 7), bool))
     assert not labels.any()
     assert list(counts) == [0, 0, 0]
 
 
-def test_scans_do_not_touch_each_other():
+def test_components_do_not_join_across_scans():
     mask = np.zeros((2, 12, 7), bool)
     mask[0, -1] = mask[1, 0] = True
     assert list(label_components(mask)[1]) == [1, 1]

@@ -72,7 +72,7 @@ def found(lines, scan=0):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("ring", [Ring.circular(), TURNED_RING, BUMPER])
-def test_lines_of_a_scan_are_those_of_the_slow_oracle(ring, seed):
+def test_lines_agree_with_the_slow_oracle(ring, seed):
     rng = np.random.default_rng(seed)
     setup = HoughSettings(rho_cells=100 if ring is not BUMPER else 120)
     echoes = a_scan(ring, rng)
@@ -91,7 +91,7 @@ def test_lines_of_a_scan_are_those_of_the_slow_oracle(ring, seed):
         np.testing.assert_allclose(lines.segments[0, k], ends, atol=1e-3)
 
 
-def test_walls_come_out_where_they_are(faw_ring):
+def test_walls_are_detected_at_their_positions(faw_ring):
     echoes = [(k, r) for wall in THREE_WALLS for k, r in oracles.wall_echoes(faw_ring, *wall)]
     came = found(extract_lines(faw_ring, dense(faw_ring, echoes)))
     assert len(came) == 3
@@ -104,7 +104,7 @@ def test_walls_come_out_where_they_are(faw_ring):
 @pytest.mark.slow
 @settings(max_examples=20)
 @given(st.integers(0, 10_000), st.integers(0, 23))
-def test_turning_the_robot_by_sensor_steps_permutes_paths_and_shifts_theta(seed, steps):
+def test_rotation_by_sensor_steps_permutes_paths_and_shifts_theta(seed, steps):
     """With cells of 3 deg a step of 15 deg is a whole number of cells, so nothing else may change."""
     ring, setup = Ring.circular(), HoughSettings(theta_cells=120)
     echoes = a_scan(ring, np.random.default_rng(seed))
@@ -136,7 +136,7 @@ def test_a_mirrored_room_gives_mirrored_lines(seed):
         assert twin[2] == pytest.approx(line[2], abs=2)
 
 
-def test_both_ways_of_a_pair_measure_one_geometry(faw_ring, rng):
+def test_both_directions_of_a_pair_give_the_same_lines(faw_ring, rng):
     echoes = a_scan(faw_ring, rng)
     swapped = [(int(faw_ring.path_index[tuple(faw_ring.paths[k][::-1])]), r) for k, r in echoes]
     lines = extract_lines(faw_ring, np.concatenate([dense(faw_ring, echoes, 6), dense(faw_ring, swapped, 6)]))
@@ -145,7 +145,7 @@ def test_both_ways_of_a_pair_measure_one_geometry(faw_ring, rng):
 
 
 @pytest.mark.slow
-def test_a_scan_gives_the_same_lines_alone_in_a_batch_and_from_a_log(faw_ring, rng):
+def test_lines_are_equal_for_single_scans_batches_and_logs(faw_ring, rng):
     scans = [a_scan(faw_ring, rng, false=int(rng.integers(0, 60))) for _ in range(300)]
     scans[7] = []
     ranges = np.concatenate([dense(faw_ring, scan, 8) for scan in scans])
@@ -166,7 +166,7 @@ def test_a_scan_gives_the_same_lines_alone_in_a_batch_and_from_a_log(faw_ring, r
     assert one.stamp == 61.5
 
 
-def test_order_and_slots_of_echoes_do_not_matter(faw_ring, rng):
+def test_lines_do_not_depend_on_the_order_of_echoes(faw_ring, rng):
     ranges = dense(faw_ring, a_scan(faw_ring, rng), 6)
     shuffled = np.concatenate([np.full((1, 168, 2), np.nan, np.float32), ranges[:, :, ::-1]], axis=2)
     first, second = extract_lines(faw_ring, ranges), extract_lines(faw_ring, shuffled)
@@ -175,7 +175,7 @@ def test_order_and_slots_of_echoes_do_not_matter(faw_ring, rng):
     np.testing.assert_allclose(first.theta, second.theta, atol=1e-5)
 
 
-def test_padding_and_order(faw_ring, rng):
+def test_lines_are_sorted_and_padded(faw_ring, rng):
     ranges = np.concatenate([dense(faw_ring, []), dense(faw_ring, a_scan(faw_ring, rng))])
     lines = extract_lines(faw_ring, ranges)
     assert np.isnan(lines.rho[0]).all()
@@ -184,7 +184,7 @@ def test_padding_and_order(faw_ring, rng):
     assert ((lines.theta >= -np.pi) & (lines.theta < np.pi) | np.isnan(lines.theta)).all()
 
 
-def test_nothing_in_nothing_out(faw_ring):
+def test_no_scans_give_no_lines(faw_ring):
     lines = extract_lines(faw_ring, np.zeros((0, 168, 2), np.float32))
     assert lines.rho.shape == (0, 1)
     lines = extract_lines(faw_ring, np.zeros((3, 168, 0), np.float32))
@@ -192,7 +192,7 @@ def test_nothing_in_nothing_out(faw_ring):
     assert list(local_models(faw_ring, as_log(faw_ring, []))) == []
 
 
-def test_no_echo_is_no_wall(faw_ring):
+def test_no_echoes_give_no_wall(faw_ring):
     """Paths without an echo, and devices that write the maximum range instead, give no line."""
     everywhere = np.full((1, 168, 1), faw_ring.max_range, np.float32)
     assert not extract_lines(faw_ring, everywhere).echoes.any()
@@ -208,7 +208,7 @@ def test_no_echo_is_no_wall(faw_ring):
         ([(0, 1.0), (5, 1.5), (10, 0.6), (15, 1.8)], "no c"),
     ],
 )
-def test_an_empty_model_says_why(faw_ring, echoes, why):
+def test_an_empty_model_states_the_reason(faw_ring, echoes, why):
     model = next(local_models(faw_ring, as_log(faw_ring, [echoes])))
     assert model.lines == ()
     assert why in model.empty
@@ -227,7 +227,7 @@ def test_involved_sensors_bound_the_segment(faw_ring):
     np.testing.assert_allclose(line.segment[1], feet[span.argmax()], atol=1e-5)
 
 
-def test_json_is_plain_and_complete(faw_ring, rng):
+def test_json_is_complete(faw_ring, rng):
     (model,) = local_models(faw_ring, as_log(faw_ring, [a_scan(faw_ring, rng)]))
     back = json.loads(json.dumps(model.as_json(), allow_nan=False))
     assert back["scan"] == 0
@@ -241,7 +241,7 @@ def test_json_is_plain_and_complete(faw_ring, rng):
     assert "stamp" in dataclasses.replace(model, stamp=float("nan")).as_json()
 
 
-def test_offsets_and_speed_of_sound_are_taken_out():
+def test_offsets_and_speed_of_sound_are_corrected():
     plain = Ring.circular()
     ring = dataclasses.replace(plain, range_offset=np.linspace(0.0, 0.1, 24), speed_of_sound=350.0)
     echoes = oracles.wall_echoes(plain, 1.1, 0.7)
@@ -251,7 +251,7 @@ def test_offsets_and_speed_of_sound_are_taken_out():
     np.testing.assert_allclose(lines.rho[0, 0], wanted.rho[0, 0], atol=1e-4)
 
 
-def test_compiles_once_for_a_ring_whatever_the_scans(faw_ring, rng):
+def test_compiles_once_per_ring(faw_ring, rng):
     """New scans, other numbers of echoes and a recalibrated ring run what was compiled before."""
     compiled: list[Any] = [kernels.vote, kernels.ring_arcs]
     for kernel in compiled:
@@ -272,7 +272,7 @@ def primitives(jaxpr):
                 yield from primitives(value.jaxpr)
 
 
-def test_one_jitted_step_from_echoes_to_cells(faw_ring):
+def test_one_compiled_call_from_echoes_to_cells(faw_ring):
     """Votes, low pass and threshold are one program: no call of the host in it, cells and points come out."""
     echoes = kernels.PackedEchoes(jnp.zeros((2, 64), jnp.int32), jnp.full((2, 64), jnp.nan, jnp.float32))
     step = partial(kernels.vote, settings=HoughSettings())
@@ -286,7 +286,7 @@ def test_one_jitted_step_from_echoes_to_cells(faw_ring):
 
 
 @pytest.mark.parametrize(("offset", "speed"), [(0.25, 343.2), (-0.1, 343.2), (0.0, 319.0), (0.1, 360.0)])
-def test_the_maximum_range_is_one_of_true_ranges(offset, speed):
+def test_the_maximum_range_applies_to_corrected_ranges(offset, speed):
     """Echoes just within it vote and those beyond it do not, whatever the sensors add and the air does."""
     ring = dataclasses.replace(Ring.circular(), range_offset=offset, speed_of_sound=speed)
     for rho, heard in [(2.2, True), (2.5, False)]:
@@ -299,13 +299,13 @@ def test_the_maximum_range_is_one_of_true_ranges(offset, speed):
         assert heard or model.empty == "no echo within the maximum range"
 
 
-def test_ranges_beyond_single_precision_are_no_echo(faw_ring):
+def test_ranges_beyond_single_precision_are_ignored(faw_ring):
     echoes = [*oracles.wall_echoes(faw_ring, 1.2, 0.3), (3, 1e39)]
     assert len(next(local_models(faw_ring, as_log(faw_ring, [echoes]))).lines) == 1
 
 
 @pytest.mark.slow
-def test_large_accumulators_run_fewer_scans_at_once(faw_ring):
+def test_large_accumulators_use_smaller_batches(faw_ring):
     fine = HoughSettings(theta_cells=720, rho_cells=300, rho_cell=0.01)
     ranges = np.concatenate([dense(faw_ring, oracles.wall_echoes(faw_ring, 1.2, 0.3))] * 40)
     lines = extract_lines(faw_ring, ranges, settings=fine)
@@ -320,12 +320,12 @@ def test_large_accumulators_run_fewer_scans_at_once(faw_ring):
         (np.full((1, 168, 1), -0.5, np.float32), r"ranges\[0, 0, 0\] = -0.5"),
     ],
 )
-def test_unusable_ranges_are_refused(faw_ring, ranges, message):
+def test_invalid_ranges_raise_an_error(faw_ring, ranges, message):
     with pytest.raises(SonarError, match=message):
         extract_lines(faw_ring, ranges)
 
 
-def test_unusable_calls_are_refused(faw_ring):
+def test_invalid_arguments_raise_an_error(faw_ring):
     ranges = dense(faw_ring, [])
     with pytest.raises(SonarError, match=r"method 'best'; allowed is ml or hough$"):
         extract_lines(faw_ring, ranges, method="best")
@@ -338,7 +338,7 @@ def test_unusable_calls_are_refused(faw_ring):
         list(local_models(faw_ring, stranger))
 
 
-def test_pairs_that_the_ring_does_not_listen_to_are_counted(faw_ring):
+def test_pairs_that_are_no_paths_are_counted(faw_ring):
     log = Log.from_echoes(
         np.array([0, 0]), np.array([3, 3]), np.array([3, 12]), np.ones(2), stamp=np.zeros(1), pose=np.zeros((1, 3))
     )
@@ -347,7 +347,7 @@ def test_pairs_that_the_ring_does_not_listen_to_are_counted(faw_ring):
     assert told == [1]
 
 
-def test_a_far_reaching_ring_gets_a_larger_accumulator():
+def test_a_ring_with_a_long_range_gets_a_larger_accumulator():
     ring = Ring.circular(max_range=6.0)
     echoes = oracles.wall_echoes(ring, 5.5, 1.0)
     assert extract_lines(ring, dense(ring, echoes)).rho[0, 0] == pytest.approx(5.5, abs=0.03)

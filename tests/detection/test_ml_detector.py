@@ -89,7 +89,7 @@ def positive_definite(cov):
 
 
 @pytest.mark.slow
-def test_lines_are_those_of_the_local_models(log, models):
+def test_lines_equal_those_of_the_local_models(log, models):
     lines = extract_lines(RING, dense_of(log))
     assert lines.rho.shape == (SCANS, max(1, *(len(model.lines) for model in models)))
     for row, model in enumerate(models):
@@ -107,7 +107,7 @@ def test_lines_are_those_of_the_local_models(log, models):
 
 
 @pytest.mark.slow
-def test_lines_are_sorted_folded_and_padded(log):
+def test_lines_are_sorted_normalized_and_padded(log):
     lines = extract_lines(RING, dense_of(log), sigma=0.003)
     there = lines.echoes > 0
     assert there.any(axis=1).sum() > SCANS / 2
@@ -122,7 +122,7 @@ def test_lines_are_sorted_folded_and_padded(log):
 
 
 @pytest.mark.slow
-def test_two_slots_a_path_are_enough_for_two_echoes(log):
+def test_unused_slots_do_not_change_the_lines(log):
     """Of paths with more echoes, the nearest two."""
     ranges = np.sort(dense_of(log), axis=2)
     two = ranges[:, :, :2]
@@ -133,7 +133,7 @@ def test_two_slots_a_path_are_enough_for_two_echoes(log):
 
 
 @pytest.mark.slow
-def test_what_a_model_holds_explains_each_echo_once(log, models):
+def test_each_echo_is_explained_at_most_once(log, models):
     for row, model in enumerate(models):
         echoes = int((log.echo_scan == row).sum())
         parts = [*model.lines, *model.points, *model.undecided]
@@ -162,7 +162,7 @@ def test_what_a_model_holds_explains_each_echo_once(log, models):
 
 
 @pytest.mark.slow
-def test_json_of_a_model_is_plain_and_complete(models):
+def test_json_of_a_model_is_complete(models):
     assert any(model.points for model in models)
     assert any(model.undecided for model in models)
     for model in models:
@@ -184,7 +184,7 @@ def test_json_of_a_model_is_plain_and_complete(models):
 
 
 @pytest.mark.slow
-def test_the_papers_way_knows_no_points_no_noise_and_no_covariance(log):
+def test_method_hough_gives_no_points_noise_or_covariance(log):
     for model in local_models(RING, log, method="hough"):
         back = written(model)
         assert set(back) - {"empty"} == {"scan", "stamp", "lines"}
@@ -213,7 +213,7 @@ def test_a_known_noise_is_reported_and_scales_covariances(log):
 # what stands there
 
 
-def test_a_corner_between_its_walls_is_a_point_of_the_model():
+def test_a_corner_between_its_walls_is_reported():
     room = Room(np.array([[[1.2, 1.0], [-40, 1.0]], [[1.2, 1.0], [1.2, -40]]]))
     came = simulate(RING, room, np.zeros((2, 3)))
     scan = list(zip(came.path.tolist(), came.range.tolist(), strict=True))[: int((came.scan == 0).sum())]
@@ -230,7 +230,7 @@ def test_a_corner_between_its_walls_is_a_point_of_the_model():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("corner", [True, False])
-def test_direct_echoes_alone_leave_corner_and_edge_open_and_the_model_says_so(corner):
+def test_direct_echoes_alone_do_not_distinguish_corner_and_edge(corner):
     ring = dataclasses.replace(RING, neighbors=0)
     place = np.array([1.0, 0.35])
     scan = [(path, reach) for _, path, reach in oracles.point_echoes(ring, np.zeros(3), place, corner=corner)]
@@ -251,7 +251,7 @@ def test_direct_echoes_alone_leave_corner_and_edge_open_and_the_model_says_so(co
     assert nothing.undecided == ()
 
 
-def test_the_papers_way_takes_the_same_echoes_for_a_wall_where_there_are_enough():
+def test_method_hough_takes_the_same_echoes_for_a_wall():
     """Why there is a method ml: a pole is its best line."""
     loud = Acoustics(pole_strength=1.0)
     came = simulate(RING, Room(np.zeros((0, 2, 2)), poles=np.array([[1.0, 0.2]])), np.zeros((1, 3)), acoustics=loud)
@@ -268,7 +268,7 @@ def test_the_papers_way_takes_the_same_echoes_for_a_wall_where_there_are_enough(
 
 
 @pytest.mark.parametrize("sigma", [0.0, -0.001, 1e-7, 1.5, math.nan, math.inf])
-def test_a_noise_that_no_ring_has_is_refused_in_one_line(sigma):
+def test_an_invalid_sigma_raises_a_one_line_error(sigma):
     nothing = np.full((1, len(RING.paths), 1), np.nan)
     for call in (
         lambda: extract_lines(RING, nothing, sigma=sigma),
@@ -280,7 +280,7 @@ def test_a_noise_that_no_ring_has_is_refused_in_one_line(sigma):
         assert len(str(refused.value).splitlines()) == 1
 
 
-def test_an_unknown_method_is_refused_in_one_line():
+def test_an_unknown_method_raises_a_one_line_error():
     nothing = np.full((1, len(RING.paths), 1), np.nan)
     for call in (
         lambda: extract_lines(RING, nothing, method="best"),
@@ -302,7 +302,7 @@ def call(*arguments):
 
 
 @pytest.mark.slow
-def test_the_command_takes_the_noise_and_writes_what_the_library_gives(log, tmp_path, capsys):
+def test_the_command_and_the_library_agree(log, tmp_path, capsys):
     save_log(log, tmp_path / "log.csv")
     arguments = ["lines", tmp_path / "log.csv", "--ring", "faw", "-o", tmp_path / "lines.jsonl"]
     assert call(*arguments, "--sigma", "0.003") == 0
@@ -330,7 +330,7 @@ def test_the_command_takes_the_noise_and_writes_what_the_library_gives(log, tmp_
         (["--method", "best"], ["--method", "best", "ml", "hough"]),
     ],
 )
-def test_a_wrong_argument_is_one_line_and_exit_code_2(tmp_path, capsys, options, said):
+def test_an_invalid_option_gives_one_line_and_exit_code_2(tmp_path, capsys, options, said):
     save_log(log_of([]), tmp_path / "log.csv")
     assert call("lines", tmp_path / "log.csv", "--ring", "faw", "-o", tmp_path / "lines.jsonl", *options) == 2
     came = capsys.readouterr()
@@ -341,7 +341,7 @@ def test_a_wrong_argument_is_one_line_and_exit_code_2(tmp_path, capsys, options,
     assert not (tmp_path / "lines.jsonl").exists()
 
 
-def test_kinds_have_the_names_of_the_kernels_numbers():
+def test_kind_names_match_the_values_of_the_kernels():
     assert [KIND_NAMES[kind] for kind in (kernels.PLANE, kernels.CORNER, kernels.EDGE)] == ["plane", "corner", "edge"]
     assert HoughSettings().rho_cells == 100
     assert SETTINGS.min_probability > 0.5

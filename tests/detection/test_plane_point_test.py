@@ -51,7 +51,7 @@ def is_wall(room, pose, line):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("stale", [True, False])
-def test_both_walls_of_a_corridor_and_nothing_else(seed, stale):
+def test_exactly_both_walls_of_a_corridor_are_detected(seed, stale):
     room = CORRIDOR
     windows, _ = models_of(room, seed, stale=stale)
     assert len(windows) == 8
@@ -64,7 +64,7 @@ def test_both_walls_of_a_corridor_and_nothing_else(seed, stale):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_lines_are_made_of_their_echoes(seed):
+def test_lines_are_consistent_with_their_echoes(seed):
     """Every echo is in one line at most, enough of them and long enough; segments lie on their lines."""
     windows, log = models_of(CORRIDOR, seed)
     for _, model in windows:
@@ -82,7 +82,7 @@ def test_lines_are_made_of_their_echoes(seed):
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("poles", [[[3.0, 0.8]], [[2.2, -0.6], [4.4, 0.9]], [[1.0, 1.2], [3.1, -1.0], [5.0, 0.7]]])
-def test_poles_are_no_walls(poles, seed):
+def test_poles_are_not_reported_as_walls(poles, seed):
     windows, log = models_of(Room(np.zeros((0, 2, 2)), poles=np.array(poles)), seed)
     assert len(log.tx) > 20
     assert [line for _, model in windows for line in model.lines] == []
@@ -91,7 +91,7 @@ def test_poles_are_no_walls(poles, seed):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("middle", [3.0, 4.3])
-def test_a_door_splits_the_wall(middle, seed):
+def test_a_door_splits_a_wall(middle, seed):
     """No segment covers the middle of an opening of 1 m, and both parts of the wall are there."""
     left = [[[-3.0, 0.9], [middle - 0.5, 0.9]], [[middle + 0.5, 0.9], [12.0, 0.9]]]
     room = Room(np.array([*left, RIGHT]))
@@ -107,7 +107,7 @@ def test_a_door_splits_the_wall(middle, seed):
     assert beyond
 
 
-def test_turning_and_moving_the_world_moves_no_line():
+def test_lines_are_invariant_under_motions_of_the_world():
     """The same log driven elsewhere: local models are in the robot's frame."""
     room, poses = CORRIDOR, drive()
     log = recorded(room, poses, 0)
@@ -124,7 +124,7 @@ def test_turning_and_moving_the_world_moves_no_line():
             np.testing.assert_allclose(there.segment, here.segment, atol=2e-3)
 
 
-def test_scan_numbers_name_the_scans_of_a_log():
+def test_lines_refer_to_scans_by_their_numbers():
     """A model is called after its window's last scan, its lines after those that their echoes come from."""
     log = recorded(CORRIDOR, drive(), 0)
     numbers = np.arange(len(log))[::-1] * 7 + 100
@@ -138,21 +138,21 @@ def test_scan_numbers_name_the_scans_of_a_log():
             np.testing.assert_array_equal(there.segment, here.segment)
 
 
-def test_an_accumulator_must_hold_what_a_window_can_reach():
+def test_an_accumulator_must_cover_the_range_of_a_window():
     log = recorded(CORRIDOR, drive(scans=5), 0)
     local_models(RING, log, settings=HoughSettings())  # 4 m are enough for a single scan
     with pytest.raises(SonarError, match=r"rho_cells 100 x rho_cell 0\.04 m = 4 m; allowed is 5\.19\d m or more"):
         local_models(RING, log, window=LENGTH, settings=HoughSettings())
 
 
-def test_nothing_around_is_no_line():
+def test_no_echoes_give_no_line():
     windows, log = models_of(NOTHING, 0)
     assert len(log.tx) == 0
     assert len(windows) == 8
     assert {model.empty for _, model in windows} == {"no echo within the maximum range"}
 
 
-def test_nothing_to_gather_is_no_model():
+def test_no_windows_give_no_model():
     poses = drive(scans=5)
     log = recorded(CORRIDOR, poses, 0)
     lost = Log.from_echoes(log.echo_scan, log.tx, log.rx, log.range, stamp=log.stamp, pose=np.full((5, 3), np.nan))

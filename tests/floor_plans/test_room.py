@@ -42,21 +42,21 @@ def test_a_rectangle_has_four_right_angles_inside_and_four_edges_outside():
     assert np.allclose(np.sort(junctions.wedge_reach[junctions.corners], axis=1), [[3.0, 4.0]] * 4)
 
 
-def test_a_free_standing_segment_has_two_ends_of_a_full_turn():
+def test_a_free_standing_wall_has_two_wedges_of_360_degrees():
     junctions = Room(np.array([[[0.0, 0.0], [1.0, 0.0]]])).junctions
     assert np.allclose(junctions.wedge_width, 2 * np.pi)
     assert np.array_equal(junctions.edges, [0, 1])
     assert len(junctions.corners) == 0
 
 
-def test_wedges_of_a_t_an_x_and_a_straight_node():
+def test_wedges_of_t_x_and_straight_junctions():
     through = [[-1.0, 0.0], [1.0, 0.0]]
     assert np.allclose(widths_at(Room(np.array([through, [[0.0, 0.0], [0.0, 1.0]]])), [0, 0]), [90, 90, 180])
     assert np.allclose(widths_at(Room(np.array([through, [[0.0, -1.0], [0.0, 1.0]]])), [0, 0]), [90] * 4)
     assert np.allclose(widths_at(Room(np.array([through, [[1.0, 0.0], [3.0, 0.0]]])), [1, 0]), [180, 180])
 
 
-def test_walls_that_lie_on_one_another_are_one_direction():
+def test_overlapping_walls_share_one_direction():
     room = Room(np.array([[[0.0, 0.0], [2.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]]))
     assert np.allclose(widths_at(room, [0, 0]), [90, 270])
     assert room.junctions.right_angled.sum() == 4  # both walls along x with the one along y, both orders
@@ -67,7 +67,7 @@ def test_walls_that_lie_on_one_another_are_one_direction():
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.9e-3])
-def test_ends_within_a_millimetre_are_one_vertex_and_leave_no_gap(gap):
+def test_ends_within_a_millimetre_become_one_vertex(gap):
     room = Room(np.array([[[0.0, 0.0], [1.0, 0.0]], [[1.0, gap], [1.0, 1.0]]]))
     assert np.array_equal(room.walls[0, 1], room.walls[1, 0])
     assert len(room.junctions.vertices) == 3
@@ -81,13 +81,13 @@ def test_an_end_within_a_millimetre_of_a_wall_touches_it(gap):
     assert np.allclose(widths_at(room, [0.1, 0]), [90, 90, 180])
 
 
-def test_ends_farther_apart_stay_apart():
+def test_ends_farther_apart_stay_unchanged():
     room = Room(np.array([[[0.0, 0.0], [1.0, 0.0]], [[1.0, 2e-3], [1.0, 1.0]]]))
     assert len(room.junctions.vertices) == 4
 
 
 @given(seed=seeds)
-def test_wedges_around_a_vertex_make_a_full_turn_and_turn_with_the_room(seed):
+def test_wedges_around_a_vertex_sum_to_360_degrees_and_rotate_with_the_room(seed):
     room = random_room(np.random.default_rng(seed), box=1.0, segment=1.0)
     junctions = room.junctions
     turns = np.bincount(junctions.wedge_vertex, junctions.wedge_width)
@@ -109,7 +109,7 @@ def test_wedges_around_a_vertex_make_a_full_turn_and_turn_with_the_room(seed):
         ([[[0, 0], [1, 0]]], (), [[np.inf, 0]], "pole"),
     ],
 )
-def test_a_room_that_cannot_be_says_why(walls, names, poles, words):
+def test_invalid_rooms_raise_an_error_with_the_reason(walls, names, poles, words):
     with pytest.raises(SonarError) as caught:
         Room(np.array(walls, dtype=float), names, np.array(poles, dtype=float).reshape(-1, 2))
     assert words in str(caught.value)
@@ -117,7 +117,7 @@ def test_a_room_that_cannot_be_says_why(walls, names, poles, words):
     assert "\n" not in str(caught.value)
 
 
-def test_a_room_cannot_be_changed():
+def test_rooms_are_immutable():
     given_walls = loop(SQUARE)
     room = Room(given_walls)
     given_walls[:] = 7.0
@@ -139,7 +139,7 @@ def write(path, *features):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_saved_room_is_the_same_room(seed, tmp_path):
+def test_geojson_round_trip(seed, tmp_path):
     room = random_room(np.random.default_rng(seed))
     room = Room(room.walls, (*room.wall_names[:-1], 'Tür "1"'), np.array([[0.1, 1 / 3], [-2e-9, 7.0]]))
     save_room(room, tmp_path / "room.geojson")
@@ -201,7 +201,7 @@ GOOD = feature("LineString", [[0, 0], [1, 0]])
         (7, "Feature"),
     ],
 )
-def test_a_bad_feature_is_named_in_one_line(bad, words, tmp_path):
+def test_an_invalid_feature_raises_a_one_line_error(bad, words, tmp_path):
     path = write(tmp_path / "room.geojson", GOOD, bad)
     with pytest.raises(SonarError) as caught:
         load_room(path)
@@ -219,7 +219,7 @@ def test_a_bad_feature_is_named_in_one_line(bad, words, tmp_path):
         '{"type": "FeatureCollection", "features": []}',
     ],
 )
-def test_a_file_that_is_no_room_is_named_in_one_line(text, tmp_path):
+def test_an_invalid_file_raises_a_one_line_error(text, tmp_path):
     path = tmp_path / "room.geojson"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(SonarError) as caught:
@@ -228,13 +228,13 @@ def test_a_file_that_is_no_room_is_named_in_one_line(text, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_or_folder_is_named(tmp_path):
+def test_a_missing_file_or_folder_raises_a_named_error(tmp_path):
     for act in (load_room, lambda path: save_room(Room(loop(SQUARE)), path)):
         with pytest.raises(SonarError, match="nowhere"):
             act(tmp_path / "nowhere" / "room.geojson")
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "room.geojson"
     save_room(Room(loop(SQUARE)), path)
     before = path.read_bytes()
@@ -253,7 +253,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 @given(seed=seeds)
-def test_lines_go_through_their_walls_in_the_robot_frame(seed):
+def test_lines_contain_their_walls_in_the_robot_frame(seed):
     rng = np.random.default_rng(seed)
     room = random_room(rng)
     pose = np.append(rng.uniform(-5, 5, 2), rng.uniform(-10, 10))
@@ -292,7 +292,7 @@ def test_random_rooms_are_closed_and_poses_keep_clear(seed):
     assert np.linalg.norm(room.poles - [x, y], axis=-1).min(initial=np.inf) >= 0.45
 
 
-def test_random_rooms_are_of_every_kind():
+def test_random_rooms_have_all_features():
     rng = np.random.default_rng(0)
     rooms = [random_room(rng) for _ in range(60)]
     corners = [len(room.junctions.corners) for room in rooms]
@@ -322,6 +322,6 @@ def test_clearance_is_checked():
         random_pose(np.random.default_rng(0), Room(loop(SQUARE)), clearance=-1.0)
 
 
-def test_rooms_need_no_jax():
+def test_rooms_and_tracing_do_not_import_jax():
     code = "import sys, jaxsonar.floor_plans.room, jaxsonar.simulation.echo_tracing; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,10 +1,8 @@
-"""The scan log: both formats carry the same without loss, and whatever is wrong is named by file, row and column."""
+"""Scan logs as CSV and in memory: lossless round trips, and errors that name file, row and column."""
 
 import csv
-import io
 import math
 import os
-import re
 import stat
 import subprocess
 import sys
@@ -16,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.logs import HEADER, SMALL, SMALL_CSV, any_scans, log_of, read, refused
 
 from jaxsonar.fileio.atomic_files import atomic_write
 from jaxsonar.hardware.errors import SonarError
@@ -23,48 +22,6 @@ from jaxsonar.scans import csv_log as logs_csv
 from jaxsonar.scans.convert import convert
 from jaxsonar.scans.log_file import load_log, save_log
 from jaxsonar.scans.scan_log import Log
-
-HEADER = "scan,stamp,x,y,theta,tx,rx,range"
-
-finite = st.floats(allow_nan=False, allow_infinity=False)
-sensor = st.integers(0, 2**31 - 1)
-echo = st.tuples(sensor, sensor, finite.filter(lambda r: r > 0), finite | st.just(math.nan))
-pose = st.tuples(finite, finite, finite) | st.just((math.nan,) * 3)
-one_scan = st.tuples(st.integers(-(2**63), 2**63 - 1), finite | st.just(math.nan), pose, st.lists(echo, max_size=4))
-
-
-def log_of(scans):
-    """A log from (scan, stamp, pose, [(tx, rx, range, amplitude), ...]) a scan."""
-    echoes = [(i, *e) for i, (*_, heard) in enumerate(scans) for e in heard]
-    index, tx, rx, reported, amplitude = zip(*echoes, strict=True) if echoes else ((),) * 5
-    return Log.from_echoes(
-        np.array(index, np.int64),
-        np.array(tx, np.int64),
-        np.array(rx, np.int64),
-        np.array(reported, np.float64),
-        amplitude=np.array(amplitude, np.float64),
-        stamp=np.array([s[1] for s in scans], np.float64),
-        pose=np.array([s[2] for s in scans], np.float64).reshape(-1, 3),
-        scan=np.array([s[0] for s in scans], np.int64),
-    )
-
-
-# Logs are built in the tests: the shape checks of the test run use `random`, which no strategy may.
-any_scans = st.lists(one_scan, max_size=5, unique_by=lambda s: s[0])
-
-SMALL = log_of(
-    [
-        (7, 0.5, (1.25, -2.5, 0.75), [(0, 1, 1.5, 10.0), (2, 3, 0.1, math.nan)]),
-        (3, math.nan, (math.nan,) * 3, []),
-        (9, 2.0, (3.5, 4.5, -3.0), [(4, 5, 2.25, 20.0)]),
-    ]
-)
-SMALL_CSV = f"""{HEADER},amplitude
-7,0.5,1.25,-2.5,0.75,0,1,1.5,10.0
-7,0.5,1.25,-2.5,0.75,2,3,0.1,
-3,,,,,,,,
-9,2.0,3.5,4.5,-3.0,4,5,2.25,20.0
-"""
 
 
 @pytest.fixture
@@ -74,29 +31,7 @@ def small_csv(tmp_path):
     return file
 
 
-def read(text, name="log.csv"):
-    """What load_log makes of these bytes."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / name
-        file.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return load_log(file)
-
-
-def refused(text, name="log.csv"):
-    """The message about these bytes: one line that begins with the file."""
-    with pytest.raises(SonarError) as caught:
-        read(text, name)
-    message = str(caught.value)
-    assert len(message.splitlines()) == 1
-    assert message.isprintable()
-    assert re.search(rf"/{re.escape(name)}: ", message)
-    return message
-
-
-# ---- the columns
-
-
-def test_every_value_stands_in_its_own_column(small_csv):
+def test_every_column_is_read_into_its_own_field(small_csv):
     assert small_csv.read_text() == SMALL_CSV
     assert load_log(small_csv) == SMALL
 
@@ -111,7 +46,7 @@ def test_one_scan():
     np.testing.assert_array_equal(scan.amplitude, [10.0, math.nan])
 
 
-def test_scans_can_be_indexed_as_a_list():
+def test_scans_can_be_indexed_like_a_list():
     assert [scan.scan for scan in SMALL] == [7, 3, 9]
     assert SMALL[-1].scan == SMALL[2].scan == 9
     assert SMALL[np.int64(1)].scan == 3
@@ -121,7 +56,7 @@ def test_scans_can_be_indexed_as_a_list():
 
 
 @given(any_scans, st.slices(5))
-def test_a_slice_of_a_log_is_the_log_of_the_slice(scans, part):
+def test_a_slice_of_a_log_contains_the_scans_of_the_slice(scans, part):
     log = log_of(scans)
     cut = log[part]
     assert cut.scan.tolist() == log.scan[part].tolist()
@@ -130,7 +65,7 @@ def test_a_slice_of_a_log_is_the_log_of_the_slice(scans, part):
 
 
 @given(any_scans)
-def test_echo_scan_names_the_scan_of_every_echo(scans):
+def test_echo_scan_is_the_scan_of_every_echo(scans):
     log = log_of(scans)
     expected = [i for i, scan in enumerate(log) for _ in scan.range]
     assert log.echo_scan.tolist() == expected
@@ -147,7 +82,7 @@ def test_echo_scan_names_the_scan_of_every_echo(scans):
     assert again == log
 
 
-def test_a_log_cannot_be_changed():
+def test_logs_are_immutable():
     with pytest.raises(ValueError, match="read-only"):
         SMALL.range[0] = -1.0
     ranges = np.array([1.0])
@@ -172,7 +107,7 @@ def test_a_log_cannot_be_changed():
         ({"scan_index": [0, 2]}, "within 0 to 1"),
     ],
 )
-def test_no_log_holds_what_could_not_be_read_again(change, message, monkeypatch):
+def test_invalid_values_raise_an_error(change, message, monkeypatch):
     # Users have no shape checks; those of the test run would get there first.
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     columns = {
@@ -195,7 +130,7 @@ def test_no_log_holds_what_could_not_be_read_again(change, message, monkeypatch)
 
 @settings(deadline=None)
 @given(any_scans)
-def test_csv_loses_nothing(scans):
+def test_csv_round_trip(scans):
     log = log_of(scans)
     with tempfile.TemporaryDirectory() as folder:
         save_log(log, f"{folder}/a.csv")
@@ -207,7 +142,7 @@ def test_csv_loses_nothing(scans):
 
 @settings(deadline=None)
 @given(any_scans)
-def test_csv_to_parquet_to_csv_is_the_same_file(scans):
+def test_csv_to_parquet_to_csv_gives_the_same_file(scans):
     log = log_of(scans)
     pytest.importorskip("pyarrow")
     with tempfile.TemporaryDirectory() as folder:
@@ -219,7 +154,7 @@ def test_csv_to_parquet_to_csv_is_the_same_file(scans):
 
 @settings(deadline=None)
 @given(any_scans.filter(len))
-def test_the_standard_library_reads_the_same_rows(scans):
+def test_csv_agrees_with_the_standard_library(scans):
     log = log_of(scans)
     with tempfile.TemporaryDirectory() as folder:
         save_log(log, f"{folder}/a.csv")
@@ -239,7 +174,7 @@ def test_the_standard_library_reads_the_same_rows(scans):
 
 @settings(deadline=None)
 @given(any_scans, st.integers(1, 300))
-def test_parsing_in_blocks_changes_nothing(scans, block):
+def test_parsing_does_not_depend_on_the_block_size(scans, block):
     log = log_of(scans)
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         save_log(log, f"{folder}/a.csv")
@@ -265,11 +200,11 @@ def test_a_log_without_scans():
         lambda text: text.replace(b"7,0.5", b"+07,.5", 1),  # the same numbers in other letters within a scan
     ],
 )
-def test_other_spellings_of_the_same_log(dialect):
+def test_other_csv_dialects_of_the_same_log(dialect):
     assert read(dialect(SMALL_CSV.encode())) == SMALL
 
 
-def test_suffixes_in_capitals():
+def test_upper_case_suffixes():
     assert read(SMALL_CSV, "LOG.CSV") == SMALL
 
 
@@ -310,7 +245,7 @@ BAD_ROWS = [
 
 @pytest.mark.parametrize("before", [0, 3])
 @pytest.mark.parametrize(("row", "column", "came", "allowed"), BAD_ROWS)
-def test_a_bad_value_is_named(row, column, came, allowed, before):
+def test_an_invalid_value_is_named(row, column, came, allowed, before):
     earlier = "".join(f"{k},0.5,1,2,3,4,5,1.5\n" for k in range(100, 100 + before))
     message = refused(f"{HEADER}\n{earlier}{row}\n200,0.5,1,2,3,4,5,1.5\n")
     assert f": row {2 + before}, column {column}: {came}" in message
@@ -336,13 +271,13 @@ def test_a_bad_value_is_named(row, column, came, allowed, before):
         (["0,,,,,1,1,1.5", "\0\1\2"], "row 3: this is no text", "allowed are 8 numbers"),
     ],
 )
-def test_rows_that_do_not_go_together_are_named(rows, place, allowed):
+def test_inconsistent_rows_are_named(rows, place, allowed):
     message = refused("\n".join([HEADER, *rows, ""]))
     assert place in message
     assert allowed in message
 
 
-def test_amplitudes_are_checked_as_well():
+def test_amplitudes_are_checked():
     with_amplitude = f"{HEADER},amplitude\n"
     assert "row 2, column amplitude: 'loud'" in refused(f"{with_amplitude}0,,,,,1,1,1.5,loud\n")
     message = refused(f"{with_amplitude}0,,,,,,,,3\n")
@@ -363,18 +298,18 @@ def test_amplitudes_are_checked_as_well():
         (HEADER.replace(",", ";"), f"unknown column '{HEADER.replace(',', ';')}'"),
     ],
 )
-def test_a_bad_header_is_named(header, came):
+def test_an_invalid_header_is_named(header, came):
     message = refused(f"{header}\n{GOOD}\n")
     assert f"row 1: {came}; allowed is {HEADER} and optionally ,amplitude" in message
 
 
 @pytest.mark.parametrize("garbage", [b"", b"\x89PNG\r\n\x1a\n\0\0", HEADER.encode("utf-16"), b"\xff" * 100, b"\n\n"])
-def test_what_is_no_csv_is_refused(garbage):
+def test_invalid_csv_raises_an_error(garbage):
     assert "row 1: " in refused(garbage)
 
 
 @given(st.binary(max_size=60) | st.text("0123456789.,-e\n\r", max_size=60).map(str.encode))
-def test_any_bytes_make_a_log_or_one_line(garbage):
+def test_arbitrary_bytes_give_a_log_or_a_one_line_error(garbage):
     for text in (garbage, HEADER.encode() + b"\n" + garbage, SMALL_CSV.encode() + garbage):
         try:
             read(text)
@@ -382,7 +317,7 @@ def test_any_bytes_make_a_log_or_one_line(garbage):
             refused(text)
 
 
-def test_a_cut_row_is_refused_and_a_missing_last_line_end_is_not():
+def test_a_truncated_row_is_invalid_but_a_missing_last_line_end_is_not():
     whole = SMALL_CSV.encode()
     assert read(whole.rstrip(b"\n")) == read(whole)
     rows = whole.splitlines(keepends=True)
@@ -392,7 +327,7 @@ def test_a_cut_row_is_refused_and_a_missing_last_line_end_is_not():
             assert f"row {k + 1}: " in refused(before + rows[k][:length])
 
 
-def test_files_that_are_none(tmp_path):
+def test_missing_files_raise_an_error(tmp_path):
     for name, came in {"missing.csv": "No such file", "missing.parquet": "No such file", "": "no suffix"}.items():
         with pytest.raises(SonarError, match=came):
             load_log(f"{tmp_path}/{name}" if name else tmp_path / "folder")
@@ -406,138 +341,14 @@ def test_files_that_are_none(tmp_path):
     assert not (tmp_path / "log.txt").exists()
 
 
-def test_a_message_stays_on_one_line_whatever_the_file_is_called(tmp_path):
+def test_messages_have_one_line_for_any_filename(tmp_path):
     with pytest.raises(SonarError) as caught:
         load_log(tmp_path / "two\nlines.csv")
     assert str(caught.value).isprintable()
 
 
-# ---- Parquet
-
-STRUCT = {"tx": 4, "rx": 5, "range": 1.5, "amplitude": 2.5}
-ROW = {"scan": 1, "stamp": 0.5, "x": 1.0, "y": 2.0, "theta": 3.0, "echoes": [STRUCT]}
-
-
-def parquet(rows, **types):
-    pa = pytest.importorskip("pyarrow")
-    table = pa.Table.from_pylist(rows)
-    for name, kind in types.items():
-        table = table.set_column(table.schema.get_field_index(name), name, table[name].cast(kind))
-    sink = io.BytesIO()
-    pa.parquet.write_table(table, sink)
-    return sink.getvalue()
-
-
-@pytest.fixture
-def pa():
-    pytest.importorskip("pyarrow.parquet")
-    import pyarrow
-
-    return pyarrow
-
-
-def test_parquet_columns_are_the_documented_ones(pa, tmp_path):
-    save_log(SMALL, tmp_path / "small.parquet")
-    table = pa.parquet.read_table(tmp_path / "small.parquet")
-    kinds = {field.name: str(field.type) for field in table.schema}
-    struct = "struct<tx: int32 not null, rx: int32 not null, range: double not null, amplitude: double>"
-    assert kinds.pop("echoes") == f"list<element: {struct} not null>"
-    assert kinds == {"scan": "int64", "stamp": "double", "x": "double", "y": "double", "theta": "double"}
-    none = dict.fromkeys(("stamp", "x", "y", "theta"))
-    assert table.to_pylist() == [
-        {
-            **{"scan": 7, "stamp": 0.5, "x": 1.25, "y": -2.5, "theta": 0.75},
-            "echoes": [
-                {"tx": 0, "rx": 1, "range": 1.5, "amplitude": 10.0},
-                {"tx": 2, "rx": 3, "range": 0.1, "amplitude": None},
-            ],
-        },
-        {"scan": 3, **none, "echoes": []},
-        {
-            **{"scan": 9, "stamp": 2.0, "x": 3.5, "y": 4.5, "theta": -3.0},
-            "echoes": [{"tx": 4, "rx": 5, "range": 2.25, "amplitude": 20.0}],
-        },
-    ]
-
-
-def test_parquet_as_others_write_it(pa):
-    nothing = dict.fromkeys(("stamp", "x", "y", "theta"))
-    struct = {"range": 1.5, "rx": 5, "tx": 4}
-    log = read(parquet([{"echoes": [struct, struct], **nothing, "scan": 3}], scan=pa.uint8()), "log.parquet")
-    assert log.scan.tolist() == [3]
-    assert np.isnan(log.pose).all()
-    assert np.isnan(log.amplitude).all()
-    assert (log.tx.tolist(), log.rx.tolist(), log.range.tolist()) == ([4, 4], [5, 5], [1.5, 1.5])
-
-
-def without(mapping, key):
-    return {k: v for k, v in mapping.items() if k != key}
-
-
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        ([without(ROW, "theta")], "column theta is missing; allowed are scan, stamp, x, y, theta, echoes"),
-        ([{**ROW, "w": 1}], "unknown column w; allowed are scan, stamp"),
-        ([{**ROW, "scan": 1.5}], "column scan: type double came; allowed is an integer type"),
-        ([{**ROW, "stamp": "now"}], "column stamp: type string came; allowed is a floating or integer type"),
-        (
-            [{**ROW, "echoes": 3}],
-            "column echoes: type int64 came; allowed is a list of struct<tx, rx, range, amplitude>",
-        ),
-        ([{**ROW, "echoes": [without(STRUCT, "rx")]}], "column echoes.rx is missing; allowed are tx, rx, range"),
-        ([{**ROW, "echoes": [{**STRUCT, "w": 1}]}], "unknown column echoes.w; allowed are tx, rx, range"),
-        ([{**ROW, "echoes": [{**STRUCT, "tx": 1.5}]}], "column echoes.tx: type double came; allowed is an integer"),
-        ([ROW, {**ROW, "scan": None}], "row 2, column scan: null came; allowed is a whole number"),
-        ([ROW, ROW], "row 2, column scan: 1 came; allowed is a whole number that no earlier scan has"),
-        ([{**ROW, "echoes": None}, {**ROW, "scan": 2}], "row 1, column echoes: null came; allowed is a list, empty"),
-        ([{**ROW, "echoes": [STRUCT, None]}], "row 1, column echoes[1].tx: null came"),
-        ([{**ROW, "x": None}], "row 1, column x, y, theta: [nan, 2.0, 3.0] came; allowed is finite x, y (m)"),
-        ([{**ROW, "stamp": math.inf}], "row 1, column stamp: inf came"),
-        (
-            [{**ROW, "scan": 0}, {**ROW, "echoes": [STRUCT, {**STRUCT, "range": -1.0}]}],
-            "row 2, column echoes[1].range: -1.0 came; allowed is a finite number of metres above 0",
-        ),
-        ([{**ROW, "echoes": [{**STRUCT, "range": None}, STRUCT]}], "row 1, column echoes[0].range: null came"),
-        ([{**ROW, "echoes": [{**STRUCT, "range": math.nan}]}], "row 1, column echoes[0].range: nan came"),
-        ([{**ROW, "echoes": [{**STRUCT, "tx": -1}]}], "row 1, column echoes[0].tx: -1 came; allowed is a sensor index"),
-        ([{**ROW, "echoes": [{**STRUCT, "rx": 2**31}]}], "row 1, column echoes[0].rx: 2147483648 came"),
-    ],
-)
-def test_bad_parquet_is_named(pa, rows, message):
-    assert message in refused(parquet(rows), "log.parquet")
-
-
-def test_what_is_no_parquet_is_refused(pa, tmp_path):
-    save_log(SMALL, tmp_path / "small.parquet")
-    whole = (tmp_path / "small.parquet").read_bytes()
-    for garbage in (
-        b"",
-        b"PAR1",
-        SMALL_CSV.encode(),
-        whole[:-1],
-        whole[: len(whole) // 2],
-        whole.replace(b"theta", b"th\xffta"),
-    ):
-        assert "needed is a scan log as a whole Parquet file" in refused(garbage, "log.parquet")
-
-
-def test_without_the_extra_parquet_says_how_to_get_it(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    file = tmp_path / "log.parquet"
-    for call in (lambda: load_log(file), lambda: save_log(SMALL, file)):
-        with pytest.raises(SonarError) as caught:
-            call()
-        expected = "Parquet needs the parquet extra: pip install 'jaxsonar[parquet]'"
-        assert str(caught.value) == f"{file}: {expected}"
-    assert not list(tmp_path.iterdir())
-
-
-# ---- writing
-
-
 @pytest.mark.parametrize("failure", [RuntimeError("stop"), KeyboardInterrupt(), OSError(28, "No space left on device")])
-def test_a_failed_write_leaves_the_old_file(failure, monkeypatch, small_csv):
+def test_a_failed_write_keeps_the_old_file(failure, monkeypatch, small_csv):
     def some_lines(log):
         yield HEADER
         raise failure
@@ -551,7 +362,7 @@ def test_a_failed_write_leaves_the_old_file(failure, monkeypatch, small_csv):
         assert str(caught.value).startswith(f"{small_csv}: cannot write: No space left on device; allowed is")
 
 
-def test_places_that_cannot_be_written(tmp_path):
+def test_unwritable_files_raise_an_error(tmp_path):
     (tmp_path / "folder.csv").mkdir()
     for path in (
         tmp_path / "folder.csv",
@@ -566,7 +377,7 @@ def test_places_that_cannot_be_written(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["folder.csv"]
 
 
-def test_permissions_are_the_umasks_or_those_of_the_old_file(tmp_path):
+def test_permissions_come_from_the_umask_or_the_old_file(tmp_path):
     file = tmp_path / "log.csv"
     before = os.umask(0o027)
     try:
@@ -579,7 +390,7 @@ def test_permissions_are_the_umasks_or_those_of_the_old_file(tmp_path):
         os.umask(before)
 
 
-def test_a_link_goes_on_pointing_at_its_file(small_csv):
+def test_symbolic_links_are_kept(small_csv):
     link = small_csv.with_name("link.csv")
     link.symlink_to(small_csv.name)
     save_log(SMALL[:1], link)
@@ -587,13 +398,13 @@ def test_a_link_goes_on_pointing_at_its_file(small_csv):
     assert load_log(small_csv) == SMALL[:1]
 
 
-def test_a_device_is_written_not_replaced():
+def test_device_files_are_written_not_replaced():
     with atomic_write("/dev/null") as file:
         file.write("nothing")
     assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
 
 
-def test_reading_and_writing_logs_needs_no_jax(tmp_path):
+def test_reading_and_writing_logs_does_not_import_jax(tmp_path):
     code = (
         "import sys; from jaxsonar.scans.log_file import load_log, save_log; "
         "from jaxsonar.scans.convert import convert;"

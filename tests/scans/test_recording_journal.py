@@ -54,7 +54,7 @@ def assembled(sent: list[Message]) -> list[RawScan]:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_recorded_log_holds_what_came(suffix, tmp_path):
+def test_a_recorded_log_contains_all_scans(suffix, tmp_path):
     path = tmp_path / f"log{suffix}"
     save_log(Log.from_scans([]), path)  # what was there before goes
     sent = list(messages())
@@ -72,7 +72,7 @@ def test_a_recorded_log_holds_what_came(suffix, tmp_path):
     assert os.listdir(tmp_path) == [path.name], "nothing is left beside it"
 
 
-def test_a_raw_record_holds_every_bit_and_both_clocks(tmp_path):
+def test_a_raw_recording_contains_all_bytes_and_both_clocks(tmp_path):
     path = tmp_path / "raw.mcap"
     sent = list(messages(40))
     recorder = open_recorder(path)
@@ -107,7 +107,7 @@ def test_a_raw_record_holds_every_bit_and_both_clocks(tmp_path):
 
 
 @pytest.mark.parametrize("speed", [0, 4])
-def test_a_raw_record_is_played_as_it_came(speed, tmp_path):
+def test_a_raw_recording_is_replayed_with_its_timing(speed, tmp_path):
     path = tmp_path / "raw.mcap"
     recorder, sent = open_recorder(path), list(messages(4))
     for k, message in enumerate(sent):
@@ -131,7 +131,7 @@ def test_a_raw_record_is_played_as_it_came(speed, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_log_that_was_cut_anywhere_opens(suffix, tmp_path):
+def test_a_truncated_log_can_be_recovered(suffix, tmp_path):
     """Killed within any write: all scans that were written whole, and no part of another one."""
     path = tmp_path / f"log{suffix}"
     scans = assembled(list(messages(4, groups=2, echoes=2)))
@@ -174,7 +174,7 @@ def test_a_log_that_was_cut_anywhere_opens(suffix, tmp_path):
             load_log(path)
 
 
-def test_a_finished_parquet_file_wins_over_what_is_left_of_its_journal(tmp_path):
+def test_a_complete_parquet_file_is_preferred_to_its_journal(tmp_path):
     path = tmp_path / "log.parquet"
     journal_filename(path).write_text(as_log(assembled(list(messages(2)))))
     os.utime(journal_filename(path), (1, 1))
@@ -183,7 +183,7 @@ def test_a_finished_parquet_file_wins_over_what_is_left_of_its_journal(tmp_path)
     assert len(load_log(path)) == 0
 
 
-def test_a_raw_record_that_was_cut_anywhere_opens(tmp_path):
+def test_a_truncated_raw_recording_can_be_read(tmp_path):
     path = tmp_path / "raw.mcap"
     recorder, sent = open_recorder(path), list(messages(60, echoes=40))
     for k, message in enumerate(sent):
@@ -227,7 +227,7 @@ def test_errors_of_the_reading_thread_reach_the_consumer(tmp_path):
     assert not recording_marker(path).exists()
 
 
-def test_a_full_disk_is_told_in_one_line(tmp_path):
+def test_a_full_disk_raises_a_one_line_error(tmp_path):
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full here")
     for suffix in (".csv", ".mcap"):
@@ -238,7 +238,7 @@ def test_a_full_disk_is_told_in_one_line(tmp_path):
         assert "\n" not in str(told.value)
 
 
-def test_frames_and_groups_that_cannot_be_are_counted_together():
+def test_invalid_frames_and_groups_are_counted_together():
     echoes = np.zeros(1, ECHO)
     echoes["time_us"] = 1000.0
     many = encode(Group(9, 2_000_000, 1, 0, 500, 20.0, echoes))  # of so many groups makes nobody a scan
@@ -249,14 +249,14 @@ def test_frames_and_groups_that_cannot_be_are_counted_together():
 
 
 @pytest.mark.parametrize("name", ["log.txt", "log", "nowhere/log.csv", "nowhere/log.parquet", "nowhere/log.mcap"])
-def test_records_that_cannot_be(name, tmp_path):
+def test_invalid_recording_filenames_raise_an_error(name, tmp_path):
     with pytest.raises(SonarError) as told:
         open_log_recorder(tmp_path / name)
     assert "allowed" in str(told.value)
     assert os.listdir(tmp_path) == []
 
 
-def test_files_that_cannot_be_played(tmp_path):
+def test_files_that_cannot_be_replayed_raise_an_error(tmp_path):
     (tmp_path / "x.mcap").write_bytes(b"no")
     for url in ("file:nowhere.mcap", f"file:{tmp_path}/x.mcap", "file:log.txt", "file:x.mcap?speed=-1", "file:"):
         with pytest.raises(SonarError) as told:
@@ -265,7 +265,7 @@ def test_files_that_cannot_be_played(tmp_path):
     assert parse_url("file:/a/b.csv?speed=2").path == "/a/b.csv"
 
 
-def test_a_record_of_another_program_is_refused(tmp_path):
+def test_a_recording_of_another_program_raises_an_error(tmp_path):
     writing = pytest.importorskip("mcap.writer")
     with open(tmp_path / "x.mcap", "wb") as file:
         writer = writing.Writer(file)
@@ -277,7 +277,7 @@ def test_a_record_of_another_program_is_refused(tmp_path):
         open_source(f"file:{tmp_path}/x.mcap")
 
 
-def test_what_no_device_said_is_refused_before_anybody_listens(faw_ring, tmp_path):
+def test_logs_that_no_device_can_send_raise_an_error_before_listening(faw_ring, tmp_path):
     garbage, raw = tmp_path / "x.mcap", tmp_path / "raw.mcap"
     garbage.write_bytes(b"no record at all")
     with pytest.raises(SonarError, match=r"x\.mcap: this is no MCAP file; needed is a record"):
@@ -288,7 +288,7 @@ def test_what_no_device_said_is_refused_before_anybody_listens(faw_ring, tmp_pat
         list(messages_of(raw, Ring.circular(count=3, neighbors=1)))
 
 
-def test_a_reader_that_is_stopped_has_written_everything(tmp_path):
+def test_a_stopped_reader_has_written_everything(tmp_path):
     path = tmp_path / "log.csv"
     endless = (encode(message) for message in messages(100_000))
     queue: DropOldestQueue[RawScan] = DropOldestQueue(16)
@@ -304,7 +304,7 @@ def test_a_reader_that_is_stopped_has_written_everything(tmp_path):
     assert queue.get(0.0)[0].scan == len(log) - 16
 
 
-def test_a_patient_reader_drops_nothing_and_ends_after_so_many_scans():
+def test_a_waiting_reader_drops_nothing_and_stops_after_the_requested_scans():
     queue: DropOldestQueue[RawScan] = DropOldestQueue(4)
     reader = ReaderThread(Given(encode(m) for m in messages(300)), queue, block_when_full=True, scans=200)
     reader.start()
@@ -318,7 +318,7 @@ def test_a_patient_reader_drops_nothing_and_ends_after_so_many_scans():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("played_back", [True, False])
-def test_a_device_that_runs_ahead_of_its_clock_is_waited_for_and_a_live_one_is_not(played_back):
+def test_the_reader_waits_for_replays_but_not_for_live_devices(played_back):
     """Also once it has been made to wait for longer than its own clock is ahead."""
     scans = 120
     sent = list(messages(scans, groups=1))
@@ -380,7 +380,7 @@ def killed(stem, pause, after):
 
 
 @pytest.mark.slow
-def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
+def test_a_killed_recorder_loses_at_most_one_second(tmp_path):
     """Twenty processes, four at a time, killed at random moments: every file opens, with what came a second before."""
     rng = random.Random(7)
     stems = [str(tmp_path / f"log{k}") for k in range(20)]

@@ -1,164 +1,29 @@
-"""Windows of the path: gathered echoes, what is kept of a log, whole and scan by scan, against loops and matrices."""
+"""Sliding windows, incremental and of whole logs, against loops and matrices."""
 
 import math
 from functools import partial
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import oracles
 
-from jaxsonar import HoughSettings, Log, Ring, SonarError, kernels, local_models
-from jaxsonar.detection.arc_tables import arc_tables
-from jaxsonar.geometry.se2 import relative, transform_points, wrap_angle
+from jaxsonar import HoughSettings, Log, Ring, SonarError, local_models
+from jaxsonar.geometry.se2 import relative, wrap_angle
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.scans.sliding_windows import SETTINGS as WINDOWS
 from jaxsonar.scans.sliding_windows import WindowBuffer, gather_windows, has_moved, is_fresh_reading
 
-RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # no point on a cell's border
 FOUR = Ring.circular(count=4, beam=1.0, neighbors=0)
 SETTINGS = HoughSettings()
-ROOM = 256
-endpoints_of = jax.jit(kernels.segment_endpoints)
-lines_of_scan = jax.jit(kernels.tangent_lines, static_argnames="settings")
 turns = st.floats(-3, 3)
 metres = st.floats(-1, 1)
 
 
-def packed(echoes, *, poses=True, gathered=None):
-    """(1, ROOM) echoes from a list of (pose, path, range); the poses left out if asked for."""
-    path, reported = np.zeros((1, ROOM), np.int32), np.full((1, ROOM), np.nan, np.float32)
-    pose = np.zeros((1, ROOM, 3), np.float32)
-    for k, (stood, row, reach) in enumerate(echoes):
-        path[0, k], reported[0, k], pose[0, k] = row, reach, stood
-    gathered = None if gathered is None else jnp.full(1, gathered, jnp.float32)
-    return kernels.PackedEchoes(jnp.asarray(path), jnp.asarray(reported), jnp.asarray(pose) if poses else None, gathered)
-
-
-def one_scan(echoes):
-    return jax.tree.map(lambda leaf: leaf[0], echoes)
-
-
-def mixed_echoes(rng, ring=RING, poses=((0, 0, 0),)):
-    """A wall and as many false echoes."""
-    true = [echo for pose in poses for echo in oracles.plane_echoes(ring, np.array(pose), 1.2, 0.3)]
-    false = [(pose, int(rng.integers(len(ring.paths))), rng.uniform(0.4, 1.9)) for pose, _, _ in true]
-    return (true + false)[:ROOM]
-
-
-def composed(world_from_a, a_from_b):
-    """world_from_b."""
-    world = oracles.matrix(world_from_a) @ oracles.matrix(a_from_b)
-    return np.array([world[0, 2], world[1, 2], math.atan2(world[1, 0], world[0, 0])])
-
-
-# gathered echoes
-
-
-@pytest.mark.slow
-def test_echoes_that_all_carry_the_identity_are_those_of_one_scan(rng):
-    echoes = mixed_echoes(rng)
-    arcs = arc_tables(RING, SETTINGS).arcs
-    plain = lines_of_scan(arcs, one_scan(packed(echoes, poses=False)), settings=SETTINGS)
-    posed = lines_of_scan(arcs, one_scan(packed(echoes)), settings=SETTINGS)
-    jax.tree.map(np.testing.assert_array_equal, posed, plain)
-
-
-@settings(max_examples=15)
-@given(metres, metres, turns, st.integers(0, 1000))
-def test_a_motion_of_all_poses_moves_the_lines(x, y, turn, seed):
-    rng = np.random.default_rng(seed)
-    poses = rng.uniform(-0.3, 0.3, (3, 3))
-    echoes = mixed_echoes(rng, poses=poses)
-    motion = np.array([x, y, turn])
-    arcs = arc_tables(RING, SETTINGS).arcs
-    turned = [(composed(motion, pose), path, reach) for pose, path, reach in echoes]
-    both = [one_scan(packed(seen)) for seen in (echoes, turned)]
-    here, there = (lines_of_scan(arcs, seen, settings=SETTINGS) for seen in both)
-    spin = oracles.matrix(motion)[:2, :2]
-    count = len(echoes)
-    normals = np.stack([here.normal_x, here.normal_y], axis=-1)[:count] @ spin.T
-    np.testing.assert_allclose(np.stack([there.normal_x, there.normal_y], -1)[:count], normals, atol=2e-6)
-    counts = np.asarray(arcs.arcs.exists)[[path for _, path, _ in echoes]]
-    np.testing.assert_allclose(
-        np.asarray(there.rho)[:count][counts], (np.asarray(here.rho)[:count] + normals @ [x, y])[counts], atol=5e-6
-    )
-
-
-@settings(max_examples=10)
-@given(metres, metres, turns, st.floats(-3, 3), st.integers(0, 1000))
-def test_a_motion_of_line_and_sensors_moves_the_segment(x, y, turn, theta, seed):
-    sensors = np.random.default_rng(seed).uniform(-1, 1, (9, 2)).astype(np.float32)
-    motion, involved = np.array([x, y, turn]), np.arange(9) % 3 > 0
-    here = endpoints_of(jnp.float32(2), jnp.float32(theta), sensors, involved)
-    rho = 2 + x * math.cos(theta + turn) + y * math.sin(theta + turn)
-    moved_sensors = transform_points(motion, sensors.astype(float)).astype(np.float32)
-    there = endpoints_of(jnp.float32(rho), jnp.float32(theta + turn), moved_sensors, involved)
-    np.testing.assert_allclose(there, transform_points(motion, np.asarray(here, float)), atol=1e-5)
-
-
-def test_turning_the_frame_by_whole_cells_turns_the_cells(rng):
-    arcs = arc_tables(RING, SETTINGS).arcs
-    echoes = mixed_echoes(rng, poses=rng.uniform(-0.3, 0.3, (2, 3)))
-    results = []
-    for step in (0, 7, 50):
-        motion = np.array([0, 0, step * SETTINGS.theta_cell])
-        turned = packed([(composed(motion, pose), path, reach) for pose, path, reach in echoes], gathered=2.0)
-        cells = np.asarray(kernels.vote(arcs, turned, settings=SETTINGS).occupied)
-        results.append(np.roll(cells[0], -step, axis=0))
-    assert results[0].any()
-    # A point on the border of two cells may round into the other one in single precision.
-    assert max((other != results[0]).sum() for other in results[1:]) <= 2
-
-
-def test_scans_of_a_moving_robot_vote_for_the_wall_in_the_frame_of_the_last_pose(rng):
-    poses = [np.array([0.15 * k - 0.2, 0.1 * math.sin(k), 0.25 * k - 2.9]) for k in range(5)]
-    last = poses[-1]
-    rho, theta = 1.4, 2.1
-    echoes = [echo for pose in poses for echo in oracles.plane_echoes(RING, pose, rho, theta)][::7]
-    assert len(echoes) > 20
-    wanted = oracles.accumulate(
-        [oracles.cell(r, t, SETTINGS) for r, t in oracles.gathered_lines(RING, echoes, last, SETTINGS.point_pitch)],
-        SETTINGS,
-    )
-    gathered = packed([(relative(last, pose), path, reach) for pose, path, reach in echoes], gathered=5.0)
-    votes, _ = kernels.accumulators(arc_tables(RING, SETTINGS).arcs, gathered, settings=SETTINGS)
-    votes = np.asarray(votes[0])
-    assert votes.sum() == wanted.sum()
-    assert np.abs(votes - wanted).sum() <= 0.01 * wanted.sum()  # points on the border of two cells
-    best = np.unravel_index(votes.argmax(), votes.shape)
-    seen = oracles.cell(rho - last[0] * math.cos(theta) - last[1] * math.sin(theta), theta - last[2], SETTINGS)
-    assert seen is not None
-    assert max(abs(best[0] - seen[0]), abs(best[1] - seen[1])) <= 1
-
-
-@pytest.mark.parametrize("times", [1, 2, 4])
-def test_the_same_echoes_several_times_over_and_gathered_so_often_are_the_same_cells(rng, times):
-    echoes = [*mixed_echoes(rng)][: ROOM // 4]
-    arcs = arc_tables(RING, SETTINGS).arcs
-    once = kernels.vote(arcs, packed(echoes, gathered=1.0), settings=SETTINGS).occupied
-    often = kernels.vote(arcs, packed(echoes * times, gathered=float(times)), settings=SETTINGS).occupied
-    assert once.any()
-    np.testing.assert_array_equal(often, once)
-
-
-@pytest.mark.parametrize("gathered", [0.5, 1.0, 3.25])
-def test_gathered_is_a_factor_of_the_threshold(rng, gathered):
-    echoes, arcs = mixed_echoes(rng), arc_tables(RING, SETTINGS).arcs
-    _, smooth = kernels.accumulators(arcs, packed(echoes, gathered=gathered), settings=SETTINGS)
-    came = kernels.vote(arcs, packed(echoes, gathered=gathered), settings=SETTINGS).occupied
-    np.testing.assert_array_equal(came, np.asarray(smooth) > np.float32(arcs.vote_threshold) * np.float32(gathered))
-
-
-# poses and logs
-
-
 @given(*[st.tuples(metres, metres, turns)] * 2)
-def test_relative_poses_are_those_of_matrices(a, b):
+def test_relative_poses_agree_with_matrices(a, b):
     a, b = np.array(a), np.array(b)
     came = relative(a, b)
     wanted = oracles.relative(a, b)
@@ -221,7 +86,7 @@ def straight(steps, heading=0.0):
 
 @settings(max_examples=25)
 @given(st.integers(0, 10_000))
-def test_a_log_of_its_own_scans_is_the_log(seed):
+def test_round_trip_of_a_log_by_single_scans(seed):
     log = a_log(seed, missing=0.3)
     assert Log.from_scans(list(log)) == log
     assert log[3].as_log() == log[3:4]
@@ -236,7 +101,7 @@ def test_a_log_of_no_scans():
 
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.sampled_from([0.3, 1.0, 2.5, 50.0]), st.sampled_from([0.0, 0.05, 0.4]))
-def test_windows_hold_the_new_echoes_of_their_stretch_in_the_frame_of_its_end(seed, length, missing):
+def test_windows_contain_the_fresh_echoes_of_their_section_in_the_frame_of_its_end(seed, length, missing):
     log = a_log(seed, missing=missing)
     windows, left_out = gather_windows(FOUR, log, length=length)
     scans = heard(FOUR, log)
@@ -265,7 +130,7 @@ def test_windows_hold_the_new_echoes_of_their_stretch_in_the_frame_of_its_end(se
 
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.sampled_from([0.3, 1.0, 2.5]))
-def test_windows_cover_the_path_reach_back_by_their_length_and_across_no_gap(seed, length):
+def test_windows_cover_the_trajectory_with_their_length_and_cross_no_gap(seed, length):
     log = a_log(seed, missing=0.1)
     windows, _ = gather_windows(FOUR, log, length=length)
     known = np.array([bool(np.isfinite(pose).all()) for pose in log.pose])
@@ -284,7 +149,7 @@ def test_windows_cover_the_path_reach_back_by_their_length_and_across_no_gap(see
         assert covered[known].all()
 
 
-def test_every_echo_is_in_two_windows_of_an_even_path():
+def test_every_echo_is_in_two_windows_of_a_uniform_trajectory():
     log = log_of([[(0, 0, 1 + k / 100)] for k in range(65)], straight([0.0625] * 64))
     windows, _ = gather_windows(FOUR, log, length=1.0)
     assert windows.last.tolist() == [8, 16, 24, 32, 40, 48, 56, 64]
@@ -295,7 +160,7 @@ def test_every_echo_is_in_two_windows_of_an_even_path():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [0.1, 0.05, 0.025])
-def test_scan_by_scan_windows_of_decimal_steps_end_where_those_of_the_log_do(step):
+def test_incremental_windows_of_decimal_steps_end_at_the_same_scans(step):
     """A pose may come to lie just on the end of a window; both ways must round alike."""
     log = log_of([[(0, 0, 1 + k / 100)] for k in range(120)], np.arange(120)[:, None] * [step, 0.0, 0.0])
     for length in (0.2, 0.3, 0.4, 0.6, 1.0, 1.4):
@@ -303,7 +168,7 @@ def test_scan_by_scan_windows_of_decimal_steps_end_where_those_of_the_log_do(ste
         assert [windows.last[0] for windows in scan_by_scan(FOUR, log, length)] == whole.last.tolist(), length
 
 
-def test_a_short_window_on_a_long_path_is_as_many_windows_as_scans():
+def test_short_windows_contain_one_scan_each():
     log = log_of([[(0, 0, 1.0)], [(0, 0, 1.1)], [(0, 0, 1.2)]], straight([10.0, 10.0]))
     windows, _ = gather_windows(FOUR, log, length=0.01)
     assert windows.last.tolist() == [1, 2]
@@ -321,7 +186,7 @@ def kept_of(readings, poses=None, ring=FOUR):
 
 
 @given(st.integers(1, 12), st.integers(1, 12))
-def test_of_a_repeated_reading_every_second_one_is_new_and_a_gap_starts_anew(times, again):
+def test_every_second_repeated_reading_is_fresh_and_a_gap_restarts_the_count(times, again):
     here, other = (0, 0, 1.0), (1, 1, 1.0)
     assert len(kept_of([[here]] * times)) == math.ceil(times / 2)
     gap = [[here]] * times + [[]] + [[here]] * again
@@ -333,7 +198,7 @@ def test_of_a_repeated_reading_every_second_one_is_new_and_a_gap_starts_anew(tim
 
 @settings(max_examples=40)
 @given(st.integers(0, 10_000))
-def test_new_readings_are_those_of_the_slow_oracle(seed):
+def test_fresh_readings_agree_with_the_slow_oracle(seed):
     log = a_log(seed, strangers=False)
     flat, _ = FlatEchoes.from_log(FOUR, log)
     wanted = [new for scan in oracles.renewed(heard(FOUR, log)) for new in scan]
@@ -341,7 +206,7 @@ def test_new_readings_are_those_of_the_slow_oracle(seed):
 
 
 @pytest.mark.parametrize("times", [1, 2, 5])
-def test_a_reading_that_comes_twice_in_a_scan_is_renewed_as_one_that_comes_once(times):
+def test_duplicates_in_a_scan_are_fresh_like_single_readings(times):
     """A device that rounds may report two echoes of a path at one range."""
     twice = kept_of([[(0, 0, 1.0), (0, 0, 1.0)]] * times)
     assert sorted({scan for scan, _, _ in twice}) == [scan for scan, _, _ in kept_of([[(0, 0, 1.0)]] * times)]
@@ -349,12 +214,12 @@ def test_a_reading_that_comes_twice_in_a_scan_is_renewed_as_one_that_comes_once(
 
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.3, 1.0]))
-def test_places_are_those_of_the_slow_oracle(seed, missing):
+def test_has_moved_agrees_with_the_slow_oracle(seed, missing):
     log = a_log(seed, missing=missing)
     assert has_moved(log.pose).tolist() == oracles.moved(log.pose, WINDOWS.place_distance, WINDOWS.place_rotation)
 
 
-def test_a_waiting_robot_counts_once_and_one_that_turns_in_place_goes_on():
+def test_a_robot_at_rest_counts_once_and_a_rotating_robot_moves():
     waiting = np.tile([[1.0, 2.0, 0.5]], (6, 1))
     assert has_moved(waiting).tolist() == [True] + [False] * 5
     turning = np.column_stack([np.ones((6, 2)), np.radians([170, 175, 180, -175, -170, -165])])
@@ -366,11 +231,11 @@ def test_a_waiting_robot_counts_once_and_one_that_turns_in_place_goes_on():
 @pytest.mark.parametrize(
     "poses", [np.zeros((0, 3)), np.full((4, 3), np.nan), np.full((1, 3), np.nan), np.zeros((1, 3))]
 )
-def test_places_of_hardly_any_scans(poses):
+def test_has_moved_for_few_scans(poses):
     assert has_moved(poses).tolist() == np.isfinite(poses).all(axis=1).tolist()
 
 
-def test_a_waiting_robot_adds_one_scan_to_its_window():
+def test_a_robot_at_rest_adds_one_scan_to_its_window():
     readings = [[(0, 0, 1 + k / 50)] for k in range(12)]
     poses = straight([0.2] * 3 + [0.0] * 5 + [0.2] * 3)
     windows, _ = gather_windows(FOUR, log_of(readings, poses), length=2.0)
@@ -390,7 +255,7 @@ def test_a_waiting_robot_adds_one_scan_to_its_window():
         ([[(0, 0, 1.0)], [], [(0, 0, 1.0)]], [[0, 0, 0], [np.nan] * 3, [0, 0, 0]], [0, 2]),
     ],
 )
-def test_hardly_anything_to_gather(readings, poses, last):
+def test_windows_of_few_readings(readings, poses, last):
     log = log_of(readings, poses)
     windows, left_out = gather_windows(FOUR, log, length=1.0)
     assert windows.last.tolist() == last
@@ -398,7 +263,7 @@ def test_hardly_anything_to_gather(readings, poses, last):
 
 
 @pytest.mark.parametrize("length", [0.0, -1.0, math.nan, math.inf, -math.inf])
-def test_windows_that_are_no_length_are_refused(length):
+def test_invalid_window_lengths_raise_an_error(length):
     log = a_log(1)
     with pytest.raises(SonarError, match=r"window = .* m; allowed is 0.01 to 100 m"):
         gather_windows(FOUR, log, length=length)
@@ -407,12 +272,12 @@ def test_windows_that_are_no_length_are_refused(length):
 
 
 @pytest.mark.parametrize("length", [1e4, 1e300])
-def test_windows_too_long_for_an_accumulator_are_refused_like_every_value(length):
+def test_windows_too_long_for_an_accumulator_raise_an_error(length):
     with pytest.raises(SonarError, match="allowed"):
         local_models(FOUR, a_log(1), window=length)
 
 
-def test_sensors_that_the_ring_does_not_have_are_refused():
+def test_unknown_sensors_raise_an_error():
     log = log_of([[(0, 0, 1.0)], [(1, 7, 1.0)]], straight([0.5]))
     message = "tx 1, rx 7; allowed are 0 to 3"
     with pytest.raises(SonarError, match=message):
@@ -424,7 +289,7 @@ def test_sensors_that_the_ring_does_not_have_are_refused():
         buffer.window(FOUR, length=1.0)
 
 
-def test_pairs_that_the_ring_does_not_listen_to_are_counted_and_left_out():
+def test_pairs_that_are_no_paths_are_counted_and_omitted():
     log = log_of([[(0, 0, 1.0), (0, 1, 1.0)], [(2, 3, 1.0), (1, 1, 0.7)]], straight([0.5]))
     windows, left_out = gather_windows(FOUR, log, length=5.0)
     assert left_out == 2
@@ -434,7 +299,7 @@ def test_pairs_that_the_ring_does_not_listen_to_are_counted_and_left_out():
     assert told == [2]
 
 
-def test_scan_numbers_name_scans_and_do_not_order_them():
+def test_the_order_of_scans_does_not_depend_on_their_numbers():
     readings = [[(k % 4, k % 4, 1 + k / 50)] for k in range(20)]
     poses = straight([0.1] * 19)
     plain, shuffled = log_of(readings, poses), log_of(readings, poses, scan=np.arange(20)[::-1] * 7 + 100)
@@ -488,16 +353,16 @@ def assert_same_windows(ring, log, length):
 @pytest.mark.slow
 @settings(max_examples=50)
 @given(st.integers(0, 10_000), st.sampled_from([0.25, 0.7, 2.0, 50.0]), st.sampled_from([0.0, 0.05, 0.5]))
-def test_windows_gathered_scan_by_scan_are_those_of_the_whole_log(seed, length, missing):
+def test_incremental_windows_equal_those_of_the_whole_log(seed, length, missing):
     assert_same_windows(FOUR, a_log(seed, missing=missing), length)
 
 
-def test_a_reading_that_comes_twice_in_a_scan_is_the_same_scan_by_scan():
+def test_incremental_windows_handle_duplicates_in_a_scan():
     log = log_of([[(0, 0, 1.0), (0, 0, 1.0)]] * 4, straight([0.25] * 3))
     assert_same_windows(FOUR, log, 0.5)
 
 
-def test_the_stretch_given_is_left_as_it_was():
+def test_adding_a_scan_does_not_change_the_buffer():
     log = a_log(5, missing=0.0)
     buffer, _ = WindowBuffer().add(log[0], length=1.0)
     before = (buffer.scans, buffer.travelled, buffer.fresh, dict(buffer.runs), buffer.place)
@@ -505,7 +370,7 @@ def test_the_stretch_given_is_left_as_it_was():
     assert (buffer.scans, buffer.travelled, buffer.fresh, dict(buffer.runs), buffer.place) == before
 
 
-def test_a_stretch_forgets_what_lies_farther_back_than_a_window():
+def test_the_buffer_drops_scans_older_than_a_window():
     nobody = np.zeros(0, int)
     buffer, step = (
         WindowBuffer(),

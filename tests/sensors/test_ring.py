@@ -25,14 +25,14 @@ def test_the_papers_ring_has_24_direct_and_144_cross_paths(faw_ring):
 
 
 @pytest.mark.parametrize(("count", "neighbors"), [(24, 3), (32, 3), (24, 7), (5, 2), (9, 0), (1, 0)])
-def test_paths_come_in_the_documented_order(count, neighbors):
+def test_paths_have_the_documented_order(count, neighbors):
     ring = Ring.circular(count=count, neighbors=neighbors)
     assert [tuple(p) for p in ring.paths] == oracles.paths(count, neighbors)
     assert len(ring.paths) == count * (2 * neighbors + 1)
 
 
 @given(st.integers(1, 12).flatmap(lambda n: st.tuples(st.just(n), st.integers(0, n - 1))))
-def test_no_path_is_listed_twice_and_the_index_inverts_the_list(shape):
+def test_paths_are_unique_and_path_index_is_the_inverse(shape):
     ring = Ring.circular(count=shape[0], neighbors=shape[1])
     paths = ring.paths
     assert len(np.unique(paths, axis=0)) == len(paths)
@@ -66,7 +66,7 @@ def test_detection_ranges_of_section_3(beam, neighbors, widths):
         ),
     ],
 )
-def test_a_path_hears_a_direction_that_lies_in_both_cones_and_no_other(ring):
+def test_detection_ranges_are_the_intersection_of_both_cones(ring):
     first, last = np.asarray(ring.detection_ranges, dtype=np.float64).T
     for direction in np.radians(np.arange(-179.75, 180, 0.5)):
         for k, (tx, rx) in enumerate(ring.paths):
@@ -77,12 +77,12 @@ def test_a_path_hears_a_direction_that_lies_in_both_cones_and_no_other(ring):
             assert both == ((direction - first[k]) % (2 * np.pi) < last[k] - first[k])
 
 
-def test_virtual_sensors_lie_midway(faw_ring):
+def test_virtual_sensors_are_midpoints(faw_ring):
     middle = faw_ring.position[faw_ring.paths].mean(axis=1)
     np.testing.assert_allclose(faw_ring.virtual_sensors, middle, atol=1e-7)
 
 
-def test_every_eighth_sensor_fires_at_once(faw_ring):
+def test_every_eighth_sensor_fires_simultaneously(faw_ring):
     groups = faw_ring.firing_groups
     assert [list(g) for g in groups] == [[k, k + 8, k + 16] for k in range(8)]
 
@@ -106,17 +106,17 @@ def test_firing_groups_do_not_interfere(shape):
             assert not np.isin(between, audible).any()  # the one in the middle hears nothing
 
 
-def test_the_fewest_groups_that_the_spacing_allows():
+def test_firing_groups_are_as_few_as_the_spacing_allows():
     assert [len(Ring.circular(count=n, neighbors=3).firing_groups) for n in (24, 32, 25, 7, 16)] == [8, 8, 9, 7, 8]
 
 
-def test_reported_ranges_are_corrected_by_offsets_then_speed():
+def test_ranges_are_corrected_by_offset_then_by_speed_of_sound():
     ring = Ring(**BUMPER, beam=1.0, neighbors=1, max_range=3.0, range_offset=[0.1, 0.2, 0.4, 0.0], speed_of_sound=350.0)
     corrected = ring.corrected(np.array([1.0, 2.0]), np.array([0, 2]), np.array([0, 1]))
     np.testing.assert_allclose(corrected, [(1.0 - 0.1) * 350 / 343.2, (2.0 - 0.3) * 350 / 343.2])
 
 
-def test_a_ring_with_one_thing_replaced_keeps_the_others():
+def test_replacing_one_field_keeps_the_others():
     ring = Ring(**BUMPER, beam=1.0, neighbors=1, max_range=3.0, range_offset=[0.1, 0.2, 0.4, 0.0], speed_of_sound=350.0)
     other = dataclasses.replace(ring, neighbors=2)
     assert other.neighbors == 2
@@ -127,7 +127,7 @@ def test_a_ring_with_one_thing_replaced_keeps_the_others():
         dataclasses.replace(ring, neighbors=4)
 
 
-def test_a_ring_is_a_pytree_of_what_can_be_calibrated(faw_ring):
+def test_the_leaves_of_a_ring_are_the_calibration_parameters(faw_ring):
     leaves, tree = jax.tree.flatten(faw_ring)
     assert [leaf.shape for leaf in leaves] == [(24, 2), (24,), (24,), (24,), ()]
     assert jax.tree.unflatten(tree, leaves).paths.shape == (168, 2)
@@ -151,7 +151,7 @@ def test_a_ring_is_a_pytree_of_what_can_be_calibrated(faw_ring):
         ({"first_heading": 1e6}, "at most 720 deg"),
     ],
 )
-def test_a_value_that_no_ring_can_have_is_refused_with_what_is_allowed(change, allowed):
+def test_invalid_values_raise_an_error_with_the_allowed_range(change, allowed):
     with pytest.raises(SonarError, match=allowed) as caught:
         Ring.circular(**change)
     assert "\n" not in str(caught.value)

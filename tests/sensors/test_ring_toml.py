@@ -115,7 +115,7 @@ common = {"max_range": st.floats(0.1, 50), "speed_of_sound": st.floats(1, 5000),
         | {"neighbors": st.integers(0, 3), **common}
     )
 )
-def test_a_circle_comes_back_as_a_circle(settings):
+def test_round_trip_of_a_circular_ring(settings):
     ring = Ring.circular(**settings)
     tables, again = saved(ring)
     assert "ring" in tables
@@ -126,14 +126,14 @@ def test_a_circle_comes_back_as_a_circle(settings):
     st.lists(st.tuples(number, number, st.floats(-7, 7), beams, st.floats(-1, 1)), min_size=2, max_size=6),
     st.fixed_dictionaries(common | {"neighbors": st.integers(0, 1)}),
 )
-def test_any_arrangement_comes_back(sensors, settings):
+def test_round_trip_of_any_arrangement(sensors, settings):
     x, y, heading, beam, offset = (np.array(column) for column in zip(*sensors, strict=True))
     ring = Ring(np.stack([x, y], axis=-1), heading, beam=beam, range_offset=offset, **settings)
     assert_same(saved(ring)[1], ring)
 
 
 @pytest.mark.parametrize("field", ["position", "heading", "beam", "range_offset"])
-def test_what_a_circle_cannot_say_is_saved_as_an_array(field):
+def test_rings_that_are_not_circular_are_saved_as_an_array(field):
     ring = Ring.circular()
     fields = {name: np.array(getattr(ring, name)) for name in ("position", "heading", "beam", "range_offset")}
     fields[field][5] += 1e-9
@@ -151,7 +151,7 @@ def test_what_a_circle_cannot_say_is_saved_as_an_array(field):
     assert_same(again, bent)
 
 
-def test_degrees_are_written_as_a_person_would(tmp_path):
+def test_degrees_are_written_without_rounding_noise(tmp_path):
     save_ring(Ring.circular(name="paper"), tmp_path / "ring.toml")
     assert (tmp_path / "ring.toml").read_text().splitlines() == [
         'name = "paper"',
@@ -170,7 +170,7 @@ def test_degrees_are_written_as_a_person_would(tmp_path):
     assert "[[sensor]]\nx = 0.5\ny = 0.25\nheading_deg = 10.0\nbeam_deg = 50.0\nrange_offset = 0.125\n" in text
 
 
-def test_other_spellings_of_the_same_ring():
+def test_other_toml_notations_of_the_same_ring():
     ring = read(CIRCLE)
     for text in (
         CIRCLE.replace("340.0", "340").replace("15.0", "15"),
@@ -182,7 +182,7 @@ def test_other_spellings_of_the_same_ring():
 
 
 @pytest.mark.parametrize("text", [CIRCLE, BUMPER])
-def test_every_key_but_the_optional_ones_is_needed(text):
+def test_every_key_except_the_optional_ones_is_required(text):
     lines = text.splitlines(keepends=True)
     for k, line in enumerate(lines):
         key = line.partition(" ")[0].strip()
@@ -253,13 +253,13 @@ def test_every_key_but_the_optional_ones_is_needed(text):
         (BUMPER, "0.125", "-inf", "sensor[0].range_offset: -inf came; allowed is a finite number (m)"),
     ],
 )
-def test_a_bad_key_is_named(text, old, new, message):
+def test_an_invalid_key_is_named(text, old, new, message):
     assert old in text
     assert message in refused(text.replace(old, new))
 
 
 @given(st.binary(max_size=40) | st.text(max_size=40).map(str.encode))
-def test_any_bytes_are_refused_in_one_line(garbage):
+def test_arbitrary_bytes_raise_a_one_line_error(garbage):
     for text in (garbage, CIRCLE.encode() + garbage.replace(b"#", b"=") + b"="):
         refused(text)
 
@@ -275,7 +275,7 @@ def test_shipped_rings_load_by_name(tmp_path, monkeypatch):
     assert load_ring("faw").name == "round"
 
 
-def test_bearings_of_the_recorded_rings():
+def test_headings_of_the_recorded_rings():
     degrees = np.degrees(np.asarray(load_ring("corridor8").heading))
     np.testing.assert_allclose(degrees, [-90, -37.5, -22.5, -7.5, 7.5, 22.5, 37.5, 90])
     position = np.asarray(load_ring("corridor8").position)
@@ -284,7 +284,7 @@ def test_bearings_of_the_recorded_rings():
     np.testing.assert_allclose(np.degrees(np.asarray(load_ring("scitos24").heading)), -180 + 15 * np.arange(24))
 
 
-def test_shipped_rings_say_what_they_are():
+def test_names_of_the_shipped_rings():
     from jaxsonar.sensors.ring_toml import DATA
 
     for name in shipped_rings():
@@ -292,19 +292,19 @@ def test_shipped_rings_say_what_they_are():
 
 
 @pytest.mark.parametrize("name", ["fow", "missing.toml", "two\nlines", "nul\0", ""])
-def test_no_such_ring(name):
+def test_a_missing_ring_raises_an_error(name):
     with pytest.raises(SonarError) as caught:
         load_ring(name)
     assert str(caught.value).isprintable()
     assert "corridor8, faw, scitos24, sew-amr" in str(caught.value)
 
 
-def test_a_folder_is_no_ring(tmp_path):
+def test_a_folder_raises_an_error(tmp_path):
     with pytest.raises(SonarError, match="Is a directory; needed is a readable file with a ring"):
         load_ring(tmp_path)
 
 
-def test_a_ring_that_cannot_be_saved_leaves_the_old_one(tmp_path, monkeypatch):
+def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     file = tmp_path / "ring.toml"
     save_ring(Ring.circular(), file)
     before = file.read_text()

@@ -5,7 +5,7 @@ import pytest
 
 from jaxsonar import SonarError
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
-from jaxsonar.simulation.wheel_odometry import LATERAL_RATIO, simulate_odometry, odometry_step_sd
+from jaxsonar.simulation.wheel_odometry import LATERAL_RATIO, odometry_step_sd, simulate_odometry
 
 
 def straight(metres, steps):
@@ -18,7 +18,7 @@ def round_trip(rng):
     return np.column_stack([place + np.array([3.0, -2.0]), wrap_angle(heading)])
 
 
-def test_without_errors_it_is_the_truth(rng):
+def test_odometry_without_errors_equals_the_true_poses(rng):
     poses = round_trip(rng)
     got = simulate_odometry(poses, distance=0.0, turn=0.0)
     np.testing.assert_allclose(got, poses, atol=1e-12)
@@ -26,7 +26,7 @@ def test_without_errors_it_is_the_truth(rng):
         np.testing.assert_array_equal(simulate_odometry(few, distance=0.1, turn=0.1), few)
 
 
-def test_it_begins_at_the_truth_and_is_the_same_again(rng):
+def test_odometry_starts_at_the_true_pose_and_is_reproducible(rng):
     poses = round_trip(rng)
     got = simulate_odometry(poses, distance=0.02, turn=0.02, seed=3)
     np.testing.assert_array_equal(got[0], poses[0])
@@ -35,7 +35,7 @@ def test_it_begins_at_the_truth_and_is_the_same_again(rng):
     assert (np.abs(got[:, 2]) <= np.pi).all()
 
 
-def test_it_does_not_hang_on_the_frame(rng):
+def test_odometry_is_equivariant_under_motions_of_the_world(rng):
     poses, motion = round_trip(rng), np.array([1.0, 2.0, 3.0])
     moved = simulate_odometry(compose(motion, poses), distance=0.02, turn=0.02)
     there = compose(motion, simulate_odometry(poses, distance=0.02, turn=0.02))
@@ -50,7 +50,7 @@ def errors_of_parts(poses, length, **errors):
 
 
 @pytest.mark.parametrize("steps", [9, 90])
-def test_the_walk_grows_with_the_root_of_the_way(steps):
+def test_random_walk_grows_with_the_square_root_of_the_distance(steps):
     """After 9 m three times as much as after one, in few steps as in many."""
     parts = 2000
     poses = straight(9.0 * parts, steps * parts)
@@ -63,7 +63,7 @@ def test_the_walk_grows_with_the_root_of_the_way(steps):
     assert 0.8 < off[:, 1].std() / (0.01 * np.sqrt(9.0**3 / 3)) < 1.1
 
 
-def test_turning_on_the_spot_costs_heading_alone():
+def test_rotation_in_place_affects_the_heading_only():
     parts = 2000
     poses = np.column_stack([np.ones((8 * parts + 1, 2)), wrap_angle(np.pi / 4 * np.arange(8 * parts + 1))])
     off = errors_of_parts(poses, 8, distance=0.02, turn=0.5)
@@ -71,7 +71,7 @@ def test_turning_on_the_spot_costs_heading_alone():
     np.testing.assert_allclose(off[:, 2].std(), 0.02 * np.sqrt(2 * np.pi), rtol=0.08)
 
 
-def test_what_is_wrong_for_good(rng):
+def test_scale_errors_are_systematic(rng):
     poses = round_trip(rng)
     long = simulate_odometry(poses, distance=0.0, turn=0.0, scale=0.03)
     np.testing.assert_allclose(long[:, :2] - poses[0, :2], 1.03 * (poses[:, :2] - poses[0, :2]), atol=1e-12)
@@ -80,7 +80,7 @@ def test_what_is_wrong_for_good(rng):
     np.testing.assert_allclose(wrap_angle(told[:, 2] - 1.5 * steps[:, 2]), 0, atol=1e-9)
 
 
-def test_standard_deviations_are_those_of_the_steps(rng):
+def test_step_standard_deviations_match_the_simulated_errors(rng):
     poses = np.concatenate([straight(0.25, 1), [[0.25, 0.0, 0.4]]])
     sd = odometry_step_sd(poses, distance=0.02, turn=0.1)
     np.testing.assert_allclose(sd, [[0.01, 0.01 * LATERAL_RATIO, 0.05], [0, 0, 0.02 * np.sqrt(0.4)]])
@@ -90,7 +90,7 @@ def test_standard_deviations_are_those_of_the_steps(rng):
     ("wrong", "said"),
     [({"distance": -0.1}, "distance -0.1"), ({"turn": np.nan}, "turn nan"), ({"scale": -1.0}, "scale -1")],
 )
-def test_values_out_of_range_are_named(wrong, said):
+def test_values_out_of_range_raise_a_named_error(wrong, said):
     with pytest.raises(SonarError, match=f"odometry: {said}; allowed"):
         simulate_odometry(straight(1.0, 2), **{"distance": 0.1, "turn": 0.1} | wrong)
     with pytest.raises(SonarError, match="pose 1"):

@@ -1,0 +1,75 @@
+"""Scan logs for tests of the file formats."""
+
+import math
+import re
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from jaxsonar.hardware.errors import SonarError
+from jaxsonar.scans.log_file import load_log
+from jaxsonar.scans.scan_log import Log
+
+HEADER = "scan,stamp,x,y,theta,tx,rx,range"
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+sensor = st.integers(0, 2**31 - 1)
+echo = st.tuples(sensor, sensor, finite.filter(lambda r: r > 0), finite | st.just(math.nan))
+pose = st.tuples(finite, finite, finite) | st.just((math.nan,) * 3)
+one_scan = st.tuples(st.integers(-(2**63), 2**63 - 1), finite | st.just(math.nan), pose, st.lists(echo, max_size=4))
+
+
+def log_of(scans):
+    """A log from (scan, stamp, pose, [(tx, rx, range, amplitude), ...]) a scan."""
+    echoes = [(i, *e) for i, (*_, heard) in enumerate(scans) for e in heard]
+    index, tx, rx, reported, amplitude = zip(*echoes, strict=True) if echoes else ((),) * 5
+    return Log.from_echoes(
+        np.array(index, np.int64),
+        np.array(tx, np.int64),
+        np.array(rx, np.int64),
+        np.array(reported, np.float64),
+        amplitude=np.array(amplitude, np.float64),
+        stamp=np.array([s[1] for s in scans], np.float64),
+        pose=np.array([s[2] for s in scans], np.float64).reshape(-1, 3),
+        scan=np.array([s[0] for s in scans], np.int64),
+    )
+
+
+# Logs are built in the tests: the shape checks of the test run use `random`, which no strategy may.
+any_scans = st.lists(one_scan, max_size=5, unique_by=lambda s: s[0])
+
+SMALL = log_of(
+    [
+        (7, 0.5, (1.25, -2.5, 0.75), [(0, 1, 1.5, 10.0), (2, 3, 0.1, math.nan)]),
+        (3, math.nan, (math.nan,) * 3, []),
+        (9, 2.0, (3.5, 4.5, -3.0), [(4, 5, 2.25, 20.0)]),
+    ]
+)
+SMALL_CSV = f"""{HEADER},amplitude
+7,0.5,1.25,-2.5,0.75,0,1,1.5,10.0
+7,0.5,1.25,-2.5,0.75,2,3,0.1,
+3,,,,,,,,
+9,2.0,3.5,4.5,-3.0,4,5,2.25,20.0
+"""
+
+
+def read(text, name="log.csv"):
+    """What load_log makes of these bytes."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / name
+        file.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return load_log(file)
+
+
+def refused(text, name="log.csv"):
+    """The message about these bytes: one line that begins with the file."""
+    with pytest.raises(SonarError) as caught:
+        read(text, name)
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    assert message.isprintable()
+    assert re.search(rf"/{re.escape(name)}: ", message)
+    return message
