@@ -35,8 +35,11 @@ def rotation(theta: float) -> Float[np.ndarray, "2 2"]:
     return np.array([[c, -s], [s, c]])
 
 
-def rotate(vector: Float[np.ndarray, "*#batch 2"], theta: Float[np.ndarray, "*#batch"]) -> Float[np.ndarray, "... 2"]:
+def rotate(
+    vector: Float[np.ndarray, "*#batch 2"], theta: Float[np.ndarray, "*#batch"] | float
+) -> Float[np.ndarray, "... 2"]:
     """Vectors rotated by theta radians, both broadcast against each other."""
+    theta = np.asarray(theta)
     return np.cos(theta)[..., None] * vector + np.sin(theta)[..., None] * perpendicular(vector)
 
 

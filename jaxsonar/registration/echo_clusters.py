@@ -61,7 +61,7 @@ class PathGeometry(NamedTuple):
         return PathGeometry(*(column[rows] for column in self))
 
 
-class _Cluster(NamedTuple):
+class _EchoCluster(NamedTuple):
     """One row of ``EchoClusters``, with the paths (transmitter, receiver) of its echoes."""
 
     plane: Float[np.ndarray, "2"]
@@ -102,7 +102,7 @@ class ScanObservations:
         slots = SETTINGS.echoes_per_path
         ranges = np.full((len(models), len(ring.paths), slots), np.inf)
         echoes: list[tuple[np.ndarray, ...]] = []
-        clusters: list[tuple[int, _Cluster]] = []
+        clusters: list[tuple[int, _EchoCluster]] = []
         for row, model in enumerate(models):
             path, measured = corrected_echoes(ring, log[row])
             order = np.lexsort((measured, path))
@@ -146,27 +146,27 @@ def _columns(
     return whole[0], whole[1], whole[2], whole[3]
 
 
-def _clusters_of(model: LocalModel) -> Iterator[_Cluster]:
+def _clusters_of(model: LocalModel) -> Iterator[_EchoCluster]:
     """The reflectors of a local model, as walls and as points."""
     rest = (1 - SETTINGS.decided_probability) / 2
     least = SETTINGS.min_kind_probability
     for line in model.lines:
         log_prior = np.log([SETTINGS.decided_probability, rest, rest])
-        yield _Cluster(np.array([line.rho, line.theta]), line.rho * unit(line.theta), log_prior, line.paths)
+        yield _EchoCluster(np.array([line.rho, line.theta]), line.rho * unit(line.theta), log_prior, line.paths)
     for one in model.points:
         probability = np.full(3, max((1 - one.probability) / 2, least))
         probability[kernels.CORNER if one.kind == "corner" else kernels.EDGE] = one.probability
         point = np.array([one.x, one.y])
         plane = np.array([np.hypot(*point), np.arctan2(one.y, one.x)])
-        yield _Cluster(plane, point, np.log(probability), one.paths)
+        yield _EchoCluster(plane, point, np.log(probability), one.paths)
     for other in model.undecided:
         probability = np.array([other.probability[name] for name in ("plane", "corner", "edge")])
         plane, point = np.array([other.rho, other.theta]), np.array([other.x, other.y])
-        yield _Cluster(plane, point, np.log(np.maximum(probability, least)), other.paths)
+        yield _EchoCluster(plane, point, np.log(np.maximum(probability, least)), other.paths)
 
 
 def _inliers(
-    one: _Cluster,
+    one: _EchoCluster,
     path: Int[np.ndarray, " echoes"],
     measured: Float[np.ndarray, " echoes"],
     paths: PathGeometry,

@@ -98,7 +98,7 @@ def register_remaining(
     given = np.full((len(models), 3), np.nan) if odometry is None else np.array(odometry, dtype=np.float64)
     scans = [scan_features(model, noise_scale=noise_scale) for model in models]
     registration = _Registration(scans, MotionModel(given, odometry_sd), margin)
-    base = _Cluster(len(models))
+    base = _FeatureCluster(len(models))
     for scan in np.flatnonzero(np.isfinite(poses[:, 0])):
         base.add(int(scan), scans[scan], poses[scan])
     free = ~base.registered
@@ -116,7 +116,7 @@ def _from_first(
     return compose(compose(start, inverse(poses[first])), poses)
 
 
-class _Cluster:
+class _FeatureCluster:
     """Scans that are registered to each other, and their map."""
 
     def __init__(self, scans: int) -> None:
@@ -148,7 +148,7 @@ class _Registration:
 
     def clusters(
         self, progress: Callable[[int, int], None] | None, free: Bool[np.ndarray, " scans"] | None = None
-    ) -> list[_Cluster]:
+    ) -> list[_FeatureCluster]:
         """Clusters of the free scans (all if left out), each from its first scan on."""
         count, clusters = len(self.scans), []
         free = np.ones(count, dtype=bool) if free is None else free.copy()
@@ -173,10 +173,10 @@ class _Registration:
 
     def _grown_from(
         self, start: int, free: Bool[np.ndarray, " scans"], progress: Callable[[int, int], None] | None
-    ) -> _Cluster:
+    ) -> _FeatureCluster:
         """A cluster from one scan on, until the robot is lost."""
         count, lost = len(self.scans), 0
-        cluster = _Cluster(count)
+        cluster = _FeatureCluster(count)
         cluster.add(start, self.scans[start], np.zeros(3))
         for scan in range(start + 1, count):
             found = free[scan] and self._register(cluster, scan)
@@ -187,7 +187,7 @@ class _Registration:
                 break
         return cluster
 
-    def _register(self, cluster: _Cluster, scan: int) -> bool:
+    def _register(self, cluster: _FeatureCluster, scan: int) -> bool:
         """Add a scan to a cluster if its pose is unambiguous; whether it was."""
         features = self.scans[scan]
         if not len(features.theta) + len(features.point):
@@ -202,7 +202,7 @@ class _Registration:
             cluster.add(scan, features, pose)
         return pose is not None
 
-    def fill(self, cluster: _Cluster, free: Bool[np.ndarray, " scans"]) -> None:
+    def fill(self, cluster: _FeatureCluster, free: Bool[np.ndarray, " scans"]) -> None:
         """Try the free scans near a cluster again, backward and forward, until none is added."""
         for turn in range(4):
             inside, scans = np.flatnonzero(cluster.registered), np.arange(len(free))
@@ -214,7 +214,7 @@ class _Registration:
             if turn and not any(added):
                 break
 
-    def merged(self, clusters: list[_Cluster]) -> list[_Cluster]:
+    def merged(self, clusters: list[_FeatureCluster]) -> list[_FeatureCluster]:
         """Merge the other clusters into the first one wherever the alignment is unambiguous."""
         number = 1
         while number < len(clusters):
@@ -232,7 +232,7 @@ class _Registration:
             number = 1
         return clusters
 
-    def _aligned(self, base: _Cluster, other: _Cluster) -> Float[np.ndarray, "scans 3"] | None:
+    def _aligned(self, base: _FeatureCluster, other: _FeatureCluster) -> Float[np.ndarray, "scans 3"] | None:
         """Poses of another cluster in the frame of the base, or None where the alignment is ambiguous."""
         mine, theirs = np.flatnonzero(base.registered), np.flatnonzero(other.registered)
         gap = np.abs(mine[:, None] - theirs)
