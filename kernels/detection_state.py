@@ -55,8 +55,14 @@ class SceneEstimate(NamedTuple):
     def initial(sigma: Float[Array, ""], settings: DetectionSettings) -> "SceneEstimate":
         """No walls yet, and the priors of the nuisance parameters."""
         size = settings.reflectors
-        prior = (jnp.asarray(p, sigma.dtype) for p in (settings.detection_probability, settings.aligned_fraction))
-        return SceneEstimate(jnp.zeros((size, 2)), jnp.zeros((size, 2, 2)), jnp.zeros(size, bool), *prior, sigma)
+        return SceneEstimate(
+            walls=jnp.zeros((size, 2)),
+            covariance=jnp.zeros((size, 2, 2)),
+            is_wall=jnp.zeros(size, bool),
+            detection_probability=jnp.asarray(settings.detection_probability, sigma.dtype),
+            aligned_fraction=jnp.asarray(settings.aligned_fraction, sigma.dtype),
+            sigma=sigma,
+        )
 
 
 class Hypotheses(NamedTuple):

@@ -1,4 +1,4 @@
-"""Arcs, votes, low pass and centres of gravity against slow NumPy, alone, jitted and vmapped; symmetries; gradients."""
+"""Arcs, votes and low pass equal the NumPy oracle, plain, jitted and vmapped; symmetries; gradients."""
 
 from functools import partial
 
@@ -25,7 +25,7 @@ def run_jitted(kernel, *arrays):
 
 
 def run_in_a_batch(kernel, *arrays):
-    """The same input twice in a batch; both results are the same and returned once."""
+    """Run a batch of two equal inputs, check that the results are equal, and return one of them."""
     both = jax.vmap(kernel)(*jax.tree.map(lambda a: jnp.stack([jnp.asarray(a)] * 2), arrays))
     jax.tree.map(lambda a: np.testing.assert_array_equal(a[0], a[1]), both)
     return jax.tree.map(lambda a: a[0], both)
@@ -46,19 +46,19 @@ def one_path(ring, k):
 
 
 @given(st.floats(-50, 50, width=32))
-def test_wrapped_angles_are_the_same_direction_in_the_half_open_turn(angle):
+def test_a_wrapped_angle_is_the_same_direction_in_the_half_open_interval(angle):
     wrapped = float(kernels.wrap_angle(jnp.float32(angle)))
     assert -np.float32(np.pi) <= wrapped < np.float32(np.pi)
     assert np.cos(wrapped - angle) == pytest.approx(1, abs=1e-5)
 
 
 @pytest.mark.parametrize("angle", [np.pi, -np.pi, 3 * np.pi, -1e-9 + np.pi])
-def test_half_a_turn_wraps_to_the_closed_end(angle):
+def test_pi_wraps_to_minus_pi(angle):
     assert float(kernels.wrap_angle(jnp.float32(angle))) == pytest.approx(-np.pi, abs=1e-6)
 
 
 @given(st.floats(-3, 3, width=32, allow_subnormal=False), angles)
-def test_a_folded_line_is_the_same_line(rho, theta):
+def test_the_canonical_form_of_a_line_is_the_same_line(rho, theta):
     folded_rho, folded_theta = (float(a) for a in kernels.fold_line(jnp.float32(rho), jnp.float32(theta)))
     assert folded_rho >= 0
     assert -np.float32(np.pi) <= folded_theta < np.float32(np.pi)
@@ -68,7 +68,7 @@ def test_a_folded_line_is_the_same_line(rho, theta):
 
 
 @given(st.floats(0.5, 3), angles, st.floats(0, 0.3), st.floats(0, 0.3))
-def test_plane_range_is_half_the_way_from_the_image_source(rho, theta, offset, baseline):
+def test_the_range_of_a_plane_is_half_the_distance_from_the_image_source(rho, theta, offset, baseline):
     n = np.array([np.cos(theta), np.sin(theta)])
     tx, rx = np.array([offset, 0.1]), np.array([offset - baseline, -0.05])
     assume(min(rho - tx @ n, rho - rx @ n) > 0.05)
@@ -78,7 +78,7 @@ def test_plane_range_is_half_the_way_from_the_image_source(rho, theta, offset, b
     assert float(came) == pytest.approx(np.linalg.norm(image - rx) / 2, abs=1e-5)
 
 
-def test_a_corner_answers_like_two_reflections_and_an_edge_like_its_own_source():
+def test_the_range_of_a_corner_is_that_of_two_reflections_and_of_an_edge_the_mean_of_its_legs():
     tx, rx, corner = np.array([0.28, 0.1]), np.array([0.1, 0.27]), np.array([1.3, 0.8])
     twice_mirrored = 2 * corner - tx  # mirrored in both walls of a right angle, whatever its orientation
     as_arrays = [jnp.asarray(a, jnp.float32) for a in (corner, (tx + rx) / 2, (rx - tx) / 2)]
@@ -95,7 +95,7 @@ def test_a_corner_answers_like_two_reflections_and_an_edge_like_its_own_source()
 @pytest.mark.slow
 @ways
 @pytest.mark.parametrize("path", [0, 5, 30, 50, 80, 100, 130, 167])
-def test_tangent_lines_of_an_arc(faw_ring, run, path):
+def test_tangent_lines_of_an_arc_are_those_of_the_oracle(faw_ring, run, path):
     settings, reach = HoughSettings(), 1.234
     arc = kernels.arc(one_path(faw_ring, path), pitch=settings.point_pitch, points=60)
     tangents = partial(kernels.tangent_rho, max_range=jnp.float32(2))
@@ -108,7 +108,7 @@ def test_tangent_lines_of_an_arc(faw_ring, run, path):
 
 
 @given(st.floats(0.3, 2), st.integers(0, 167), st.floats(0, 1))
-def test_points_of_an_arc_are_at_equal_path_length_with_the_tangent_there(reach, path, share):
+def test_points_of_an_arc_have_the_path_length_and_the_tangent(reach, path, share):
     ring = Ring.circular()
     geometry = one_path(ring, path)
     theta = geometry.start + share * geometry.width
@@ -120,7 +120,7 @@ def test_points_of_an_arc_are_at_equal_path_length_with_the_tangent_there(reach,
 
 
 @given(st.floats(0.4, 1.9), angles)
-def test_a_wall_lies_on_the_tangent_of_every_echo_it_causes(rho, theta):
+def test_a_wall_is_a_tangent_line_of_each_of_its_echoes(rho, theta):
     ring = Ring.circular()
     for path, reach in oracles.wall_echoes(ring, rho, theta):
         tx, rx = ring.position[ring.paths[path]]
@@ -128,8 +128,8 @@ def test_a_wall_lies_on_the_tangent_of_every_echo_it_causes(rho, theta):
 
 
 @pytest.mark.parametrize("reach", [np.nan, 2.0, 2.5, 0.0, -1.0, 0.05])
-def test_no_echo_no_vote(faw_ring, reach):
-    """Missing, at or beyond the maximum range, impossible, or shorter than the way from tx to rx."""
+def test_an_invalid_range_has_no_votes(faw_ring, reach):
+    """Invalid: missing, at or beyond the maximum range, impossible, or shorter than the baseline."""
     path = len(faw_ring.paths) - 1  # third neighbor: tx and rx are 0.21 m apart
     arc = kernels.arc(one_path(faw_ring, path), pitch=0.02, points=60)
     rho, counts = kernels.tangent_rho(arc, jnp.float32(reach), max_range=jnp.float32(2))
@@ -137,7 +137,7 @@ def test_no_echo_no_vote(faw_ring, reach):
     assert np.isfinite(rho).all()
 
 
-def test_points_are_equidistant_and_their_pitch_is_what_was_asked_for(faw_ring):
+def test_points_are_equidistant_with_the_nominal_pitch(faw_ring):
     for path, wanted in [(0, 60), (24, 45), (72, 30), (120, 15)]:
         arc = kernels.arc(one_path(faw_ring, path), pitch=np.radians(1), points=60)
         theta = np.asarray(arc.theta)[np.asarray(arc.exists)]
@@ -155,7 +155,7 @@ def test_cones_that_do_not_overlap_have_no_arc():
 
 
 @ways
-def test_votes_fall_into_the_cells_of_their_lines(rng, run):
+def test_votes_are_in_the_cells_of_their_lines(rng, run):
     rho = rng.uniform(-2.5, 2.5, 400).astype(np.float32)
     theta = rng.uniform(-9, 9, 400).astype(np.float32)
     counts = rng.random(400) < 0.8
@@ -176,20 +176,20 @@ def test_votes_fall_into_the_cells_of_their_lines(rng, run):
 @pytest.mark.slow
 @ways
 @pytest.mark.parametrize("taps", [(1,), (1, 2, 1), (1, 4, 6, 4, 1), (0, 1, 0)])
-def test_low_pass(rng, run, taps):
+def test_the_low_pass_is_that_of_the_oracle(rng, run, taps):
     settings = HoughSettings(theta_cells=12, rho_cells=9, smoothing=taps)
     votes = rng.integers(0, 50, (12, 9)).astype(np.int32)
     came = run(partial(kernels.lowpass, settings=settings), votes)
     np.testing.assert_allclose(came, oracles.lowpass(votes, settings), rtol=1e-5, atol=1e-5)
 
 
-def test_low_pass_keeps_votes_that_are_not_at_the_outer_edge(rng):
+def test_the_low_pass_preserves_the_sum_of_inner_votes(rng):
     votes = rng.integers(0, 50, (12, 9)).astype(np.int32)
     votes[:, -1] = 0
     assert float(kernels.lowpass(jnp.asarray(votes), SMALL).sum()) == pytest.approx(votes.sum(), rel=1e-6)
 
 
-def test_soft_votes_equal_hard_ones_on_cell_centres(rng):
+def test_soft_votes_equal_hard_votes_at_cell_centres(rng):
     row, column = rng.integers(0, 12, 60), rng.integers(0, 9, 60)
     theta = ((row + 0.5) * SMALL.theta_cell - np.pi).astype(np.float32)
     rho = ((column + 0.5) * SMALL.rho_cell).astype(np.float32)
@@ -199,7 +199,7 @@ def test_soft_votes_equal_hard_ones_on_cell_centres(rng):
 
 
 @given(st.floats(-2, 2, width=32, allow_subnormal=False), angles, st.floats(0.125, 5, width=32))
-def test_soft_votes_add_up_and_do_not_see_the_seams(rho, theta, weight):
+def test_soft_votes_sum_to_the_weight_and_are_continuous_across_the_seams(rho, theta, weight):
     soft = kernels.soft_accumulate(one(rho), one(theta), one(weight), SMALL)
     assert float(soft.sum()) == pytest.approx(weight, rel=1e-4)
     folded = kernels.soft_accumulate(one(-rho), one(theta + np.pi), one(weight), SMALL)
@@ -216,13 +216,13 @@ def test_soft_votes_add_up_and_do_not_see_the_seams(rho, theta, weight):
         Ring(np.zeros((2, 2)), [0.3, 0.9], beam=[1.0, 0.7], neighbors=1, max_range=2.0),
     ],
 )
-def test_unit_of_the_threshold(ring):
+def test_the_votes_of_a_full_wall_are_those_of_the_oracle(ring):
     settings = HoughSettings()
     came = kernels.full_wall_votes(ring.echo_paths, settings)
     assert float(came) == pytest.approx(oracles.full_wall_votes(ring, settings), rel=0.01)
 
 
-def test_threshold_does_not_depend_on_the_point_pitch(faw_ring):
+def test_the_threshold_does_not_depend_on_the_point_pitch(faw_ring):
     coarse, fine = (HoughSettings(point_pitch=np.radians(p)) for p in (1.0, 0.25))
     votes = [float(kernels.full_wall_votes(faw_ring.echo_paths, s)) for s in (coarse, fine)]
     assert votes[1] == pytest.approx(4 * votes[0])
@@ -230,7 +230,7 @@ def test_threshold_does_not_depend_on_the_point_pitch(faw_ring):
 
 @pytest.mark.slow
 @ways
-def test_segment_endpoints_are_the_outermost_feet(rng, run):
+def test_segment_endpoints_are_the_outermost_footpoints(rng, run):
     sensors = rng.normal(size=(7, 2)).astype(np.float32)
     involved = np.array([True, False, True, True, False, False, True])
     rho, theta = jnp.float32(1.2), jnp.float32(2.2)
@@ -245,7 +245,7 @@ def test_segment_endpoints_are_the_outermost_feet(rng, run):
 
 
 def soft_votes(ring, ranges):
-    """A score of soft votes: what a calibration differentiates, with missing and impossible echoes among them."""
+    """A score of soft votes, as in the focus measure, with missing and impossible echoes among them."""
     sensors = ring.sensors
     paths = kernels.echo_paths(sensors)
 
@@ -308,6 +308,6 @@ def test_forward_reverse_and_numerical_gradients_agree(faw_ring):
         ("min_echoes", 0),
     ],
 )
-def test_settings_out_of_range_are_refused(setting, value):
+def test_settings_out_of_range_are_rejected(setting, value):
     with pytest.raises(ValueError, match=f"{setting} = .*allowed"):
         HoughSettings(**{setting: value})

@@ -53,7 +53,7 @@ def test_the_residuals_are_reported_minus_predicted_ranges(rng):
         tx, rx = RING.paths[int(factors.path[k, e])]
         reflection = factors.reflection
         first, second = (
-            kernels.landmark_in_robot_frame(true.poses[k], landmarks.take(int(rows[k, e])))
+            kernels.landmark_in_robot_frame(true.poses[k], landmarks.take(rows[k, e]))
             for rows in (reflection.first, reflection.second)
         )
         kind = reflection.kind[k, e]

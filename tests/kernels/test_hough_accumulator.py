@@ -1,4 +1,4 @@
-"""Maxima of the accumulator against a loop over its cells, both seams kept; how many paths hear a wide wall."""
+"""Local maxima of the accumulator equal a loop over its cells, across both seams; the paths that receive a wall."""
 
 import math
 from functools import partial
@@ -22,7 +22,7 @@ seeds = st.integers(0, 10_000)
 
 
 def peaks_of(smooth, level=0.0, size=20):
-    """Lines (rho, theta) of the maxima, those that are none left out."""
+    """Lines (rho, theta) of the maxima, without unused rows."""
     rho, theta = peaks(jnp.asarray(smooth, jnp.float32), jnp.float32(level), size=size, settings=SMALL)
     assert rho.shape == theta.shape == (size,)
     np.testing.assert_array_equal(np.isnan(rho), np.isnan(theta))
@@ -32,13 +32,13 @@ def peaks_of(smooth, level=0.0, size=20):
 
 
 def value(smooth, row, column):
-    """Occupancy of a cell and of those beyond the seams; nothing beyond the last column."""
+    """Occupancy of a cell, also across the seams; 0 beyond the last column."""
     where = oracles.beyond(row, column, SMALL)
     return 0.0 if where is None else smooth[where]
 
 
 def maxima(smooth, level):
-    """(height, rho, theta) of all maxima, by a loop over the cells of an accumulator without equal neighbors."""
+    """(height, rho, theta) of all maxima, by a loop over the cells; valid if no neighbors are equal."""
     found = []
     for row in range(ROWS):
         for column in range(COLUMNS):
@@ -60,7 +60,7 @@ def same_lines(came, wanted):
 
 @settings(max_examples=40)
 @given(seeds, st.sampled_from([0.0, 0.3, 0.9]))
-def test_maxima_are_those_of_a_loop_over_all_cells_highest_first(seed, level):
+def test_maxima_are_those_of_a_loop_over_all_cells_in_descending_order(seed, level):
     smooth = np.random.default_rng(seed).random((ROWS, COLUMNS)).astype(np.float32)
     wanted = maxima(smooth.astype(float), np.float32(level))
     assert len(wanted) < 40
@@ -73,13 +73,13 @@ def test_maxima_are_those_of_a_loop_over_all_cells_highest_first(seed, level):
 @pytest.mark.slow
 @settings(max_examples=15)
 @given(seeds, st.integers(1, 5))
-def test_too_little_room_keeps_the_highest(seed, size):
+def test_a_small_result_holds_the_highest_maxima(seed, size):
     smooth = np.random.default_rng(seed).random((ROWS, COLUMNS)).astype(np.float32)
     wanted = maxima(smooth.astype(float), 0.0)[:size]
     same_lines(peaks_of(smooth, size=size), wanted)
 
 
-def test_nothing_in_an_empty_accumulator_and_nothing_at_the_level():
+def test_an_empty_accumulator_and_cells_at_the_level_have_no_maxima():
     assert len(peaks_of(np.zeros((ROWS, COLUMNS)))) == 0
     flat = np.zeros((ROWS, COLUMNS))
     flat[3, 4] = 2.0
@@ -89,7 +89,7 @@ def test_nothing_in_an_empty_accumulator_and_nothing_at_the_level():
 
 @pytest.mark.parametrize("row", range(ROWS))
 @pytest.mark.parametrize("column", [0, 1, 4, COLUMNS - 1])
-def test_a_lone_cell_is_a_line_through_its_middle(row, column):
+def test_an_isolated_cell_gives_the_line_at_its_centre(row, column):
     smooth = np.zeros((ROWS, COLUMNS))
     smooth[row, column] = 1.0
     ((rho, theta),) = peaks_of(smooth)
@@ -98,7 +98,7 @@ def test_a_lone_cell_is_a_line_through_its_middle(row, column):
 
 
 @pytest.mark.parametrize("row", range(ROWS))
-def test_a_shoulder_beyond_rho_0_belongs_to_the_same_maximum(row):
+def test_a_neighbor_across_rho_0_belongs_to_the_same_maximum(row):
     smooth = np.zeros((ROWS, COLUMNS))
     smooth[row, 0], smooth[(row + ROWS // 2) % ROWS, 0] = 3.0, 1.0
     ((rho, theta),) = peaks_of(smooth)
@@ -109,7 +109,7 @@ def test_a_shoulder_beyond_rho_0_belongs_to_the_same_maximum(row):
 @pytest.mark.parametrize("shape", [(1, 2), (2, 1), (2, 2), (3, 2), (1, 4)])
 @pytest.mark.parametrize("column", [0, 3])
 @pytest.mark.parametrize("row", [0, 5, ROWS - 1])
-def test_of_equal_neighbors_one_is_the_maximum(row, column, shape):
+def test_exactly_one_of_equal_neighbors_is_a_maximum(row, column, shape):
     smooth = np.zeros((ROWS, COLUMNS))
     for down in range(shape[0]):
         for right in range(shape[1]):
@@ -122,7 +122,7 @@ def test_of_equal_neighbors_one_is_the_maximum(row, column, shape):
 
 
 @pytest.mark.parametrize("row", [0, 3, ROWS // 2, ROWS - 1])
-def test_of_equal_neighbors_across_rho_0_one_is_the_maximum(row):
+def test_exactly_one_of_equal_neighbors_across_rho_0_is_a_maximum(row):
     smooth = np.zeros((ROWS, COLUMNS))
     smooth[row, 0] = smooth[(row + ROWS // 2) % ROWS, 0] = 1.0
     assert len(peaks_of(smooth)) == 1
@@ -130,7 +130,7 @@ def test_of_equal_neighbors_across_rho_0_one_is_the_maximum(row):
 
 @settings(max_examples=15)
 @given(seeds, st.integers(0, ROWS - 1))
-def test_turning_the_accumulator_turns_the_lines(seed, steps):
+def test_rotating_the_accumulator_rotates_the_lines(seed, steps):
     smooth = np.random.default_rng(seed).random((ROWS, COLUMNS)).astype(np.float32)
     here, there = peaks_of(smooth, size=40), peaks_of(np.roll(smooth, steps, axis=0), size=40)
     np.testing.assert_allclose(there[:, 0], here[:, 0], atol=1e-5)
@@ -139,7 +139,7 @@ def test_turning_the_accumulator_turns_the_lines(seed, steps):
 
 
 @pytest.mark.slow
-def test_a_batch_is_one_by_one(rng):
+def test_a_batch_gives_the_results_of_single_accumulators(rng):
     smooth = jnp.asarray(rng.random((3, ROWS, COLUMNS)), jnp.float32)
     level = jnp.float32(0.5)
     kernel = partial(hough.peaks, size=9, settings=SMALL)
@@ -159,7 +159,7 @@ RINGS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RINGS)
-def test_paths_that_hear_a_wide_wall_are_those_of_the_loop(name):
+def test_the_number_of_paths_that_receive_a_wide_wall_is_that_of_a_loop(name):
     ring = RINGS[name]
     setup = HoughSettings()
     wanted = oracles.full_wall_votes(ring, setup) * setup.point_pitch / setup.theta_cell
@@ -169,6 +169,6 @@ def test_paths_that_hear_a_wide_wall_are_those_of_the_loop(name):
     assert votes == pytest.approx(came * setup.theta_cell / setup.point_pitch, rel=1e-5)
 
 
-def test_of_one_sensor_one_path_hears_a_wall():
+def test_with_one_sensor_one_path_receives_a_wall():
     assert float(hough.full_wall_paths(RINGS["one sensor"].echo_paths)) == pytest.approx(1, rel=0.01)
     assert float(hough.full_wall_paths(RINGS["cones that never meet"].echo_paths)) == pytest.approx(1, rel=0.01)

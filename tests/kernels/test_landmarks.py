@@ -1,4 +1,4 @@
-"""What a path reports of a reflector of the world: image sources, rigid motions, both sides of a wall, slopes."""
+"""Predicted ranges of landmarks: image sources, rigid motions, both sides of a wall, derivatives."""
 
 import dataclasses
 import math
@@ -14,18 +14,18 @@ from jaxsonar.kernels import CORNER, EDGE, PLANE, SECOND_ORDER, EchoPaths, Landm
 from jaxsonar.kernels import measurement_model as reflectors
 
 MANY = 200
-SLACK = 0.3  # m; a wall may be heard so far beyond its ends
-KINDS = {"plane": PLANE, "corner": CORNER, "edge": EDGE, "wall to wall": SECOND_ORDER}
+SLACK = 0.3  # m; margin within which a wall is visible beyond its ends
+KINDS = {"plane": PLANE, "corner": CORNER, "edge": EDGE, "second order": SECOND_ORDER}
 kinds = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
 
 expected_ranges = jax.jit(jax.vmap(kernels.expected_range))
-audible = jax.jit(jax.vmap(kernels.predict_reflection))
-seen_from = jax.jit(jax.vmap(kernels.landmark_in_robot_frame))
+predict_reflections = jax.jit(jax.vmap(kernels.predict_reflection))
+to_robot_frame = jax.jit(jax.vmap(kernels.landmark_in_robot_frame))
 
 
 @pytest.fixture(autouse=True)
-def double():
-    """Double precision, but where a test asks for less."""
+def double_precision():
+    """Double precision, unless a test requests single precision."""
     with jax.enable_x64(True):
         yield
 
@@ -35,25 +35,25 @@ def unit(angle):
 
 
 def image(point, line):
-    """A point mirrored at the line (rho, theta)."""
+    """Mirror image of a point at the line (rho, theta)."""
     n = unit(line[1])
     return point - 2 * (point @ n - line[0]) * n
 
 
 def oracle(kind, first, second, tx, rx):
-    """Half the path length, by mirroring the transmitter until it stands where the receiver hears it."""
+    """Half the path length, by mirroring the transmitter at each plane."""
     if kind == PLANE:
         return np.linalg.norm(image(tx, first) - rx) / 2
     if kind == SECOND_ORDER:
         return np.linalg.norm(image(image(tx, first), second) - rx) / 2
-    if kind == CORNER:  # two walls through the corner, at a right angle, turned anyhow
+    if kind == CORNER:  # two walls through the corner, at a right angle, rotated anyhow
         for theta in (0.3, 0.3 + np.pi / 2):
             tx = image(tx, (first @ unit(theta), theta))
         return np.linalg.norm(tx - rx) / 2
     return (np.linalg.norm(first - tx) + np.linalg.norm(rx - first)) / 2
 
 
-def some(rng, kind, count=MANY):
+def random_reflectors(rng, kind, count=MANY):
     """Reflectors around a robot, and pairs of sensors; every fourth path is a direct one."""
     first = rng.uniform(-2, 2, (count, 2))
     second = rng.uniform(-2, 2, (count, 2))
@@ -66,7 +66,7 @@ def some(rng, kind, count=MANY):
 
 
 def paths_between(tx, rx, heading, half_beam=0.5):
-    """Echo paths of sensors with these headings (paths, 2), in the precision that is switched on."""
+    """Echo paths of sensors with these headings (paths, 2), in the default precision."""
     arrays = {
         "midpoint": (tx + rx) / 2,
         "half_baseline": (rx - tx) / 2,
@@ -79,8 +79,8 @@ def paths_between(tx, rx, heading, half_beam=0.5):
     return EchoPaths(**{name: jnp.asarray(value) for name, value in arrays.items()})
 
 
-def some_scene(rng, kind, count=MANY):
-    """Reflectors anywhere in the world."""
+def random_landmarks(rng, kind, count=MANY):
+    """Landmarks anywhere in the world."""
     line = np.column_stack([rng.uniform(-0.1, 0.1, count), rng.uniform(-np.pi, np.pi, count)])
     return Landmarks(
         kind=np.full(count, PLANE if kind in (PLANE, SECOND_ORDER) else kind, np.int32),
@@ -90,35 +90,37 @@ def some_scene(rng, kind, count=MANY):
     )
 
 
-def turned(theta, points):
+def rotated(theta, points):
     cos, sin = math.cos(theta), math.sin(theta)
     return points @ np.array([[cos, sin], [-sin, cos]])
 
 
-def moved_scene(scene, motion):
-    """The same reflectors after the world was turned by motion[2] and then shifted."""
+def transformed_landmarks(scene, motion):
+    """The same landmarks after a rotation of the world by motion[2] and then a translation."""
     of_plane = scene.kind[:, None] == PLANE
     return dataclasses.replace(
         scene,
-        parameters=np.where(of_plane, scene.parameters + np.array([0, motion[2]]), turned(motion[2], scene.parameters)),
-        anchor=turned(motion[2], scene.anchor) + motion[:2],
+        parameters=np.where(
+            of_plane, scene.parameters + np.array([0, motion[2]]), rotated(motion[2], scene.parameters)
+        ),
+        anchor=rotated(motion[2], scene.anchor) + motion[:2],
     )
 
 
-def moved_poses(poses, motion):
-    return np.column_stack([turned(motion[2], poses[:, :2]) + motion[:2], poses[:, 2] + motion[2]])
+def transformed_poses(poses, motion):
+    return np.column_stack([rotated(motion[2], poses[:, :2]) + motion[:2], poses[:, 2] + motion[2]])
 
 
 def arrays(tree):
     return jax.tree.map(jnp.asarray, tree)
 
 
-def heard(kind, poses, first, second, tx, rx, heading):
-    """What ``audible`` says of every path: range, share, arrival."""
+def predicted(kind, poses, first, second, tx, rx, heading):
+    """Range, visibility and arrival of every path, by ``predict_reflection``."""
     rows = np.arange(len(poses), dtype=np.int32)
     reflection = Reflection(np.full(len(poses), kind, np.int32), rows, rows)
     path = paths_between(tx, rx, heading, half_beam=1.2)
-    return [np.asarray(x) for x in audible(*arrays((poses, reflection, first, second)), path)]
+    return [np.asarray(x) for x in predict_reflections(*arrays((poses, reflection, first, second)), path)]
 
 
 # Ranges
@@ -126,15 +128,15 @@ def heard(kind, poses, first, second, tx, rx, heading):
 
 @kinds
 def test_ranges_are_those_of_image_sources(rng, kind):
-    first, second, tx, rx = some(rng, kind)
+    first, second, tx, rx = random_reflectors(rng, kind)
     found = expected_ranges(*arrays((np.full(MANY, kind), first, second, tx, rx)))
     expected = [oracle(kind, *row) for row in zip(first, second, tx, rx, strict=True)]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
 @kinds
-def test_ranges_are_those_that_local_models_fit(rng, kind):
-    first, second, tx, rx = some(rng, kind)
+def test_ranges_are_those_of_the_predicted_echoes(rng, kind):
+    first, second, tx, rx = random_reflectors(rng, kind)
     kernel = [reflectors.plane_echo, reflectors.corner_echo, reflectors.edge_echo, reflectors.second_order_echo][kind]
     path = paths_between(tx, rx, np.zeros((MANY, 2)))
     lines = arrays((first, second))[: 2 if kind == SECOND_ORDER else 1]
@@ -145,8 +147,8 @@ def test_ranges_are_those_that_local_models_fit(rng, kind):
     np.testing.assert_allclose(np.asarray(found)[exists], np.asarray(sighting.range)[exists], rtol=0, atol=1e-12)
 
 
-def test_wall_to_wall_of_square_walls_is_their_corner(rng):
-    first, _, tx, rx = some(rng, PLANE)
+def test_the_second_order_range_of_perpendicular_walls_is_that_of_their_corner(rng):
+    first, _, tx, rx = random_reflectors(rng, PLANE)
     second = np.column_stack([rng.uniform(0.7, 2, MANY), first[:, 1] + rng.choice([-1, 1], MANY) * np.pi / 2])
     both = np.stack([unit(first[:, 1]), unit(second[:, 1])], axis=1)
     place = np.linalg.solve(both, np.stack([first[:, 0], second[:, 0]], axis=-1)[..., None])[..., 0]
@@ -158,25 +160,25 @@ def test_wall_to_wall_of_square_walls_is_their_corner(rng):
 
 
 @kinds
-def test_there_and_back_are_one_geometry(rng, kind):
-    first, second, tx, rx = some(rng, kind)
+def test_exchanging_transmitter_and_receiver_keeps_the_range(rng, kind):
+    first, second, tx, rx = random_reflectors(rng, kind)
     there = expected_ranges(*arrays((np.full(MANY, kind), first, second, tx, rx)))
     back = (second, first, rx, tx) if kind == SECOND_ORDER else (first, second, rx, tx)
     np.testing.assert_allclose(there, expected_ranges(*arrays((np.full(MANY, kind), *back))), atol=1e-12)
 
 
-def test_what_is_no_reflector_has_no_range_and_is_not_heard(rng):
-    first, second, tx, rx = some(rng, PLANE)
+def test_an_unused_row_has_no_range_and_is_not_visible(rng):
+    first, second, tx, rx = random_reflectors(rng, PLANE)
     np.testing.assert_array_equal(expected_ranges(*arrays((np.full(MANY, -1), first, second, tx, rx))), 0)
-    scene = some_scene(rng, PLANE)
-    reach, share, arrival = heard(-1, np.zeros((MANY, 3)), scene, scene, tx, rx, np.zeros((MANY, 2)))
+    scene = random_landmarks(rng, PLANE)
+    reach, share, arrival = predicted(-1, np.zeros((MANY, 3)), scene, scene, tx, rx, np.zeros((MANY, 2)))
     np.testing.assert_array_equal(share, 0)
     assert np.isfinite(reach).all()
     assert np.isfinite(arrival).all()
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.97, 1.0, 1.04])
-def test_reports_and_corrections_undo_one_another(scale):
+def test_reported_and_corrected_ranges_are_inverse(scale):
     for reach, offset in ((0.3, 0.05), (1.0, 0.0), (2.0, -0.03)):
         told = {"range_offset": jnp.asarray(offset), "range_scale": jnp.asarray(scale)}
         reported = kernels.reported_range(jnp.asarray(reach), **told)
@@ -187,60 +189,60 @@ def test_reports_and_corrections_undo_one_another(scale):
 
 
 @kinds
-def test_moving_and_turning_the_world_changes_nothing(rng, kind):
-    first, second = some_scene(rng, kind), some_scene(rng, kind)
+def test_a_rigid_motion_of_the_world_changes_nothing(rng, kind):
+    first, second = random_landmarks(rng, kind), random_landmarks(rng, kind)
     poses = rng.uniform([-1, -1, -np.pi], [1, 1, np.pi], (MANY, 3))
-    _, _, tx, rx = some(rng, kind)
+    _, _, tx, rx = random_reflectors(rng, kind)
     heading = rng.uniform(-np.pi, np.pi, (MANY, 1)) + rng.uniform(-0.3, 0.3, (MANY, 2))
-    before = heard(kind, poses, first, second, tx, rx, heading)
+    before = predicted(kind, poses, first, second, tx, rx, heading)
     assert 0.02 < np.mean(before[1] > 0) < 0.98
     for motion in ([3.0, -5.0, 2.1], [-40.0, 20.0, -3.0]):
-        worlds = (moved_scene(first, motion), moved_scene(second, motion))
-        after = heard(kind, moved_poses(poses, motion), *worlds, tx, rx, heading)
+        worlds = (transformed_landmarks(first, motion), transformed_landmarks(second, motion))
+        after = predicted(kind, transformed_poses(poses, motion), *worlds, tx, rx, heading)
         for was, now in zip(before, after, strict=True):
             np.testing.assert_allclose(now, was, atol=1e-11)
 
 
-@pytest.mark.parametrize("kind", [PLANE, SECOND_ORDER], ids=["plane", "wall to wall"])
-def test_a_wall_has_two_sides_and_no_direction(rng, kind):
-    """The normal turned about, the ends with it: the same wall. Half of the robots stand behind it."""
-    first, second = some_scene(rng, kind), some_scene(rng, kind)
+@pytest.mark.parametrize("kind", [PLANE, SECOND_ORDER], ids=["plane", "second order"])
+def test_the_direction_of_the_normal_of_a_wall_does_not_matter(rng, kind):
+    """Reversing the normal together with the ends gives the same wall. Half of the robots are behind it."""
+    first, second = random_landmarks(rng, kind), random_landmarks(rng, kind)
     poses = rng.uniform([-1, -1, -np.pi], [1, 1, np.pi], (MANY, 3))
-    _, _, tx, rx = some(rng, kind)
+    _, _, tx, rx = random_reflectors(rng, kind)
     heading = rng.uniform(-np.pi, np.pi, (MANY, 1)) + rng.uniform(-0.3, 0.3, (MANY, 2))
 
     def about(scene):
         parameters = np.column_stack([-scene.parameters[:, 0], scene.parameters[:, 1] + np.pi])
         return dataclasses.replace(scene, parameters=parameters, extent=-scene.extent[:, ::-1])
 
-    behind = np.asarray(seen_from(*arrays((poses, first))))[:, 0] < 0
+    behind = np.asarray(to_robot_frame(*arrays((poses, first))))[:, 0] < 0
     assert 0.2 < behind.mean() < 0.8
-    before = heard(kind, poses, first, second, tx, rx, heading)
+    before = predicted(kind, poses, first, second, tx, rx, heading)
     assert (before[1][behind] > 0).any()
     for worlds in ((about(first), second), (about(first), about(second))):
-        for was, now in zip(before, heard(kind, poses, *worlds, tx, rx, heading), strict=True):
+        for was, now in zip(before, predicted(kind, poses, *worlds, tx, rx, heading), strict=True):
             np.testing.assert_allclose(now, was, atol=1e-11)
 
 
 @kinds
-def test_the_robot_sees_what_stands_in_the_world(rng, kind):
-    """Points of a wall, moved into the robot frame, lie on the line that is seen; points are where they are seen."""
-    scene = some_scene(rng, kind)
+def test_landmarks_in_the_robot_frame_are_the_transformed_points_of_the_world(rng, kind):
+    """Points of a wall, transformed to the robot frame, are on the transformed line; so are points."""
+    scene = random_landmarks(rng, kind)
     poses = rng.uniform([-5, -5, -np.pi], [5, 5, np.pi], (MANY, 3))
-    seen = np.asarray(seen_from(*arrays((poses, scene))))
+    seen = np.asarray(to_robot_frame(*arrays((poses, scene))))
     for pose, anchor, parameters, found in zip(poses, scene.anchor, scene.parameters, seen, strict=True):
         if kind in (PLANE, SECOND_ORDER):
             n = unit(parameters[1])
             for along in (-1.0, 0.5):
                 world = anchor + parameters[0] * n + along * np.array([-n[1], n[0]])
-                robot = turned(-pose[2], world - pose[:2])
+                robot = rotated(-pose[2], world - pose[:2])
                 np.testing.assert_allclose(unit(found[1]) @ robot, found[0], atol=1e-12)
         else:
-            np.testing.assert_allclose(turned(-pose[2], anchor + parameters - pose[:2]), found, atol=1e-12)
+            np.testing.assert_allclose(rotated(-pose[2], anchor + parameters - pose[:2]), found, atol=1e-12)
 
 
-def test_a_wall_is_heard_where_it_is_and_a_little_beyond():
-    """A sensor that looks at a wall of 1 m, and goes along it, on either side."""
+def test_a_wall_is_visible_up_to_a_margin_beyond_its_ends():
+    """A sensor faces a wall of 1 m and moves along it, on either side."""
     along = np.linspace(-2, 2, 81) + 1e-3
     for turn in (0.0, np.pi):
         scene = Landmarks(
@@ -251,32 +253,32 @@ def test_a_wall_is_heard_where_it_is_and_a_little_beyond():
         )
         poses = np.column_stack([np.zeros(81), along, np.zeros(81)])
         sensor = np.tile([0.28, 0.0], (81, 1))
-        reach, share, arrival = heard(PLANE, poses, scene, scene, sensor, sensor, np.zeros((81, 2)))
+        reach, share, arrival = predicted(PLANE, poses, scene, scene, sensor, sensor, np.zeros((81, 2)))
         np.testing.assert_array_equal(share > 0, np.abs(along) < 0.5 + SLACK)
         np.testing.assert_allclose(reach, 0.72, atol=1e-12)
         np.testing.assert_allclose(arrival, np.tile([1.0, 0.0], (81, 1)), atol=1e-12)
 
 
-def test_single_precision_is_enough_a_kilometre_away(rng):
-    """Anchors take the digits; the numbers of the test are such as single precision holds exactly."""
+def test_single_precision_suffices_a_kilometre_away(rng):
+    """Anchors hold the large coordinates. The numbers of the test are exact in single precision."""
     count = MANY
     poses = np.float32(rng.uniform([-1, -1, -3], [1, 1, 3], (count, 3)) + np.array([1000, -2000, 0]))
     for kind in (PLANE, CORNER, EDGE):
-        scene = some_scene(rng, kind)
+        scene = random_landmarks(rng, kind)
         scene = dataclasses.replace(scene, anchor=scene.anchor + np.array([1000, -2000]))
         scene = jax.tree.map(lambda x: np.float32(x) if x.dtype == np.float64 else x, scene)
         with jax.enable_x64(False):
-            single = np.asarray(seen_from(*arrays((poses, scene))))
+            single = np.asarray(to_robot_frame(*arrays((poses, scene))))
         assert single.dtype == np.float32
         wide = jax.tree.map(lambda x: np.float64(x) if x.dtype == np.float32 else x, (poses, scene))
-        np.testing.assert_allclose(single, seen_from(*arrays(wide)), atol=5e-6)
+        np.testing.assert_allclose(single, to_robot_frame(*arrays(wide)), atol=5e-6)
 
 
 # Slopes
 
 
 def chain(values, kind):
-    """From pose, two reflectors and two sensors, 11 numbers, to a report."""
+    """Expected range as a function of 11 numbers: pose, two reflectors, two sensors."""
     pose, one, other, tx, rx = values[:3], values[3:5], values[5:7], values[7:9], values[9:11]
     none = jnp.zeros(2, values.dtype)
     of = jnp.where(kind == SECOND_ORDER, PLANE, kind)
@@ -292,8 +294,8 @@ slopes = {
 
 @pytest.mark.slow
 @kinds
-def test_slopes_are_those_of_finite_differences_forward_and_in_reverse(rng, kind):
-    first, second, tx, rx = some(rng, kind)
+def test_forward_and_reverse_derivatives_equal_finite_differences(rng, kind):
+    first, second, tx, rx = random_reflectors(rng, kind)
     values = jnp.asarray(np.column_stack([rng.uniform(-0.3, 0.3, (MANY, 3)), first, second, tx, rx]))
     of = jnp.asarray(kind)
     report = jax.jit(jax.vmap(partial(chain, kind=of)))
@@ -316,18 +318,18 @@ DEGENERATE = {
 @pytest.mark.slow
 @kinds
 @pytest.mark.parametrize("place", DEGENERATE)
-def test_slopes_are_finite_where_geometry_is_not(kind, place):
+def test_derivatives_are_finite_in_singular_geometries(kind, place):
     values = jnp.asarray([DEGENERATE[place]], float)
     for slope in slopes.values():
         assert np.isfinite(slope(values, jnp.asarray(kind))).all()
 
 
 @kinds
-def test_single_precision_agrees(rng, kind):
-    first, second, tx, rx = some(rng, kind)
+def test_single_precision_agrees_with_double_precision(rng, kind):
+    first, second, tx, rx = random_reflectors(rng, kind)
     given = (np.full(MANY, kind, np.int32), first, second, tx, rx)
-    double = expected_ranges(*arrays(given))
+    double_precision = expected_ranges(*arrays(given))
     with jax.enable_x64(False):
         single = expected_ranges(*arrays(given))
     assert single.dtype == np.float32
-    np.testing.assert_allclose(single, double, atol=2e-6)
+    np.testing.assert_allclose(single, double_precision, atol=2e-6)

@@ -1,6 +1,6 @@
-"""Reflectors that explain a scan: exact without noise, at the bound with it, honest about both; no echo twice.
+"""Maximum-likelihood detection: exact without noise, at the Cramer-Rao bound with it, consistent covariances.
 
-All scans run in one compiled shape with room for 64 echoes, the product's, whatever the ring.
+All scans run in one compiled shape of 64 echoes, as in the product, for all rings.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ from jaxsonar.scans.echo_batches import SLOW_SCANS
 from jaxsonar.simulation.acoustics import Acoustics
 from jaxsonar.simulation.traced_echoes import EchoKind
 
-RING, SETTINGS, EXPECTED = Ring.circular(), HoughSettings(), kernels.DetectionSettings()
-SCANS, ROOM, PATHS, POINTS = SLOW_SCANS.rows[0], 64, 168, 64
+RING, SETTINGS, PRIOR = Ring.circular(), HoughSettings(), kernels.DetectionSettings()
+SCANS, SLOTS, PATHS, POINTS = SLOW_SCANS.rows[0], 64, 168, 64
 DECIDED = 0.7
 PLAIN: dict[str, Any] = {"box": 0.0, "segment": 0.0, "pole": 0.0}
 ORIGIN = np.zeros((1, 3))
@@ -40,35 +40,35 @@ def polygon(*lines):
 TRIANGLE = polygon((1.4, 0.1), (1.6, 2.2), (1.3, -2.0))
 
 
-def explained(scans, sigma=math.nan, arcs=None):
-    """The explanation of scans, each a list of (path, range); one array a field."""
+def detected(scans, sigma=math.nan, arcs=None):
+    """Detections of scans, each a list of (path, range); one array per field."""
     arcs = arc_tables(RING, SETTINGS).arcs if arcs is None else arcs
     parts = []
     for begin in range(0, len(scans), SCANS):
         some = scans[begin : begin + SCANS]
-        path, reported = np.zeros((SCANS, ROOM), np.int32), np.full((SCANS, ROOM), np.nan, np.float32)
+        path, reported = np.zeros((SCANS, SLOTS), np.int32), np.full((SCANS, SLOTS), np.nan, np.float32)
         for row, echoes in enumerate(some):
             if len(echoes):
                 path[row, : len(echoes)], reported[row, : len(echoes)] = zip(*echoes, strict=True)
         echoes = kernels.PackedEchoes(jnp.asarray(path), jnp.asarray(reported))
-        found = kernels.detect_ml(arcs, echoes, jnp.float32(sigma), hough_settings=SETTINGS, settings=EXPECTED)
+        found = kernels.detect_ml(arcs, echoes, jnp.float32(sigma), hough_settings=SETTINGS, settings=PRIOR)
         real = slice(0, len(some))
         parts.append(jax.tree.map(lambda leaf, rows=real: np.asarray(leaf)[rows], found))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-def heard(room, poses, ring=RING, **options):
-    """Scans as lists of (path, range), and the simulation they are of."""
+def simulated_scans(room, poses, ring=RING, **options):
+    """Scans as lists of (path, range), and the simulation."""
     came = simulate(ring, room, np.atleast_2d(poses), **options)
     scans = [
         list(zip(came.path[came.scan == k].tolist(), came.range[came.scan == k].tolist(), strict=True))
         for k in range(len(came.stamps))
     ]
-    assert max(map(len, scans)) <= ROOM
+    assert max(map(len, scans)) <= SLOTS
     return scans, came
 
 
-def some_rooms(count, **options):
+def random_rooms(count, **options):
     """Random rooms with a pose in each."""
     rngs = [np.random.default_rng(seed) for seed in range(count)]
     rooms = [random_room(rng, **options) for rng in rngs]
@@ -76,18 +76,18 @@ def some_rooms(count, **options):
 
 
 def scans_of_rooms(count, *, sigma=0.001, dropout=0.0, clutter=0.0, ring=RING, **options):
-    """A scan in each of some random rooms; in the first ones in which there are not too many echoes."""
+    """A scan in each of the first random rooms with few enough echoes."""
     scans = []
-    for seed, (room, pose) in enumerate(some_rooms(count + 8, **options)):
+    for seed, (room, pose) in enumerate(random_rooms(count + 8, **options)):
         came = simulate(ring, room, pose[None], seed=seed, sigma=sigma, dropout=dropout, clutter=clutter)
-        if len(came.path) <= ROOM:
+        if len(came.path) <= SLOTS:
             scans.append(list(zip(came.path.tolist(), came.range.tolist(), strict=True)))
     assert len(scans) >= count
     return scans[:count]
 
 
 def decided(found):
-    """(scans, reflectors) kind of what is decided, else -1."""
+    """(scans, reflectors) kind of the decided reflectors, else -1."""
     sure = (found.kind >= 0) & (found.probability.max(axis=-1) >= DECIDED)
     return np.where(sure & (found.probability.argmax(axis=-1) == found.kind), found.kind, -1)
 
@@ -100,8 +100,8 @@ def one_row(found, scan):
     return jax.tree.map(lambda leaf: leaf[scan], found)
 
 
-def same_reflectors(here, there, change=lambda x, kind: x):
-    """Whether the reflectors of two scans are the same but for ``change`` of their parameters, in any order."""
+def assert_same_reflectors(here, there, change=lambda x, kind: x):
+    """Check that the reflectors of two scans are equal after ``change`` of their parameters, in any order."""
     assert (here.kind >= 0).sum() == (there.kind >= 0).sum()
     for k in np.flatnonzero(here.kind >= 0):
         wanted, plane = change(here.parameters[k].astype(float), here.kind[k]), here.kind[k] == kernels.PLANE
@@ -116,8 +116,8 @@ def same_reflectors(here, there, change=lambda x, kind: x):
     assert there.sigma == pytest.approx(here.sigma, rel=0.01)
 
 
-def permuted(scans, change):
-    """The scans with their paths' sensors changed."""
+def with_other_sensors(scans, change):
+    """The scans with the sensors of their paths replaced."""
     return [[(int(RING.path_index[tuple(change(RING.paths[k]) % RING.count)]), r) for k, r in scan] for scan in scans]
 
 
@@ -126,13 +126,13 @@ def permuted(scans, change):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [math.nan, 0.003])
-def test_every_echo_explains_itself_once_and_everything_is_finite(sigma):
+def test_every_echo_belongs_to_at_most_one_reflector_and_everything_is_finite(sigma):
     scans = scans_of_rooms(32, sigma=0.003, dropout=0.2, clutter=0.2)
-    found = explained(scans, sigma)
+    found = detected(scans, sigma)
     there = found.kind >= 0
     assert there.any(axis=1).all()
     assert (found.involved.sum(axis=1) <= 1).all()
-    real = np.arange(ROOM) < np.array([len(scan) for scan in scans])[:, None]
+    real = np.arange(SLOTS) < np.array([len(scan) for scan in scans])[:, None]
     assert not found.involved[np.broadcast_to(~real[:, None], found.involved.shape)].any()
     assert not found.involved[~there].any()
     assert (found.involved.sum(axis=-1)[there] >= 2).all(), "two parameters"
@@ -153,9 +153,9 @@ def test_every_echo_explains_itself_once_and_everything_is_finite(sigma):
         np.testing.assert_allclose(found.sigma, sigma, rtol=1e-6)
 
 
-def test_ends_of_walls_are_the_feet_of_their_outermost_sensors():
+def test_endpoints_of_walls_are_the_footpoints_of_their_outermost_sensors():
     scans = scans_of_rooms(16)
-    found = explained(scans)
+    found = detected(scans)
     middle = RING.position[RING.paths].mean(axis=1)
     for row, k in np.argwhere(found.kind == kernels.PLANE):
         rho, theta = found.parameters[row, k].astype(float)
@@ -165,11 +165,11 @@ def test_ends_of_walls_are_the_feet_of_their_outermost_sensors():
         np.testing.assert_allclose(found.segment[row, k], ends, atol=1e-4)
 
 
-def test_the_order_of_echoes_changes_nothing_but_the_order_of_columns(rng):
+def test_permuting_the_echoes_permutes_the_columns(rng):
     scans = scans_of_rooms(16, **PLAIN)
     orders = [rng.permutation(len(scan)) for scan in scans]
-    found = explained(scans, 0.001)
-    shuffled = explained([[scan[k] for k in order] for scan, order in zip(scans, orders, strict=True)], 0.001)
+    found = detected(scans, 0.001)
+    shuffled = detected([[scan[k] for k in order] for scan, order in zip(scans, orders, strict=True)], 0.001)
     np.testing.assert_array_equal(shuffled.kind, found.kind)
     there = found.kind >= 0
     np.testing.assert_allclose(shuffled.parameters[there], found.parameters[there], atol=1e-4)
@@ -177,9 +177,9 @@ def test_the_order_of_echoes_changes_nothing_but_the_order_of_columns(rng):
         np.testing.assert_array_equal(shuffled.involved[row][:, : len(order)], found.involved[row][:, order])
 
 
-def test_turning_the_robot_by_a_sensor_shifts_theta_and_nothing_else():
+def test_rotating_the_robot_by_one_sensor_shifts_theta_only():
     scans = scans_of_rooms(16, **PLAIN)
-    here, there = explained(scans, 0.001), explained(permuted(scans, lambda pair: pair - 1), 0.001)
+    here, there = detected(scans, 0.001), detected(with_other_sensors(scans, lambda pair: pair - 1), 0.001)
     pitch = 2 * math.pi / RING.count
     turn = np.array([[math.cos(pitch), math.sin(pitch)], [-math.sin(pitch), math.cos(pitch)]])
 
@@ -187,57 +187,57 @@ def test_turning_the_robot_by_a_sensor_shifts_theta_and_nothing_else():
         return x - [0, pitch] if kind == kernels.PLANE else turn @ x
 
     for scan in range(len(scans)):
-        same_reflectors(one_row(here, scan), one_row(there, scan), turned)
+        assert_same_reflectors(one_row(here, scan), one_row(there, scan), turned)
 
 
-def test_a_mirrored_room_is_explained_by_mirrored_reflectors():
+def test_a_mirrored_room_gives_mirrored_reflectors():
     scans = scans_of_rooms(16, **PLAIN)
-    here, there = explained(scans, 0.001), explained(permuted(scans, lambda pair: -pair), 0.001)
+    here, there = detected(scans, 0.001), detected(with_other_sensors(scans, lambda pair: -pair), 0.001)
     for scan in range(len(scans)):
-        same_reflectors(one_row(here, scan), one_row(there, scan), lambda x, kind: x * [1, -1])
+        assert_same_reflectors(one_row(here, scan), one_row(there, scan), lambda x, kind: x * [1, -1])
 
 
-def test_there_and_back_of_a_pair_can_be_told_in_either_order():
+def test_exchanging_transmitters_and_receivers_changes_nothing():
     scans = scans_of_rooms(16, **PLAIN)
-    here, there = explained(scans, 0.001), explained(permuted(scans, lambda pair: pair[::-1]), 0.001)
+    here, there = detected(scans, 0.001), detected(with_other_sensors(scans, lambda pair: pair[::-1]), 0.001)
     for scan in range(len(scans)):
-        same_reflectors(one_row(here, scan), one_row(there, scan))
+        assert_same_reflectors(one_row(here, scan), one_row(there, scan))
 
 
 @pytest.mark.parametrize("sigma", [math.nan, 0.003])
-def test_where_nothing_is_heard_nothing_stands(sigma):
+def test_a_scan_without_echoes_has_no_reflectors(sigma):
     nothing = [], [(0, math.nan)], [(k, 2.0) for k in range(30)], [(k, 5.0) for k in range(30)], [(3, 1.0)]
-    found = explained(list(nothing), sigma)
+    found = detected(list(nothing), sigma)
     assert (found.kind == -1).all()
     assert not found.involved.any()
     assert np.isfinite(found.probability).all()
     assert np.isfinite(found.sigma).all()
 
 
-def test_scans_of_a_batch_do_not_know_of_each_other():
+def test_scans_of_a_batch_are_independent():
     scans = scans_of_rooms(16, sigma=0.003, dropout=0.2, clutter=0.2)
-    together = explained(scans)
+    together = detected(scans)
     for row in (0, 7, 15):
-        alone = explained([scans[row]])
+        alone = detected([scans[row]])
         jax.tree.map(np.testing.assert_array_equal, one_row(alone, 0), one_row(together, row))
-    elsewhere = explained(scans[::-1])
+    elsewhere = detected(scans[::-1])
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[::-1]), together, elsewhere)
 
 
 def test_echoes_beyond_the_maximum_range_change_nothing():
     scans = scans_of_rooms(16)
-    more = [scan + [(k, 2.0 + 0.1 * k) for k in range(ROOM - len(scan))] for scan in scans]
-    here, there = explained(scans), explained(more)
+    more = [scan + [(k, 2.0 + 0.1 * k) for k in range(SLOTS - len(scan))] for scan in scans]
+    here, there = detected(scans), detected(more)
     assert not there.involved[:, :, max(map(len, scans)) :].any()
     jax.tree.map(np.testing.assert_array_equal, here, there)
 
 
-def test_compiles_once_whatever_is_heard():
-    explained([[]])
+def test_compiles_once_for_all_scans():
+    detected([[]])
     compiled: Any = kernels.detect_ml
     size = compiled._cache_size()
-    explained(scans_of_rooms(3), 0.002)
-    explained([[]] * 40)
+    detected(scans_of_rooms(3), 0.002)
+    detected([[]] * 40)
     assert compiled._cache_size() == size
 
 
@@ -250,9 +250,9 @@ def test_a_single_wall_is_exact_without_noise():
     scans = []
     for rho, theta in zip(distances, angles, strict=True):
         n, t = np.array([math.cos(theta), math.sin(theta)]), np.array([-math.sin(theta), math.cos(theta)])
-        scans += heard(Room(np.stack([rho * n - 40 * t, rho * n + 40 * t])[None]), ORIGIN)[0]
+        scans += simulated_scans(Room(np.stack([rho * n - 40 * t, rho * n + 40 * t])[None]), ORIGIN)[0]
     for sigma in (0.001, math.nan):
-        found = explained(scans, sigma)
+        found = detected(scans, sigma)
         assert (decided(found)[:, 0] == kernels.PLANE).all()
         assert (found.kind[:, 1:] == -1).all()
         assert (found.involved[:, 0].sum(axis=-1) == [len(scan) for scan in scans]).all()
@@ -261,15 +261,15 @@ def test_a_single_wall_is_exact_without_noise():
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.001])
-def test_a_corner_between_two_walls_is_a_point_and_no_line(sigma):
-    """In all directions, seen from all sides."""
+def test_a_corner_between_two_walls_is_a_point_not_a_line(sigma):
+    """In all directions and from all sides."""
     rng = np.random.default_rng(5)
     place, scans = [], []
     for seed in range(32):
         x, y, heading = *rng.uniform(-0.15, 0.15, 2), rng.uniform(-math.pi, math.pi)
-        scans += heard(CORNERED, [x, y, heading], sigma=sigma, seed=seed)[0]
+        scans += simulated_scans(CORNERED, [x, y, heading], sigma=sigma, seed=seed)[0]
         place.append((np.linalg.inv(oracles.matrix((x, y, heading))) @ [1.2, 1.0, 1])[:2])
-    found = explained(scans, max(sigma, 0.001))
+    found = detected(scans, max(sigma, 0.001))
     for scan, corner in enumerate(place):
         bearing = math.atan2(*corner[::-1])
         walls = reflectors_of(found, scan, kernels.PLANE)
@@ -285,19 +285,21 @@ def test_a_corner_between_two_walls_is_a_point_and_no_line(sigma):
         assert len(reflectors_of(found, scan, kernels.EDGE)) == 0
 
 
-def lone_poles(count, **options):
+def isolated_poles(count, **options):
     rng = np.random.default_rng(7)
     bearing, distance = rng.uniform(-math.pi, math.pi, count), rng.uniform(0.5, 1.6, count)
     place = distance[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
     loud = Acoustics(pole_strength=1.0)
     rooms = [Room(np.zeros((0, 2, 2)), poles=p[None]) for p in place]
-    return place, [heard(room, ORIGIN, acoustics=loud, seed=k, **options)[0][0] for k, room in enumerate(rooms)]
+    return place, [
+        simulated_scans(room, ORIGIN, acoustics=loud, seed=k, **options)[0][0] for k, room in enumerate(rooms)
+    ]
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.001, 0.003])
-def test_a_lone_pole_is_an_edge_there_and_never_a_corner_elsewhere(sigma):
-    place, scans = lone_poles(32, sigma=sigma)
-    found = explained(scans, max(sigma, 0.001))
+def test_an_isolated_pole_is_an_edge_and_never_a_corner_elsewhere(sigma):
+    place, scans = isolated_poles(32, sigma=sigma)
+    found = detected(scans, max(sigma, 0.001))
     kinds, many = decided(found), np.array([len(scan) for scan in scans]) >= 4
     assert many.sum() > 16
     assert (found.kind[many, 0] >= 0).all()
@@ -321,15 +323,15 @@ def image_range(line, tx, rx):
     return np.linalg.norm(image - rx, axis=-1) / 2
 
 
-def bound(line, paths, sigma):
-    """Cramer-Rao bound of a wall from first-order echoes, covariance, by numerical derivatives of the image source."""
+def cramer_rao_bound(line, paths, sigma):
+    """Cramer-Rao bound (covariance) of a wall from first-order echoes, by numerical derivatives of the range."""
     tx, rx = RING.position[paths.T]
     slopes = [(image_range(line + d, tx, rx) - image_range(line - d, tx, rx)) / 2e-6 for d in 1e-6 * np.eye(2)]
     return sigma**2 * np.linalg.inv(np.array(slopes) @ np.array(slopes).T)
 
 
 def wall_errors(found, came, scan, room, pose, sigma):
-    """Per wall with many first-order echoes the error (rho, theta) of its line, NaN without one, and its bound."""
+    """Error (rho, theta; NaN if not detected) and Cramer-Rao bound of each wall with many first-order echoes."""
     truth = np.stack(walls_in_robot_frame(room, pose), axis=-1)
     lines = reflectors_of(found, scan, kernels.PLANE)
     for wall in range(len(truth)):
@@ -341,16 +343,16 @@ def wall_errors(found, came, scan, room, pose, sigma):
         near = (np.abs(off) < [0.1, 0.26]).all(axis=1)
         yield (
             off[near][0] if near.sum() == 1 else np.full(2, np.nan),
-            bound(truth[wall], RING.paths[came.path[own]], sigma),
+            cramer_rao_bound(truth[wall], RING.paths[came.path[own]], sigma),
         )
 
 
-def test_covariances_are_those_of_the_errors():
-    """Monte Carlo: 320 scans of one place, three walls in view."""
+def test_covariances_agree_with_the_errors():
+    """Monte Carlo: 320 scans at one pose with three visible walls."""
     sigma, pose = 0.002, np.array([-0.1, 0.05, 0.3])
     poses = np.tile(pose, (320, 1))
-    scans, _ = heard(TRIANGLE, poses, sigma=sigma, seed=3)
-    found = explained(scans, sigma)
+    scans, _ = simulated_scans(TRIANGLE, poses, sigma=sigma, seed=3)
+    found = detected(scans, sigma)
     truth = np.stack(walls_in_robot_frame(TRIANGLE, pose), axis=-1)
     first = one_row(found, 0)
     walls = reflectors_of(found, 0, kernels.PLANE)
@@ -374,11 +376,11 @@ def test_covariances_are_those_of_the_errors():
     assert 1.7 < np.concatenate(nees).mean() < 2.3
 
 
-def test_walls_are_found_at_the_bound_of_their_ranges():
+def test_walls_are_estimated_at_the_cramer_rao_bound():
     sigma, errors, bounds = 0.001, [], []
-    for room, pose in some_rooms(8, **PLAIN, recess=0.0):
-        scans, came = heard(room, np.tile(pose, (32, 1)), sigma=sigma, seed=11)
-        found = explained(scans, sigma)
+    for room, pose in random_rooms(8, **PLAIN, recess=0.0):
+        scans, came = simulated_scans(room, np.tile(pose, (32, 1)), sigma=sigma, seed=11)
+        found = detected(scans, sigma)
         for scan in range(len(scans)):
             for error, cov in wall_errors(found, came, scan, room, pose, sigma):
                 errors.append(error)
@@ -394,43 +396,43 @@ def test_walls_are_found_at_the_bound_of_their_ranges():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.001, 0.003, 0.01])
-def test_noise_is_estimated(sigma):
-    found = explained(scans_of_rooms(32, sigma=sigma))
+def test_sigma_is_estimated(sigma):
+    found = detected(scans_of_rooms(32, sigma=sigma))
     assert np.median(found.sigma) == pytest.approx(sigma, rel=0.3)
 
 
 # other rings
 
 
-def roomy(ring):
-    """Arcs of a ring among deaf paths: the shape of all others, so that nothing is compiled anew.
+def padded_arcs(ring):
+    """Arcs of a ring, padded with paths that have no detection range, so that all rings share one compiled shape.
 
-    A path is deaf if its sensors look in opposite directions.
+    The two sensors of such a path face in opposite directions.
     """
     sensors = ring.sensors
-    deaf = PATHS - len(sensors.tx)
-    assert deaf >= 0
+    padding = PATHS - len(sensors.tx)
+    assert padding >= 0
 
-    def two_more(values, first, second):
+    def append_two(values, first, second):
         more = jnp.asarray(np.stack([first, second]), values.dtype)
         return jnp.concatenate([values, more])
 
     return kernels.ring_arcs(
         dataclasses.replace(
             sensors,
-            position=two_more(sensors.position, np.zeros(2), np.zeros(2)),
-            heading=two_more(sensors.heading, 0.0, math.pi),
-            beam=two_more(sensors.beam, 0.1, 0.1),
-            range_offset=two_more(sensors.range_offset, 0.0, 0.0),
-            tx=jnp.concatenate([sensors.tx, jnp.full(deaf, ring.count, sensors.tx.dtype)]),
-            rx=jnp.concatenate([sensors.rx, jnp.full(deaf, ring.count + 1, sensors.rx.dtype)]),
+            position=append_two(sensors.position, np.zeros(2), np.zeros(2)),
+            heading=append_two(sensors.heading, 0.0, math.pi),
+            beam=append_two(sensors.beam, 0.1, 0.1),
+            range_offset=append_two(sensors.range_offset, 0.0, 0.0),
+            tx=jnp.concatenate([sensors.tx, jnp.full(padding, ring.count, sensors.tx.dtype)]),
+            rx=jnp.concatenate([sensors.rx, jnp.full(padding, ring.count + 1, sensors.rx.dtype)]),
         ),
         settings=SETTINGS,
         points=POINTS,
     )
 
 
-STRANGE = {
+UNUSUAL_RINGS = {
     "corridor8": load_ring("corridor8"),
     "bumper": Ring(
         [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
@@ -448,13 +450,13 @@ STRANGE = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", STRANGE)
-def test_strange_rings_explain_what_they_hear(name):
-    ring = STRANGE[name]
+@pytest.mark.parametrize("name", UNUSUAL_RINGS)
+def test_unusual_rings_detect_reflectors(name):
+    ring = UNUSUAL_RINGS[name]
     scans = scans_of_rooms(16, ring=ring, sigma=0.002, clutter=0.1, dropout=0.1)
     assert any(scans)
     for sigma in (math.nan, 0.002):
-        found = explained(scans, sigma, roomy(ring))
+        found = detected(scans, sigma, padded_arcs(ring))
         there = found.kind >= 0
         assert (found.involved.sum(axis=1) <= 1).all()
         for field in ("parameters", "covariance", "evidence", "segment"):
@@ -463,15 +465,15 @@ def test_strange_rings_explain_what_they_hear(name):
         assert np.isfinite(found.sigma).all()
 
 
-def test_with_direct_echoes_alone_corner_and_edge_stay_open():
-    """To a path with one sensor both are the same."""
-    ring = STRANGE["direct echoes only"]
-    place, _ = lone_poles(32)
+def test_direct_echoes_alone_do_not_distinguish_corner_and_edge():
+    """On a direct path both have the same range."""
+    ring = UNUSUAL_RINGS["direct echoes only"]
+    place, _ = isolated_poles(32)
     scans = [
         [(path, reach) for _, path, reach in oracles.point_echoes(ring, np.zeros(3), pole, corner=False)]
         for pole in place
     ]
-    found = explained(scans, 0.001, roomy(ring))
+    found = detected(scans, 0.001, padded_arcs(ring))
     many = np.array([len(scan) for scan in scans]) >= 3
     there = found.kind[:, 0] >= 0
     assert (there & many).sum() > 0.8 * many.sum() > 8
@@ -482,12 +484,12 @@ def test_with_direct_echoes_alone_corner_and_edge_stay_open():
 
 
 @pytest.mark.slow
-def test_deaf_paths_are_deaf():
-    """Those that ``roomy`` adds: neither the threshold nor what is found is another."""
+def test_paths_without_a_detection_range_change_nothing():
+    """The padding of ``padded_arcs`` changes neither the threshold nor the detections."""
     ring = dataclasses.replace(RING, neighbors=2)
     scans = scans_of_rooms(16, ring=ring, **PLAIN)
     alone = kernels.ring_arcs(ring.sensors, settings=SETTINGS, points=POINTS)
-    assert float(roomy(ring).vote_threshold) == pytest.approx(float(alone.vote_threshold))
-    assert float(roomy(ring).full_wall_paths) == pytest.approx(float(alone.full_wall_paths))
-    found = explained(scans, 0.001, roomy(ring))
+    assert float(padded_arcs(ring).vote_threshold) == pytest.approx(float(alone.vote_threshold))
+    assert float(padded_arcs(ring).full_wall_paths) == pytest.approx(float(alone.full_wall_paths))
+    found = detected(scans, 0.001, padded_arcs(ring))
     assert (decided(found) == kernels.PLANE).any(axis=1).mean() > 0.8
