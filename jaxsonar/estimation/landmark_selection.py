@@ -77,7 +77,9 @@ def reclassify_points(found: AdjustmentResult, settings: LandmarkSelectionSettin
     return state._replace(landmark_map=state.landmark_map._replace(landmarks=landmarks, candidates=candidates))
 
 
-def remove_misfitting_points(state: AdjustmentState, found: AdjustmentResult, settings: GncSettings) -> AdjustmentState:
+def remove_misfitting_points(
+    state: AdjustmentState, found: AdjustmentResult, settings: LandmarkSelectionSettings = SETTINGS
+) -> AdjustmentState:
     """Remove the reflections of points whose echoes fit neither a corner nor an edge, such as two walls at an angle.
 
     Otherwise their residuals would increase the estimated noise, and the gate would admit more such echoes.

@@ -44,15 +44,15 @@ class LevenbergMarquardtSettings:
 class LeastSquares(Protocol[Point, Evaluation, Equations]):
     """A nonlinear least-squares problem with a structure of its own."""
 
-    def evaluate(self, point: Point) -> tuple[float, Evaluation]:
+    def evaluate(self, point: Point, /) -> tuple[float, Evaluation]:
         """The cost at a point, and whatever of its computation ``linearize`` can use again."""
         ...
 
-    def linearize(self, point: Point, evaluation: Evaluation) -> Equations:
+    def linearize(self, point: Point, evaluation: Evaluation, /) -> Equations:
         """The normal equations at a point."""
         ...
 
-    def step(self, point: Point, equations: Equations, damping: float) -> tuple[Point, float]:
+    def step(self, point: Point, equations: Equations, damping: float, /) -> tuple[Point, float]:
         """The next point with this damping, and the largest component of the step to it."""
         ...
 

@@ -145,7 +145,7 @@ class _Product(NamedTuple):
     first: int
     second: int
     term: Int[np.ndarray, " chosen"]
-    index: Int[np.ndarray, "_ _ _"]
+    entry: Int[np.ndarray, "_ _ _"]
     """Storage index of each entry, term by term; one index for all terms if they all depend on the same two blocks."""
 
 
@@ -214,7 +214,7 @@ class _SparseProblem:
             if (pair == pair[0]).all():
                 pair = pair[:1]
             base, row_stride, column_stride = (x[:, None, None] for x in structure.storage(pair[:, 0], pair[:, 1]))
-            rows, columns = (np.arange(sizes[block]) for block in pair[0])
+            rows, columns = (np.arange(int(sizes[block])) for block in pair[0])
             index = base + row_stride * rows[:, None] + column_stride * columns
             products.append(_Product(kind, first, second, term, index))
         return structure, products
@@ -252,9 +252,9 @@ class _SparseProblem:
             factors, term = evaluation[product.kind], product.term
             first = factors.jacobians[product.first][term] * factors.weight[term][..., None]
             second = factors.jacobians[product.second][term]
-            if len(product.index) < len(term):  # the same two blocks: the sum over all terms is one matrix product
+            if len(product.entry) < len(term):  # the same two blocks: the sum over all terms is one matrix product
                 first, second = (x.reshape(1, -1, x.shape[-1]) for x in (first, second))
-            index.append(product.index.ravel())
+            index.append(product.entry.ravel())
             values.append((np.swapaxes(first, 1, 2) @ second).ravel())
         matrix = np.bincount(np.concatenate(index), np.concatenate(values), minlength=structure.nnz)
         # 2. Their gradients.

@@ -1,4 +1,4 @@
-"""Sharpness of the accumulator: slopes, invariances, limits; and the calibration that climbs on it."""
+"""Focus measure of the accumulator: derivatives, invariances, limits; and the autofocus that maximises it."""
 
 import dataclasses
 
@@ -18,14 +18,14 @@ PARAMETERS = ("position", "heading", "range_offset", "range_scale")
 
 
 def scene(true, rng, count=20, **errors):
-    """What a ring hears in a random room: a log with true poses."""
+    """Scans of a random room with true poses."""
     room = random_room(rng)
     poses = np.stack([random_pose(rng, room) for _ in range(count)])
     return simulate(true, room, poses, seed=5, **errors).as_log(true, poses)
 
 
 def packed(log, *, dtype: type = np.float32, frame=(0.0, 0.0, 0.0)):
-    """All echoes of a log in one row, their poses seen from another frame."""
+    """All echoes of a log in one row, with their poses in another frame."""
     path = RING.path_index[log.tx, log.rx]
     x, y, turn = log.pose[log.echo_scan].T
     cos, sin = np.cos(frame[2]), np.sin(frame[2])
@@ -45,7 +45,7 @@ def score(sensors, echoes, settings=COARSE, width=1.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("world", [True, False])
-def test_slopes_agree_forward_in_reverse_and_with_finite_differences(rng, world):
+def test_forward_reverse_and_numerical_derivatives_agree(rng, world):
     log = scene(RING, rng, 3, sigma=0.002)
     with jax.enable_x64(True):
         echoes = packed(log, dtype=np.float64)
@@ -53,7 +53,7 @@ def test_slopes_agree_forward_in_reverse_and_with_finite_differences(rng, world)
             echoes = echoes._replace(pose=None)
         sensors = as_floats(RING.sensors, np.float64)
         given = {name: getattr(sensors, name) for name in PARAMETERS}
-        # Off the cells' borders, off the symmetry of the ring, and never one step from the rim of a detection range.
+        # Away from the edges of cells, from the symmetry of the ring, and from the edges of detection cones.
         given = {name: value + 1e-3 * rng.standard_normal(value.shape) for name, value in given.items()}
 
         @jax.jit
@@ -61,18 +61,18 @@ def test_slopes_agree_forward_in_reverse_and_with_finite_differences(rng, world)
             return score(dataclasses.replace(sensors, **values), echoes)
 
         reverse = jax.grad(of)(given)
-        slope = jax.jit(lambda way: jax.jvp(of, (given,), (way,))[1])
+        derivative = jax.jit(lambda direction: jax.jvp(of, (given,), (direction,))[1])
         for name in PARAMETERS:
-            way = {other: jnp.zeros_like(value) for other, value in given.items()}
-            way[name] = jnp.asarray(rng.standard_normal(given[name].shape))
-            ahead, behind = (of(jax.tree.map(lambda x, dx, h=h: x + h * dx, given, way)) for h in (1e-7, -1e-7))
-            forward = slope(way)
-            np.testing.assert_allclose(forward, jnp.sum(reverse[name] * way[name]), rtol=1e-9, atol=1e-9)
+            direction = {other: jnp.zeros_like(value) for other, value in given.items()}
+            direction[name] = jnp.asarray(rng.standard_normal(given[name].shape))
+            ahead, behind = (of(jax.tree.map(lambda x, dx, h=h: x + h * dx, given, direction)) for h in (1e-7, -1e-7))
+            forward = derivative(direction)
+            np.testing.assert_allclose(forward, jnp.sum(reverse[name] * direction[name]), rtol=1e-9, atol=1e-9)
             np.testing.assert_allclose(forward, (ahead - behind) / 2e-7, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.slow
-def test_single_precision_gives_what_double_gives(rng):
+def test_single_precision_agrees_with_double_precision(rng):
     log = scene(RING, rng, 3, sigma=0.002)
     single = score(as_floats(RING.sensors, np.float32), packed(log))
     assert single.dtype == jnp.float32
@@ -82,8 +82,8 @@ def test_single_precision_gives_what_double_gives(rng):
 
 
 @pytest.mark.slow
-def test_the_frame_of_the_world_is_free(rng):
-    """Exactly, by turns of whole cells; nearly, by other turns and shifts."""
+def test_the_focus_is_invariant_under_rigid_motions_of_the_world(rng):
+    """Exactly for rotations by whole cells, approximately for other rotations and for translations."""
     log = scene(RING, rng, 10, sigma=0.001)
     sensors = as_floats(RING.sensors, np.float32)
     fine = dataclasses.replace(COARSE, theta_cells=180, rho_cells=256, rho_cell=0.04)
@@ -94,7 +94,7 @@ def test_the_frame_of_the_world_is_free(rng):
 
 
 @pytest.mark.slow
-def test_order_and_padding_do_not_matter(rng):
+def test_order_and_padding_are_irrelevant(rng):
     log = scene(RING, rng, 3)
     echoes = packed(log)
     sensors = as_floats(RING.sensors, np.float32)
@@ -111,7 +111,7 @@ def test_order_and_padding_do_not_matter(rng):
 
 
 @pytest.mark.slow
-def test_no_echo_and_lines_beyond_the_accumulator_give_finite_slopes():
+def test_missing_echoes_and_lines_beyond_the_accumulator_have_finite_derivatives():
     sensors = as_floats(RING.sensors, np.float32)
     path, pose = jnp.zeros((1, 2), jnp.int32), jnp.zeros((1, 2, 3))
     tiny = dataclasses.replace(COARSE, rho_cells=6)
@@ -124,7 +124,7 @@ def test_no_echo_and_lines_beyond_the_accumulator_give_finite_slopes():
 
 
 @pytest.mark.slow
-def test_the_low_pass_keeps_votes_across_both_seams(rng):
+def test_the_low_pass_preserves_votes_across_both_seams(rng):
     votes = np.zeros((COARSE.theta_cells, COARSE.rho_cells), np.float32)
     votes[[0, 17, -1], [0, 2, 1]] = rng.uniform(1, 2, 3)
     smooth = blur(jnp.asarray(votes), jnp.asarray(1.0), COARSE)
@@ -133,12 +133,12 @@ def test_the_low_pass_keeps_votes_across_both_seams(rng):
     np.testing.assert_allclose(turned, np.roll(smooth, 7, axis=0), atol=1e-6)
 
 
-# The calibration
+# The autofocus
 
 
 @pytest.fixture(scope="module")
 def recovered():
-    """One sensor 20 mm off and a speed 2 % off: the given ring, the true one, and what focus makes of it."""
+    """One offset is wrong by 20 mm and the speed by 2 %: the given ring, the true one, the log, and the result."""
     rng = np.random.default_rng(7)
     given = dataclasses.replace(Ring.circular(), range_offset=0.004)
     offset = np.array(given.range_offset)
@@ -154,7 +154,7 @@ def relative_error(ring, true):
 
 
 @pytest.mark.slow
-def test_a_single_wrong_offset_and_a_wrong_speed_are_found(recovered):
+def test_a_wrong_offset_and_a_wrong_speed_are_found(recovered):
     given, true, _, found = recovered
     assert np.sqrt(np.mean(relative_error(found, true) ** 2)) < 0.003
     assert np.sqrt(np.mean(relative_error(found, true) ** 2)) < np.sqrt(np.mean(relative_error(given, true) ** 2)) / 2
@@ -162,7 +162,7 @@ def test_a_single_wrong_offset_and_a_wrong_speed_are_found(recovered):
 
 
 @pytest.mark.slow
-def test_the_mean_offset_stays_and_nothing_else_changes(recovered):
+def test_the_mean_offset_and_all_other_parameters_stay(recovered):
     given, _, _, found = recovered
     np.testing.assert_allclose(found.range_offset.mean(), given.range_offset.mean(), atol=1e-12)
     for name in ("position", "heading", "beam"):
@@ -171,17 +171,20 @@ def test_the_mean_offset_stays_and_nothing_else_changes(recovered):
 
 
 @pytest.mark.slow
-def test_a_ring_that_is_right_comes_back_as_it_is_and_so_does_one_in_clutter(recovered):
-    """No more is gained by moving than chance gives; the shapes are those of the first call."""
+def test_the_true_ring_is_returned_unchanged_and_clutter_changes_it_within_limits(recovered):
+    """Without an error, the gain does not exceed that of chance."""
     _, true, log, _ = recovered
     assert autofocus_ring(true, log, poses=True, speed=True) is true
     rng = np.random.default_rng(3)
     noise = dataclasses.replace(log, range=rng.uniform(0.3, 1.9, len(log.range)))
-    assert np.abs(autofocus_ring(true, noise, poses=True, speed=True).range_offset - true.range_offset).max() <= 0.05 + 1e-9
+    assert (
+        np.abs(autofocus_ring(true, noise, poses=True, speed=True).range_offset - true.range_offset).max()
+        <= 0.05 + 1e-9
+    )
 
 
 @pytest.mark.slow
-def test_the_same_log_gives_the_same_ring(recovered):
+def test_the_result_is_deterministic(recovered):
     given, _, log, found = recovered
     again = autofocus_ring(given, log, poses=True, speed=True)
     np.testing.assert_array_equal(again.range_offset, found.range_offset)
@@ -189,12 +192,12 @@ def test_the_same_log_gives_the_same_ring(recovered):
 
 
 @pytest.mark.slow
-def test_without_poses_the_speed_is_held_and_a_wrong_sensor_still_found(rng):
+def test_without_poses_the_speed_is_held_and_a_wrong_offset_is_found(rng):
     given = Ring.circular()
     offset = np.zeros(given.count)
     offset[3] = 0.02
     true = dataclasses.replace(given, range_offset=offset)
-    log = scene(true, rng, 32, sigma=0.001)  # half as many gain less than the parameters cost
+    log = scene(true, rng, 32, sigma=0.001)  # with half as many, the gain is smaller than the number of parameters
     unknown = dataclasses.replace(log, pose=np.full_like(log.pose, np.nan))
     found = autofocus_ring(given, unknown, poses=False, speed=False)
     assert found.speed_of_sound == given.speed_of_sound
@@ -202,7 +205,7 @@ def test_without_poses_the_speed_is_held_and_a_wrong_sensor_still_found(rng):
     np.testing.assert_allclose(found.range_offset.mean(), 0, atol=1e-12)
 
 
-def test_what_cannot_be_used_is_refused(rng):
+def test_invalid_input_is_refused(rng):
     log = scene(RING, rng, 2)
     unknown = dataclasses.replace(log, pose=np.full_like(log.pose, np.nan))
     with pytest.raises(SonarError, match="speed=True with poses=False"):

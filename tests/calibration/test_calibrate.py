@@ -1,4 +1,4 @@
-"""Calibration of rings from ordinary scans: what is found is true within what is said of it; its files and figures."""
+"""Calibration of rings: errors within the standard deviations, invariances, invalid input, files and figures."""
 
 import tomllib
 from dataclasses import replace
@@ -19,11 +19,11 @@ COUNT = 24
 FASTER = 1.01
 TURNED, BY = 7, np.radians(15.0)
 WIDER = 0.005
-Z = 4.0  # standard deviations; of 24 sensors one in 700 seeds is beyond
+Z = 4.0  # standard deviations; one of 24 sensors exceeds it in one of 700 seeds
 
 
-def heard(ring, seed=3, **options):
-    """What a ring hears in the office, with the true poses."""
+def office_log(ring, seed=3, **options):
+    """Scans of the office with the true poses."""
     office = load_office()
     options = {"sigma": SIGMA, "seed": seed, "stamps": office.stamps, **options}
     return simulate(ring, office.room, office.poses, **options).as_log(ring, office.poses)
@@ -36,14 +36,14 @@ def nominal():
 
 @pytest.fixture(scope="module")
 def true(nominal):
-    """Offsets of 5 mm, 0 in the mean, and a speed of sound 1 % higher."""
+    """Offset errors of 5 mm with mean 0, and a speed of sound that is 1 % higher."""
     offset = np.random.default_rng(101).normal(0, 0.005, COUNT)
     return replace(nominal, range_offset=offset - offset.mean(), speed_of_sound=FASTER * nominal.speed_of_sound)
 
 
 @pytest.fixture(scope="module")
 def log(true):
-    return heard(true)
+    return office_log(true)
 
 
 @pytest.fixture(scope="module")
@@ -51,60 +51,60 @@ def found(nominal, log):
     return calibrate(nominal, log)
 
 
-# With one mode only nothing is sharpened, and all of these are of one shape.
+# With one parameter group there is no autofocus, and all of these compile for the same shapes.
 
 
 @pytest.fixture(scope="module")
 def speed(nominal):
-    """Only the speed of sound is wrong, and free."""
+    """Only the speed of sound is wrong and estimated."""
     faster = replace(nominal, speed_of_sound=FASTER * nominal.speed_of_sound)
-    log = heard(faster, seed=5)
+    log = office_log(faster, seed=5)
     return log, faster, calibrate(nominal, log, free=("speed",))
 
 
 @pytest.fixture(scope="module")
 def wider(nominal):
-    """A ring of a larger radius than was thought."""
+    """A ring with a larger radius than the nominal one."""
     true = Ring.circular(radius=0.28 + WIDER)
-    return calibrate(nominal, heard(true, seed=8), free=("radius",))
+    return calibrate(nominal, office_log(true, seed=8), free=("radius",))
 
 
 @pytest.fixture(scope="module")
 def turned(nominal):
-    """One sensor looks 15 deg to the left of where it should."""
+    """The beam of one sensor is 15 deg to the left of its nominal heading."""
     heading = np.array(nominal.heading)
     heading[TURNED] += BY
-    return calibrate(nominal, heard(replace(nominal, heading=heading), seed=9), free=("heading",))
+    return calibrate(nominal, office_log(replace(nominal, heading=heading), seed=9), free=("heading",))
 
 
 @pytest.fixture(scope="module")
 def odometry(log):
-    """The way as odometry has it that slips by 2 %."""
+    """Poses from odometry with errors of 2 %."""
     rng, poses = np.random.default_rng(4), log.pose
     steps = relative(poses[:-1], poses[1:])
-    way = np.hypot(steps[:, 0], steps[:, 1])[:, None]
-    steps[:, :2] += 0.02 * way * rng.standard_normal((len(steps), 2))
-    steps[:, 2:] += 0.02 * (np.abs(steps[:, 2:]) + 0.5 * way) * rng.standard_normal((len(steps), 1))
-    way = [poses[0]]
+    distance = np.hypot(steps[:, 0], steps[:, 1])[:, None]
+    steps[:, :2] += 0.02 * distance * rng.standard_normal((len(steps), 2))
+    steps[:, 2:] += 0.02 * (np.abs(steps[:, 2:]) + 0.5 * distance) * rng.standard_normal((len(steps), 1))
+    trajectory = [poses[0]]
     for step in steps:
-        way.append(compose(way[-1], step))
-    return np.array(way)
+        trajectory.append(compose(trajectory[-1], step))
+    return np.array(trajectory)
 
 
 @pytest.fixture(scope="module")
 def estimated(nominal, log, odometry):
-    """Odometry instead of poses."""
+    """Calibration with odometry instead of poses."""
     return calibrate(nominal, replace(log, pose=odometry), poses="estimate")
 
 
 def relative_offsets(ring, true):
-    """How far the offsets are off, their mean left out."""
+    """Errors of the range offsets relative to their mean."""
     error = np.asarray(ring.range_offset) - np.asarray(true.range_offset)
     return error - error.mean()
 
 
-def known_to(found: Calibration, count=COUNT):
-    """The laws of every result."""
+def assert_consistent(found: Calibration, count=COUNT):
+    """Laws of every result."""
     covariance = found.covariance
     np.testing.assert_allclose(covariance, covariance.T, atol=1e-12 * covariance.max())
     assert np.linalg.eigvalsh((covariance + covariance.T) / 2).min() >= -1e-9 * covariance.max()
@@ -121,15 +121,15 @@ def known_to(found: Calibration, count=COUNT):
         np.testing.assert_array_equal(found.ring.range_offset, found.nominal.range_offset)
 
 
-# What may change
+# The parameter basis
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("poses_free", [False, True])
-def test_offset_modes_move_no_mean_and_have_the_spread_that_is_expected(nominal, poses_free):
-    modes = parameter_basis(nominal, PARAMETERS, poses_free=poses_free, speed_sd=0.02)
-    assert modes.columns.shape == (3 * COUNT + 1, len(modes.names))
-    of = {name: modes.columns[:, [name == other for other in modes.names]] for name in set(modes.names)}
+def test_offset_columns_keep_the_mean_and_have_the_prior_variance(nominal, poses_free):
+    basis = parameter_basis(nominal, PARAMETERS, poses_free=poses_free, speed_sd=0.02)
+    assert basis.columns.shape == (3 * COUNT + 1, len(basis.names))
+    of = {name: basis.columns[:, [name == other for other in basis.names]] for name in set(basis.names)}
     np.testing.assert_allclose(of["offset"][:COUNT].sum(axis=0), 0, atol=1e-15)
     spread = {name: np.sqrt((columns**2).sum(axis=1)) for name, columns in of.items()}
     np.testing.assert_allclose(
@@ -138,36 +138,36 @@ def test_offset_modes_move_no_mean_and_have_the_spread_that_is_expected(nominal,
         rtol=1e-12,
     )
     np.testing.assert_allclose(spread["speed"][COUNT], 0.02)
-    outward = modes.columns[COUNT + 1 :, modes.names.index("radius")].reshape(-1, 2)
+    outward = basis.columns[COUNT + 1 :, basis.names.index("radius")].reshape(-1, 2)
     np.testing.assert_allclose(np.linalg.norm(outward, axis=1), PRIOR.radius_sd)
     freedoms = 2 * COUNT - 3 * poses_free
     np.testing.assert_allclose((of["position"] ** 2).sum(), freedoms * PRIOR.position_sd**2)
     assert np.linalg.matrix_rank(of["position"]) == freedoms
 
 
-def test_with_free_poses_no_mode_is_a_motion_of_the_robot():
-    """Sensors anywhere: what all do together is no change of the ring."""
+def test_with_free_poses_no_column_is_a_motion_of_the_whole_ring():
+    """For arbitrary positions: a common motion of all sensors is a change of the robot frame."""
     place = np.random.default_rng(2).uniform(-0.5, 0.5, (7, 2))
     ring = Ring(place, np.zeros(7), beam=1.0, neighbors=1, max_range=2.0)
     columns = parameter_basis(ring, ("position",), poses_free=True, speed_sd=0.01).columns[8:]
     around = np.stack([-place[:, 1], place[:, 0]], axis=1)
     for motion in (np.tile([1.0, 0.0], (7, 1)), np.tile([0.0, 1.0], (7, 1)), around):
         np.testing.assert_allclose(motion.ravel() @ columns, 0, atol=1e-15)
-    # What is no motion stays: the projector is one.
+    # All other changes are kept: the columns are a projector.
     np.testing.assert_allclose(columns @ columns, PRIOR.position_sd * columns, atol=1e-17)
 
 
 @pytest.mark.slow
-def test_modes_that_are_held_leave_the_shape(nominal):
-    modes = parameter_basis(nominal, ("offset", "speed"), poses_free=False, speed_sd=0.01)
-    held = modes.only("offset")
-    assert held.columns.shape == modes.columns.shape
-    np.testing.assert_array_equal(held.columns[:, :COUNT], modes.columns[:, :COUNT])
+def test_holding_parameters_keeps_the_shape_of_the_basis(nominal):
+    basis = parameter_basis(nominal, ("offset", "speed"), poses_free=False, speed_sd=0.01)
+    held = basis.only("offset")
+    assert held.columns.shape == basis.columns.shape
+    np.testing.assert_array_equal(held.columns[:, :COUNT], basis.columns[:, :COUNT])
     np.testing.assert_array_equal(held.columns[:, COUNT:], 0)
 
 
 @pytest.mark.slow
-def test_what_cannot_be_free_is_refused(nominal):
+def test_invalid_parameters_are_refused(nominal):
     with pytest.raises(SonarError, match="free 'temper'; allowed are offset, speed, position, radius, heading"):
         check_parameters(("offset", "temper"))
     with pytest.raises(SonarError, match="nothing came"):
@@ -181,18 +181,18 @@ def test_what_cannot_be_free_is_refused(nominal):
 
 
 @pytest.mark.slow
-def test_offsets_and_speed_are_found_within_what_is_said_of_them(found, true):
+def test_offsets_and_speed_are_found_within_their_standard_deviations(found, true):
     error = relative_offsets(found.ring, true)
     assert np.abs(error / found.range_offset_sd).max() < Z
     assert np.sqrt(np.mean(error**2)) < 0.0006
     assert abs(float(found.ring.speed_of_sound - true.speed_of_sound)) < Z * found.speed_of_sound_sd
     assert found.speed_of_sound_sd < 0.001 * true.speed_of_sound
     assert np.sqrt(np.mean(found.range_offset_sd**2)) < 0.0005
-    known_to(found)
+    assert_consistent(found)
 
 
 @pytest.mark.slow
-def test_residuals_are_the_noise(found):
+def test_the_residuals_are_the_noise(found):
     assert found.rms == pytest.approx(SIGMA, rel=0.15)
     assert found.sigma == pytest.approx(SIGMA, rel=0.15)
     assert found.rms_before > 2 * SIGMA
@@ -201,7 +201,7 @@ def test_residuals_are_the_noise(found):
 
 
 @pytest.mark.slow
-def test_the_mean_offset_is_known_or_held_with_a_reason(found, true):
+def test_the_mean_offset_is_estimated_or_held_with_a_reason(found, true):
     mean = float(np.mean(found.ring.range_offset) - np.mean(true.range_offset))
     if "mean_offset" in found.held:
         assert found.mean_offset_sd == 0
@@ -213,7 +213,7 @@ def test_the_mean_offset_is_known_or_held_with_a_reason(found, true):
 
 
 @pytest.mark.slow
-def test_a_moved_and_turned_world_gives_the_same_ring(found, nominal, log):
+def test_the_ring_is_invariant_under_rigid_motions_of_the_world(found, nominal, log):
     motion = np.array([3.0, -7.0, 2.3])
     again = calibrate(nominal, replace(log, pose=compose(motion, log.pose)))
     np.testing.assert_allclose(relative_offsets(again.ring, found.ring), 0, atol=5e-5)
@@ -223,8 +223,8 @@ def test_a_moved_and_turned_world_gives_the_same_ring(found, nominal, log):
 
 
 @pytest.mark.slow
-def test_what_was_found_is_found_again_from_there(found, log):
-    """The result does not depend on where it began, but for what is expected of offsets: 3 cm."""
+def test_the_result_is_a_fixed_point(found, log):
+    """The result does not depend on the nominal ring, except for the prior of the offsets, 3 cm."""
     again = calibrate(found.ring, log)
     np.testing.assert_allclose(relative_offsets(again.ring, found.ring), 0, atol=5e-5)
     assert float(again.ring.speed_of_sound) == pytest.approx(float(found.ring.speed_of_sound), abs=0.02)
@@ -232,18 +232,18 @@ def test_what_was_found_is_found_again_from_there(found, log):
 
 
 @pytest.mark.slow
-def test_two_logs_tell_as_much_as_one(found, nominal, log):
-    """Every other scan in a log of its own: two worlds with fewer echoes each, so a little less is known."""
+def test_two_logs_yield_the_result_of_one(found, nominal, log):
+    """Even and odd scans in separate logs: two maps with fewer echoes each, so slightly larger standard deviations."""
     again = calibrate(nominal, [log[::2], log[1::2]])
     assert again.scans == found.scans
     assert again.echoes == found.echoes
     assert len(again.maps) == len(again.poses) == 2
     spread = np.hypot(again.range_offset_sd, found.range_offset_sd)
     assert np.abs(relative_offsets(again.ring, found.ring) / spread).max() < Z
-    known_to(again)
+    assert_consistent(again)
 
 
-# One at a time
+# One parameter group at a time
 
 
 @pytest.mark.slow
@@ -251,24 +251,24 @@ def test_the_speed_of_sound_is_found(speed):
     _, true, found = speed
     assert abs(float(found.ring.speed_of_sound - true.speed_of_sound)) < Z * found.speed_of_sound_sd
     assert found.speed_of_sound_sd < 0.0005 * true.speed_of_sound
-    known_to(found)
+    assert_consistent(found)
 
 
 @pytest.mark.slow
-def test_a_thermometer_is_one_more_measurement(nominal, speed):
-    """One that is 3 K off: precisions add up, and the result is the mean weighed by them."""
+def test_a_thermometer_is_an_additional_measurement(nominal, speed):
+    """With an error of 3 K: precisions add up, and the result is the mean weighted by them."""
     log, true, free = speed
     temperature = 273.15 * ((float(true.speed_of_sound) / 331.3) ** 2 - 1) + 3.0
-    told = calibrate(nominal, log, free=("speed",), temperature=temperature)
+    measured = calibrate(nominal, log, free=("speed",), temperature=temperature)
     logs = [np.log(float(speed)) for speed in (free.ring.speed_of_sound, nominal.speed_of_sound)]
     weight = (free.ring.speed_of_sound / free.speed_of_sound_sd) ** 2
     by_data = weight - PRIOR.speed_sd**-2
     value = (weight * logs[0] - PRIOR.speed_sd**-2 * logs[1]) / by_data
     both = by_data + PRIOR.measured_speed_sd**-2
     expected = (by_data * value + PRIOR.measured_speed_sd**-2 * np.log(speed_of_sound(temperature))) / both
-    sd = told.speed_of_sound_sd / float(told.ring.speed_of_sound)
+    sd = measured.speed_of_sound_sd / float(measured.ring.speed_of_sound)
     assert sd == pytest.approx(both**-0.5, rel=0.05)
-    assert abs(np.log(float(told.ring.speed_of_sound)) - expected) < 0.3 * sd
+    assert abs(np.log(float(measured.ring.speed_of_sound)) - expected) < 0.3 * sd
 
 
 @pytest.mark.slow
@@ -278,57 +278,58 @@ def test_a_larger_radius_is_found(wider):
     assert sd < 0.001
     outward = np.linalg.norm(np.asarray(wider.ring.position), axis=1)
     np.testing.assert_allclose(outward, radius, atol=1e-9)
-    known_to(wider)
+    assert_consistent(wider)
 
 
 @pytest.mark.slow
-def test_a_turned_sensor_is_found_by_what_it_hears(turned, nominal):
+def test_the_heading_of_a_rotated_sensor_is_found(turned, nominal):
     change = np.asarray(turned.ring.heading) - np.asarray(nominal.heading)
     expected = np.where(np.arange(COUNT) == TURNED, BY, 0)
     assert np.abs((change - expected) / turned.heading_sd).max() < Z
     assert abs(change[TURNED] - BY) < np.radians(5)
-    known_to(turned)
+    assert_consistent(turned)
 
 
-# Poses unknown
+# Unknown poses
 
 
 @pytest.mark.slow
-def test_poses_are_estimated_along(estimated, true):
+def test_offsets_and_speed_are_found_with_unknown_poses(estimated, true):
     error = relative_offsets(estimated.ring, true)
     assert np.sqrt(np.mean(error**2)) < 0.001
     assert np.abs(error / estimated.range_offset_sd).max() < Z
     assert abs(float(estimated.ring.speed_of_sound - true.speed_of_sound)) < Z * estimated.speed_of_sound_sd
     assert estimated.rms == pytest.approx(SIGMA, rel=0.2)
-    known_to(estimated)
+    assert_consistent(estimated)
 
 
 @pytest.mark.slow
-def test_the_estimated_way_is_nearer_to_the_truth_than_odometry(estimated, log, odometry):
+def test_the_estimated_trajectory_is_closer_to_the_truth_than_odometry(estimated, log, odometry):
     [poses] = estimated.poses
     known = np.isfinite(poses).all(axis=1)
     assert known.sum() >= 15
     first = np.flatnonzero(known)[0]
 
-    def off(way):
-        error = relative(*(compose(inverse(path[first]), path[known]) for path in (log.pose, way)))
+    def largest_errors(trajectory):
+        true, other = (compose(inverse(path[first]), path[known]) for path in (log.pose, trajectory))
+        error = relative(true, other)
         return np.hypot(error[:, 0], error[:, 1]).max(), np.abs(wrap_angle(error[:, 2])).max()
 
-    (estimated_way, estimated_turn), (way, turn) = off(poses), off(odometry)
-    assert estimated_way < 0.04
-    assert estimated_way < way / 2
-    assert estimated_turn < min(np.radians(1), turn / 2)
+    (position, heading), (odometry_position, odometry_heading) = largest_errors(poses), largest_errors(odometry)
+    assert position < 0.04
+    assert position < odometry_position / 2
+    assert heading < min(np.radians(1), odometry_heading / 2)
 
 
-# Refused
+# Invalid input
 
 
-def silent(scans=17):
+def log_without_echoes(scans=17):
     none = np.zeros(0, int)
     return Log.from_echoes(none, none, none, np.zeros(0), stamp=np.arange(float(scans)), pose=np.zeros((scans, 3)))
 
 
-def refused(match, *arguments, **options):
+def assert_refused(match, *arguments, **options):
     with pytest.raises(SonarError, match=match) as failure:
         calibrate(*arguments, **options)
     assert "\n" not in str(failure.value)
@@ -337,30 +338,30 @@ def refused(match, *arguments, **options):
 @pytest.mark.slow
 def test_a_ring_with_half_the_speed_of_sound_is_refused(nominal, log):
     half = replace(nominal, speed_of_sound=nominal.speed_of_sound / 2)
-    refused("speed_of_sound 171.6 m/s; allowed is that of air, 290 to 380", half, log)
+    assert_refused("speed_of_sound 171.6 m/s; allowed is that of air, 290 to 380", half, log)
 
 
 @pytest.mark.slow
 def test_ranges_that_are_whole_path_lengths_are_refused(nominal, log):
-    refused("allowed|needed", nominal, replace(log, range=2 * log.range), free=("speed",))
+    assert_refused("allowed|needed", nominal, replace(log, range=2 * log.range), free=("speed",))
 
 
 @pytest.mark.slow
-def test_a_log_without_poses_is_not_to_be_trusted(nominal, log):
+def test_a_log_without_poses_is_refused_if_poses_are_trusted(nominal, log):
     unknown = replace(log, pose=np.full_like(log.pose, np.nan))
-    refused("0 of 17 scans have a pose; allowed are 3 or more", nominal, unknown, free=("speed",))
-    refused("pose", nominal, unknown)
+    assert_refused("0 of 17 scans have a pose; allowed are 3 or more", nominal, unknown, free=("speed",))
+    assert_refused("pose", nominal, unknown)
     two = replace(log, pose=np.where(np.arange(17)[:, None] < 2, log.pose, np.nan))
-    refused("2 of 17 scans have a pose", nominal, two, free=("speed",))
+    assert_refused("2 of 17 scans have a pose", nominal, two, free=("speed",))
 
 
 @pytest.mark.slow
 def test_a_log_without_walls_is_refused(nominal, log):
-    refused("no wall found", nominal, silent(), free=("speed",))
-    refused("allowed", nominal, silent())
+    assert_refused("no wall found", nominal, log_without_echoes(), free=("speed",))
+    assert_refused("allowed", nominal, log_without_echoes())
     rng = np.random.default_rng(1)
     clutter = replace(log, range=rng.uniform(0.3, 1.9, len(log.range)))
-    refused("no wall|no echo fits|explain", nominal, clutter, free=("speed",))
+    assert_refused("no wall|no echo fits|explain", nominal, clutter, free=("speed",))
 
 
 @pytest.mark.slow
@@ -378,20 +379,20 @@ def test_a_log_without_walls_is_refused(nominal, log):
         ({"window": -1.0}, "window"),
     ],
 )
-def test_choices_that_are_none_are_refused(nominal, log, options, match):
-    refused(match, nominal, log, **options)
+def test_invalid_options_are_refused(nominal, log, options, match):
+    assert_refused(match, nominal, log, **options)
 
 
 @pytest.mark.slow
 def test_no_log_is_refused(nominal):
-    refused("no log came", nominal, [])
+    assert_refused("no log came", nominal, [])
 
 
-# Told
+# Output
 
 
 @pytest.mark.slow
-def test_the_file_is_a_ring_and_says_how_well_it_is_known(found, tmp_path):
+def test_the_file_contains_the_ring_and_its_standard_deviations(found, tmp_path):
     path = tmp_path / "ring.toml"
     save_calibration(found, path)
     again = load_ring(path)
@@ -405,8 +406,8 @@ def test_the_file_is_a_ring_and_says_how_well_it_is_known(found, tmp_path):
     )  # fmt: skip
     np.testing.assert_allclose(table["range_offset_sd"], found.range_offset_sd, atol=1e-8)
     np.testing.assert_allclose(table["speed_of_sound_sd"], found.speed_of_sound_sd, atol=1e-8)
-    told = [table[name] for name in ("sigma", "residual_rms_before", "residual_rms_after")]
-    np.testing.assert_allclose(told, [found.sigma, found.rms_before, found.rms], atol=1e-8)
+    noise = [table[name] for name in ("sigma", "residual_rms_before", "residual_rms_after")]
+    np.testing.assert_allclose(noise, [found.sigma, found.rms_before, found.rms], atol=1e-8)
     assert ("mean_offset_sd" in table) != ("mean_offset" in table["held"])
     assert {"position", "radius", "heading"} <= set(table["held"])
     for pair in table["correlations"]:
@@ -415,7 +416,7 @@ def test_the_file_is_a_ring_and_says_how_well_it_is_known(found, tmp_path):
 
 
 @pytest.mark.slow
-def test_each_parameter_has_its_keys(wider, turned, tmp_path):
+def test_each_parameter_group_has_its_keys(wider, turned, tmp_path):
     tables = []
     for one in (wider, turned):
         save_calibration(one, tmp_path / "one.toml")
@@ -430,7 +431,7 @@ def test_each_parameter_has_its_keys(wider, turned, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_summary_says_what_was_found(found, wider):
+def test_the_summary_names_the_results(found, wider):
     lines = found.summary()
     assert all("\n" not in line for line in lines)
     assert "17 scans" in lines[0]

@@ -77,7 +77,7 @@ def test_dense_solvers_find_the_same(rng, odometry, odometry_scale):
     by_scipy = least_squares(
         lambda x: np.asarray(dense_residuals(unravel(jnp.asarray(x)), problem)),
         np.asarray(flat),
-        jac=lambda x: np.asarray(dense_jacobian(unravel(jnp.asarray(x)), problem)),
+        jac=lambda x: np.asarray(dense_jacobian(unravel(jnp.asarray(x)), problem)),  # pyright: ignore[reportArgumentType]
         xtol=1e-12,
     )
     assert_same(found.unknowns, unravel(jnp.asarray(by_scipy.x)), atol=1e-6)
