@@ -12,7 +12,7 @@ from jaxsonar.detection.ml_detector import ml_detections
 from jaxsonar.detection.settings import hough_settings
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.geometry.se2 import tangent_of, unit
-from jaxsonar.kernels.measurement_model import PredictionTable, predict_all_echoes
+from jaxsonar.kernels.measurement_model import predict_all_echoes
 from jaxsonar.mapping.build_map import build_map
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
@@ -144,18 +144,18 @@ def scene_from_map(ring: Ring, log: Log) -> ReferenceScene:
 
 def predict_reports(
     ring: Ring, scene: ReferenceScene, block: slice
-) -> tuple[PredictionTable, Float[np.ndarray, "block reflectors paths"]]:
+) -> tuple[Any, Float[np.ndarray, "block reflectors paths"]]:
     """Predicted echoes of all paths from all reflectors in a block of scans.
 
     Returns:
-        The predictions, as NumPy arrays, and the ranges that the paths would report, metres.
+        A ``PredictionTable`` of NumPy arrays, and the ranges that the paths would report, metres.
     """
     size = block.stop - block.start
     padding = ((0, SETTINGS.reference.block_scans - size), (0, 0))
     kind = np.pad(scene.kind[block], padding, constant_values=-1)
     parameters = np.pad(scene.parameters[block], (*padding, (0, 0)))
-    predicted = predict_all_echoes(ring.echo_paths, kind.astype(np.int32), parameters.astype(np.float32))
-    predicted: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[:size], predicted)
+    padded = predict_all_echoes(ring.echo_paths, kind.astype(np.int32), parameters.astype(np.float32))
+    predicted: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[:size], padded)
     scale = REFERENCE_SPEED_OF_SOUND / float(ring.speed_of_sound)
     return predicted, predicted.range * scale + np.asarray(ring.echo_paths.range_offset, np.float64)
 

@@ -112,8 +112,8 @@ def inverse_sensor_model(
     depth = distance * np.cos(np.maximum(off_axis - half_width, 0))
     occluded = unexplained & (depth > first_echo + tolerance)
     counts = np.zeros((len(LAYERS), size, size), int)
-    for layer, chosen in zip(counts, (free, occluded, arcs), strict=False):
-        layer.flat = np.bincount(cell[chosen], minlength=size**2)
+    for layer, chosen in enumerate((free, occluded, arcs)):
+        counts[layer] = np.bincount(cell[chosen], minlength=size**2).reshape(size, size)
     free_layer, _, _, wall_layer, footprint_layer = counts
     column, row = (walls.cells - corner).T
     free_layer[row, column] = 0

@@ -81,7 +81,7 @@ def explained_by_walls(
     distance, off_axis = _range_and_angle(position, heading, np.concatenate([foot, points], axis=1))
     match = np.concatenate([on_wall, np.ones(points.shape[:2], bool)], axis=1)
     match &= np.abs(distance - first_echo[:, None]) <= SETTINGS.explained
-    return (match & (off_axis <= half_width[:, None] + SETTINGS.beyond_cone)).any(axis=1)
+    return np.any(match & (off_axis <= half_width[:, None] + SETTINGS.beyond_cone), axis=1)
 
 
 def estimate_extensions(

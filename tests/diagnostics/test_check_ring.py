@@ -1,6 +1,6 @@
-"""The health report: healthy rings get no findings, faults of simulated rings are named, and what is measured is right.
+"""The health check: no findings for healthy rings, the right findings for simulated faults, accurate measurements.
 
-All logs have at most 32 scans, so that little is compiled.
+All logs have at most 32 scans, so that few programs are compiled.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ SIGMA = 0.002
 
 
 def log_of(seed, ring=RING, scans=24):
-    """Scans of a random room without poses; the ring as it truly is."""
+    """Scans of a random room without poses, by the true ring."""
     rng = np.random.default_rng(seed)
     room = random_room(rng)
     poses = np.array([random_pose(rng, room) for _ in range(scans)])
@@ -33,7 +33,7 @@ def log_of(seed, ring=RING, scans=24):
     return came.as_log(ring, np.full((scans, 3), np.nan))
 
 
-def renamed(log, place):
+def renumbered(log, place):
     return dataclasses.replace(log, tx=place[log.tx], rx=place[log.rx])
 
 
@@ -69,7 +69,7 @@ def test_a_healthy_ring_has_no_findings(log, healthy):
     assert 0.5 * SIGMA < healthy.sigma < 3 * SIGMA
 
 
-def test_the_cones_are_as_wide_as_they_were_simulated(healthy):
+def test_the_measured_cones_have_the_simulated_width(healthy):
     width, error = np.degrees(healthy.beam)
     assert abs(width - 60) < 3
     assert error < 3
@@ -80,38 +80,38 @@ def test_the_cones_are_as_wide_as_they_were_simulated(healthy):
 def test_swapped_sensors_are_named(log, pair):
     place = np.arange(24)
     place[list(pair)] = pair[::-1]
-    found = check(RING, renamed(log, place))
+    found = check(RING, renumbered(log, place))
     assert (found.place == place).all()
     assert found.findings[0].startswith(f"sensors {pair[0]} and {pair[1]} look swapped")
     assert found.remarks[pair[0]] == f"swapped with {pair[1]}"
     assert sum(map(bool, found.remarks)) == 2
 
 
-def test_a_swap_is_told_from_its_mirror_image():
-    """In the office all poses look alike: as recorded, (4, 8) fits better than the (5, 7) that were exchanged."""
+def test_a_swap_is_distinguished_from_its_mirror_image():
+    """In the office the poses are similar: with the original walls, (4, 8) fits better than the true (5, 7)."""
     office = load_office()
     heard = simulate(office.ring, office.room, office.poses, sigma=0.001, stamps=office.stamps)
     place = np.arange(24)
     place[[5, 7]] = 7, 5
-    found = check(office.ring, renamed(heard.as_log(office.ring, office.poses), place))
+    found = check(office.ring, renumbered(heard.as_log(office.ring, office.poses), place))
     assert (found.place == place).all()
     assert len(found.findings) == 1
 
 
-def test_a_log_renamed_gives_the_same_figures_renamed(log, healthy):
-    """Where the exchange is found, all else is as if nothing had been exchanged."""
+def test_renumbered_sensors_give_the_renumbered_results(log, healthy):
+    """If the exchange is found, the other results are the same as without it."""
     place = np.arange(24)
     place[[3, 15]] = 15, 3
-    found = check(RING, renamed(log, place))
+    found = check(RING, renumbered(log, place))
     np.testing.assert_array_equal(found.heard, healthy.heard[place])
     np.testing.assert_array_equal(found.offset, healthy.offset[place])
     np.testing.assert_array_equal(found.direct, healthy.direct[place])
 
 
-def test_three_sensors_in_a_circle_are_permuted(log):
+def test_a_cyclic_exchange_of_three_sensors_is_named(log):
     place = np.arange(24)
     place[[2, 9, 16]] = 9, 16, 2
-    found = check(RING, renamed(log, place))
+    found = check(RING, renumbered(log, place))
     assert found.findings[0].startswith("sensors 2, 16 and 9 look permuted")
 
 
@@ -123,7 +123,7 @@ def test_a_dead_sensor_is_named(log):
 
 
 @pytest.mark.slow
-def test_deaf_and_mute_sensors_are_told_apart(log):
+def test_deaf_and_mute_sensors_are_distinguished(log):
     deaf = check(RING, only(log, log.rx != 11))
     mute = check(RING, only(log, log.tx != 11))
     assert not deaf.heard[11, 2]
@@ -134,7 +134,7 @@ def test_deaf_and_mute_sensors_are_told_apart(log):
     assert mute.remarks[11] == "mute"
 
 
-def test_an_offset_is_named_and_the_neighbors_are_not_blamed():
+def test_an_offset_is_attributed_to_its_sensor_only():
     offset = np.zeros(24)
     offset[3] = 0.01
     found = check(RING, log_of(7, dataclasses.replace(RING, range_offset=offset)))
@@ -161,7 +161,7 @@ def test_a_stuck_sensor_is_named(log):
 
 
 @pytest.mark.slow
-def test_no_echo_and_no_wall_say_why(log, rng):
+def test_the_reason_for_missing_walls_is_reported(log, rng):
     silent = check(RING, only(log, log.tx < 0))
     far = check(RING, dataclasses.replace(log, range=log.range + 3))
     assert silent.empty == "no scan heard anything"
@@ -178,8 +178,8 @@ def test_no_echo_and_no_wall_say_why(log, rng):
         health_figure(found)
 
 
-def test_echoes_left_out_are_told(log):
-    """As of a device that listens to more neighbors than the ring says."""
+def test_left_out_echoes_are_reported(log):
+    """For a device that listens to more neighbors than the ring specifies."""
     seen, told, far = [], [], np.flatnonzero(log.tx == log.rx)[::4]
     index = np.insert(log.echo_scan, far, log.echo_scan[far])
     tx, rx = np.insert(log.tx, far, log.tx[far]), np.insert(log.rx, far, (log.rx[far] + 4) % 24)
@@ -212,7 +212,7 @@ def test_json_table_and_figure(healthy, tmp_path):
 
 @pytest.mark.slow
 def test_predicted_echoes_are_those_of_the_image_source(rng):
-    """Ranges by mirrored receivers, angles from the sound's way to the mirror image."""
+    """Ranges from images of the receivers, angles from the direction to the image."""
     ring = Ring.circular(neighbors=2)
     rho, theta = rng.uniform(0.5, 1.5, 8), rng.uniform(-np.pi, np.pi, 8)
     parameters = np.stack([rho, theta], axis=-1)[:, None].astype(np.float32)
@@ -233,7 +233,7 @@ def test_predicted_echoes_are_those_of_the_image_source(rng):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("half", [10.0, 25.0, 45.0])
-def test_cones_are_found_in_drawn_sightings(rng, half):
+def test_the_cone_fit_recovers_the_true_cone(rng, half):
     truth = np.array([np.radians(half), np.radians(2), 0.85, 0.03])
     asked = np.full(len(BIN_CENTRES), 60)
     answered = rng.binomial(asked, detection_probability(truth, BIN_CENTRES))
@@ -243,7 +243,7 @@ def test_cones_are_found_in_drawn_sightings(rng, half):
     assert np.isnan(fit_cone(asked // 60, answered // 60)[1])
 
 
-def test_a_cone_that_looks_aside_is_found(rng):
+def test_a_turned_cone_is_found(rng):
     truth = np.array([np.radians(30), np.radians(2), 0.9, 0.02])
     asked = np.full((3, len(BIN_CENTRES)), 5)
     turn = np.radians([0.0, 12.0, -9.0])[:, None]
@@ -253,8 +253,8 @@ def test_a_cone_that_looks_aside_is_found(rng):
     assert (np.abs(half[:, 0] - truth[0]) < 4 * half[:, 1]).all()
 
 
-def test_offsets_lose_what_walls_can_absorb():
-    """Of offsets that explain the same, the one with the fewest sensors off."""
+def test_the_gauge_of_offsets_is_sparse():
+    """Of equivalent offsets, the ones with the fewest sensors off."""
     angle = 2 * np.pi * np.arange(24) / 24
     modes = np.stack([np.ones(24), np.cos(angle), np.sin(angle)], axis=-1)
     frame = np.linalg.qr(np.concatenate([modes, np.eye(24)], axis=1))[0]

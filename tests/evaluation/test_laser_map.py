@@ -1,4 +1,4 @@
-"""References from a laser: walls of rooms whose truth is known, ray-cast by shapely; the recorded corridor."""
+"""Reference maps from a laser: simulated rooms (ray casting by shapely), and the recorded corridor."""
 
 import math
 
@@ -51,10 +51,10 @@ def path(count=30):
     return np.stack([np.linspace(0.8, 5.2, count), np.full(count, 1.2), np.linspace(-0.5, 0.5, count)], axis=-1)
 
 
-# ---- one scan
+# --- a single scan ---
 
 
-def test_a_rectangle_is_four_walls_and_four_corners():
+def test_a_rectangle_gives_four_walls_and_four_corners():
     walls = loop([[0, 0], [5, 0], [5, 3], [0, 3]])
     pose = np.array([1.7, 1.1, 0.3])
     model = polygonal_model(AROUND, cast(walls, pose, AROUND))
@@ -67,7 +67,7 @@ def test_a_rectangle_is_four_walls_and_four_corners():
     assert (((np.array([2.5, 1.5]) - found[:, 0]) * inward).sum(axis=-1) > 0).all()  # free space to the left
 
 
-def test_what_hides_behind_an_edge_is_a_pseudo_segment():
+def test_an_occlusion_gives_a_pseudo_segment():
     walls = loop([[0, 0], [6, 0], [6, 4], [3, 4], [3, 2], [0, 2]])  # an L: the leg hides a part of the hall
     pose = np.array([1.0, 1.0, 0.0])
     model = polygonal_model(HALF, cast(walls, pose, HALF))
@@ -78,7 +78,7 @@ def test_what_hides_behind_an_edge_is_a_pseudo_segment():
     assert abs(np.linalg.det(np.stack([start - edge, pose[:2] - edge]))) < 0.1  # along the line of sight
 
 
-def test_a_model_turns_with_the_laser():
+def test_the_model_is_equivariant_under_rotations():
     walls, pose = loop(HALL), np.array([1.2, 1.3, 0.4])
     one = polygonal_model(AROUND, cast(walls, pose, AROUND))
     step = AROUND[1] - AROUND[0]
@@ -91,7 +91,7 @@ def test_a_model_turns_with_the_laser():
 
 
 @pytest.mark.parametrize("ranges", [np.full(361, np.nan), np.where(np.arange(361) == 7, 1.0, np.nan)])
-def test_nothing_to_see_is_no_model(ranges):
+def test_no_returns_give_an_empty_model(ranges):
     model = polygonal_model(HALF, ranges)
     assert len(model.segments) == len(model.pseudo) == len(model.intersections) == 0
 
@@ -117,17 +117,17 @@ def test_the_fit_is_total_least_squares(rng):
         (HALF, np.full(361, np.inf), "infinite"),
     ],
 )
-def test_no_laser_scan_is_refused(bearing, ranges, words):
+def test_invalid_laser_scans_are_refused(bearing, ranges, words):
     with pytest.raises(SonarError, match=words) as caught:
         polygonal_model(bearing, ranges)
     assert "allowed are" in str(caught.value)
 
 
-# ---- a run
+# --- a whole run ---
 
 
 @pytest.mark.parametrize(("noise", "tolerance"), [(0.0, 0.002), (0.01, 0.006)])
-def test_a_hall_with_a_recess_is_its_walls(noise, tolerance, rng):
+def test_the_walls_of_a_hall_with_a_recess_are_found(noise, tolerance, rng):
     truth = loop(HALL)
     walls = reference_map(drive(truth, path(), noise=noise, rng=rng))
     result = evaluate(walls, truth)
@@ -140,7 +140,7 @@ def test_a_hall_with_a_recess_is_its_walls(noise, tolerance, rng):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_random_rooms_within_millimetres(seed):
+def test_random_rooms_are_accurate_to_millimetres(seed):
     rng = np.random.default_rng(seed)
     room = random_room(rng, box=0.0, segment=0.0, pole=0.0)
     poses = np.array([random_pose(rng, room) for _ in range(20)])
@@ -173,7 +173,7 @@ def test_both_faces_of_a_thin_wall():
     np.testing.assert_allclose(np.sort(walls[:, :, 1].mean(axis=1)), [0, 0.12], atol=0.002)
 
 
-def test_what_few_scans_saw_is_left_out():
+def test_walls_that_few_scans_saw_are_left_out():
     hall = loop(HALL)
     laser = drive(hall, path())
     person = np.array([[[3.0, 1.5], [3.5, 1.6]]])
@@ -184,7 +184,7 @@ def test_what_few_scans_saw_is_left_out():
     assert evaluate(seen, hall).precision == 1
 
 
-def test_a_run_that_sees_nothing():
+def test_a_run_without_returns():
     laser = drive(loop(HALL), path(4))
     nothing = np.full_like(laser.ranges, np.nan)
     assert reference_map(LaserRecording(laser.stamp, laser.pose, nothing, laser.bearing, MOUNT)).shape == (0, 2, 2)
@@ -194,7 +194,7 @@ def test_a_run_that_sees_nothing():
 
 
 def test_the_recorded_corridor():
-    """Two parallel walls, normals 91.4 and 270.0 deg, 1.220 and 1.083 m from the start, with doors and recesses."""
+    """Two parallel walls with doors and recesses; normals 91.4 and 270.0 deg, 1.220 and 1.083 m from the start."""
     walls = reference_map(read_corridor8_laser(recorded("corridor8")))
     along = walls[:, 1] - walls[:, 0]
     length = np.linalg.norm(along, axis=1)

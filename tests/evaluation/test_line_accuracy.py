@@ -1,4 +1,4 @@
-"""Matching against all permutations, bounds against noise and slopes, and hand-made lines in a rectangle."""
+"""Matching against all permutations, bounds against numerical derivatives and noise, and lines in a rectangle."""
 
 import itertools
 from dataclasses import fields
@@ -25,14 +25,14 @@ POSES = np.array([[0.3, 0.1, 0.2], [0.0, 0.2, -2.9], [1.3, -0.1, 1.0], [0.4, 0.6
 
 
 def distance(line, wall):
-    """In gates; infinite beyond them. One pair at a time, as one would say it."""
+    """Distance of one pair in units of the gates; infinite beyond them."""
     turn = abs(oracles.wrap(line[1] - wall[1])) / GATES.gate_theta
     apart = abs(line[0] - wall[0]) / GATES.gate_rho
     return float(np.hypot(turn, apart)) if turn <= 1 and apart <= 1 else np.inf
 
 
 def best_by_trying(found, truth):
-    """Number of pairs and their cost, the best of all assignments of lines to walls or to nothing."""
+    """Oracle: number of pairs and cost of the best of all assignments."""
     best = (0, 0.0)
     for choice in itertools.product([None, *range(len(truth))], repeat=len(found)):
         taken = [wall for wall in choice if wall is not None]
@@ -43,7 +43,7 @@ def best_by_trying(found, truth):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 5), st.integers(0, 4))
-def test_matches_are_as_many_then_as_near_as_can_be(seed, lines, walls):
+def test_matches_are_optimal(seed, lines, walls):
     rng = np.random.default_rng(seed)
     # Close together and around the seam of theta, so that gates overlap and lines compete.
     truth = np.stack([rng.uniform(1, 1.2, walls), oracles.wrap(np.pi + rng.uniform(-0.4, 0.4, walls))], axis=-1)
@@ -74,12 +74,12 @@ def test_gates():
     assert matches([(1.0, oracles.wrap(3.1 + np.pi))], wall) == []
 
 
-def test_walls_that_are_not_there_match_nothing():
+def test_nan_matches_nothing():
     assert matches([(1.0, 0.0), (2.0, 0.0)], [(np.nan, np.nan), (2.0, 0.0)]) == [(1, 1)]
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-10, 10))
-def test_turning_everything_changes_no_match(seed, turn):
+def test_matches_are_invariant_under_rotations(seed, turn):
     rng = np.random.default_rng(seed)
     found = np.stack([rng.uniform(0.5, 0.8, 5), rng.uniform(-np.pi, np.pi, 5)], axis=-1)
     truth = found[::-1][:3] + rng.uniform(-0.09, 0.09, (3, 2))
@@ -88,7 +88,7 @@ def test_turning_everything_changes_no_match(seed, turn):
 
 
 def image_ranges(line, tx, rx):
-    """Half path lengths over a wall by the mirror image of each transmitter, one after the other."""
+    """Ranges of a wall by the image of each transmitter."""
     n = np.array([np.cos(line[1]), np.sin(line[1])])
     return np.array([np.linalg.norm(t + 2 * (line[0] - t @ n) * n - r) / 2 for t, r in zip(tx, rx, strict=True)])
 
@@ -101,7 +101,7 @@ def wall_seen_by(ring, rho, theta):
 
 @pytest.mark.parametrize("theta", [-3.0, -1.234, 0.0, 0.7, 2.2])
 @pytest.mark.parametrize("rho", [0.45, 1.0, 1.8])
-def test_bound_is_the_inverse_of_the_information(faw_ring, rho, theta):
+def test_bound_is_the_inverse_of_the_fisher_information(faw_ring, rho, theta):
     tx, rx = wall_seen_by(faw_ring, rho, theta)
     line, step, sigma = np.array([rho, theta]), 1e-6, 0.003
     slopes = [
@@ -113,8 +113,8 @@ def test_bound_is_the_inverse_of_the_information(faw_ring, rho, theta):
 
 
 @pytest.mark.slow
-def test_bound_is_that_of_the_kernels_geometry(faw_ring):
-    """The Fisher information once more, from derivatives of the kernel that predicts ranges."""
+def test_bound_agrees_with_the_kernel(faw_ring):
+    """The Fisher information from derivatives of the kernel that predicts ranges."""
     line, sigma = np.array([1.2, 0.4]), 0.003
     tx, rx = wall_seen_by(faw_ring, *line)
     arguments = (jnp.asarray(line), jnp.asarray((tx + rx) / 2), jnp.asarray((rx - tx) / 2))
@@ -128,7 +128,7 @@ def test_bound_is_that_of_the_kernels_geometry(faw_ring):
 
 
 @pytest.mark.slow
-def test_least_squares_over_noisy_echoes_scatters_as_the_bound_says(faw_ring, rng):
+def test_least_squares_reaches_the_bound(faw_ring, rng):
     truth, sigma, trials = np.array([1.0, 0.7]), 0.001, 400
     tx, rx = wall_seen_by(faw_ring, *truth)
     exact = image_ranges(truth, tx, rx)
@@ -144,8 +144,8 @@ def test_least_squares_over_noisy_echoes_scatters_as_the_bound_says(faw_ring, rn
     ("neighbors", "beam_deg", "rho_mm", "theta_deg"),
     [(3, 60, 0.30, 0.245), (0, 60, 0.51, 0.316), (7, 120, 0.146, 0.065)],
 )
-def test_bounds_are_those_of_an_independent_simulation(neighbors, beam_deg, rho_mm, theta_deg):
-    """Figures from elsewhere for a wall at about 1 m and sigma 1 mm; what echoes it had is known only roughly."""
+def test_bounds_agree_with_an_independent_implementation(neighbors, beam_deg, rho_mm, theta_deg):
+    """Bounds of another implementation for a wall at about 1 m and sigma 1 mm; its echoes are known only roughly."""
     ring = Ring.circular(radius=0.31, neighbors=neighbors, beam=np.radians(beam_deg))
     bounds = [
         cramer_rao_bound(np.array([1.0, theta]), *wall_seen_by(ring, 1.0, theta), 0.001)
@@ -155,7 +155,7 @@ def test_bounds_are_those_of_an_independent_simulation(neighbors, beam_deg, rho_
     np.testing.assert_allclose(mean, [rho_mm, theta_deg], rtol=0.2)
 
 
-def test_bound_grows_with_noise_and_falls_with_echoes(faw_ring):
+def test_bound_scales_with_noise_and_number_of_echoes(faw_ring):
     line = np.array([1.0, 0.3])
     tx, rx = wall_seen_by(faw_ring, *line)
     once = cramer_rao_bound(line, tx, rx, 0.001)
@@ -184,7 +184,7 @@ def a_model(scan, lines):
 
 
 def walls_from(pose):
-    """The rectangle's four lines as a robot sees them, by the foot of the perpendicular."""
+    """The four walls of the rectangle in the robot frame, from footpoints."""
     lines = []
     for (x1, y1), (x2, _) in RECTANGLE.walls:
         foot = np.array([x1, pose[1]]) if x1 == x2 else np.array([pose[0], y1])
@@ -194,13 +194,13 @@ def walls_from(pose):
 
 
 def corner_from(pose, corner):
-    """The line that a corner looks like: through it, square to the view of it."""
+    """The line that a corner produces: through the corner, perpendicular to the line of sight."""
     offset = np.asarray(corner) - pose[:2]
     return np.hypot(*offset), oracles.wrap(np.arctan2(offset[1], offset[0]) - pose[2])
 
 
 def plane_echoes(simulation, scan, wall):
-    """How many first-order echoes a wall gave in a scan, one by one."""
+    """Number of first-order echoes of a wall in a scan."""
     rows = zip(simulation.scan, simulation.kind, simulation.reflector, strict=True)
     return sum(s == scan and kind == EchoKind.PLANE and r == wall for s, kind, r in rows)
 
@@ -229,7 +229,7 @@ def test_perfect_lines(faw_ring):
     assert (result.rho_bound > 0).all()
 
 
-def test_deviations_have_their_sign_and_bound(faw_ring):
+def test_errors_have_the_right_sign_and_bound(faw_ring):
     def off(k, simulation):
         return [(rho + 0.02, theta - 0.03) for rho, theta in heard_walls(simulation, k)]
 
@@ -254,7 +254,7 @@ def test_no_lines(faw_ring):
     assert len(result.rho_error) == 0
 
 
-def test_a_line_nowhere_is_false_but_no_corner(faw_ring):
+def test_a_line_away_from_walls_and_corners_is_false(faw_ring):
     _, result = judged(faw_ring, lambda k, s: [*heard_walls(s, k), (3.9, 0.1)])
     assert result.false == len(POSES)
     assert result.false_per_scan == 1
@@ -263,7 +263,7 @@ def test_a_line_nowhere_is_false_but_no_corner(faw_ring):
 
 
 @pytest.mark.parametrize("corner", [(-1, -1.2), (2.5, 1.6)])
-def test_a_line_at_a_corner_is_counted_as_such(faw_ring, corner):
+def test_a_line_at_a_corner_is_counted_as_false_at_a_corner(faw_ring, corner):
     poses = POSES[:1]
     line = corner_from(poses[0], corner)
     gaps = [distance(line, wall) for wall in walls_from(poses[0])]
@@ -275,7 +275,7 @@ def test_a_line_at_a_corner_is_counted_as_such(faw_ring, corner):
     assert (result.false, result.false_at_corners) == (1, 0)
 
 
-def test_of_a_line_and_its_duplicate_the_nearer_is_the_wall(faw_ring):
+def test_the_nearer_of_two_duplicates_matches(faw_ring):
     def twice(k, simulation):
         rho, theta = heard_walls(simulation, k)[0]
         return [(rho + 0.03, theta), (rho - 0.01, theta)]
@@ -286,7 +286,7 @@ def test_of_a_line_and_its_duplicate_the_nearer_is_the_wall(faw_ring):
     np.testing.assert_allclose(result.rho_error, -0.01, atol=1e-12)
 
 
-def test_a_wall_without_an_echo_is_no_excuse_for_a_line(faw_ring):
+def test_a_line_on_a_wall_without_echoes_is_false(faw_ring):
     simulation = simulate(faw_ring, RECTANGLE, POSES)
     deaf = [(k, wall) for k in range(len(POSES)) for wall in range(4) if not plane_echoes(simulation, k, wall)]
     assert deaf
@@ -297,7 +297,7 @@ def test_a_wall_without_an_echo_is_no_excuse_for_a_line(faw_ring):
         assert line_accuracy(faw_ring, [model], alone, RECTANGLE, pose, sigma=0.001).false == 1
 
 
-def test_another_ring_may_say_which_walls_are_to_be_found(faw_ring):
+def test_another_simulation_can_determine_the_expected_walls(faw_ring):
     usual = Ring.circular(beam=np.radians(30), neighbors=0)
     judge = simulate(faw_ring, RECTANGLE, POSES)
     _, own = judged(usual, lambda k, s: heard_walls(s, k))
@@ -309,7 +309,7 @@ def test_another_ring_may_say_which_walls_are_to_be_found(faw_ring):
     assert other.lines == own.lines
 
 
-def test_pooled_is_all_scans_at_once(faw_ring):
+def test_pooling_equals_all_scans_at_once(faw_ring):
     def some(pose):
         return [(rho + 0.01, theta - 0.02) for rho, theta in walls_from(pose)[:3]] + [(3.9, 1.0)]
 

@@ -1,4 +1,4 @@
-"""Maps against references: laws of the measure, shapely as another way to the covered length, degenerate input."""
+"""Maps against references: invariances, covered length against shapely, degenerate and invalid input."""
 
 import json
 import math
@@ -19,7 +19,7 @@ SQUARE = np.array([[[0, 0], [4, 0]], [[4, 0], [4, 3]], [[4, 3], [0, 3]], [[0, 3]
 
 
 def scene(seed, count=6):
-    """A reference, and a map with some of its walls moved a little, cut or turned around, and some false ones."""
+    """A random reference, and a map of noisy, cut or reversed parts of its walls and some false ones."""
     rng = np.random.default_rng(seed)
     reference = rng.uniform(-4, 4, (count, 2, 2))
     along = reference[:, 1] - reference[:, 0]
@@ -44,7 +44,7 @@ def numbers(evaluation):
 
 @pytest.mark.slow
 @given(seed=seeds)
-def test_moving_both_changes_nothing(seed):
+def test_evaluation_is_invariant_under_rigid_motions(seed):
     segments, reference = scene(seed)
     here, there = evaluate(segments, reference), evaluate(moved(segments), moved(reference))
     for one, two in zip(numbers(here), numbers(there), strict=True):
@@ -53,7 +53,7 @@ def test_moving_both_changes_nothing(seed):
 
 @pytest.mark.slow
 @given(seed=seeds)
-def test_a_map_is_itself(seed):
+def test_a_map_equals_itself(seed):
     segments = np.random.default_rng(seed).uniform(-4, 4, (9, 2, 2))
     result = evaluate(segments, segments)
     np.testing.assert_allclose(result.distance, 0, atol=1e-9)
@@ -65,7 +65,7 @@ def test_a_map_is_itself(seed):
 
 @pytest.mark.slow
 @given(seed=seeds, share=st.floats(0.05, 0.95))
-def test_cutting_a_reference_or_a_segment_changes_no_length(seed, share):
+def test_splitting_segments_changes_no_length(seed, share):
     def cut(lines):
         middle = lines[:, 0] + share * (lines[:, 1] - lines[:, 0])
         return np.concatenate([np.stack([lines[:, 0], middle], 1), np.stack([middle, lines[:, 1]], 1)])
@@ -79,7 +79,7 @@ def test_cutting_a_reference_or_a_segment_changes_no_length(seed, share):
 
 @pytest.mark.slow
 @given(seed=seeds)
-def test_turning_segments_round_changes_only_signs_of_the_reference(seed):
+def test_reversing_segments_changes_only_signs(seed):
     segments, reference = scene(seed)
     here, there, other = evaluate(segments, reference), evaluate(segments[:, ::-1], reference), None
     other = evaluate(segments, reference[:, ::-1])
@@ -91,7 +91,7 @@ def test_turning_segments_round_changes_only_signs_of_the_reference(seed):
 
 @pytest.mark.slow
 @given(seed=seeds, gate=st.floats(0.02, 0.5))
-def test_covered_length_as_shapely_sees_it(seed, gate):
+def test_covered_length_equals_shapely(seed, gate):
     shapely = pytest.importorskip("shapely")
     segments, reference = scene(seed)
     result = evaluate(segments, reference, gate_distance=gate, gate_angle=math.radians(20))
@@ -131,7 +131,7 @@ def test_gates():
     assert evaluate(wall + np.array([4.0, 0.0]), wall).precision_length == 0  # end to end
 
 
-def test_the_nearest_reference_is_the_one_that_deviates():
+def test_deviations_are_those_from_the_nearest_reference():
     wall = np.array([[[0.0, 0.0], [4.0, 0.0]]])
     faces = np.concatenate([wall, wall + np.array([0, 0.1]), wall[:, ::-1] + np.array([0, 0.1])])
     result = evaluate(wall + np.array([0, 0.02]), faces)
@@ -141,12 +141,12 @@ def test_the_nearest_reference_is_the_one_that_deviates():
     np.testing.assert_allclose(result.reference_covered, [4.0, 4.0, 4.0])
 
 
-def test_union():
+def test_union_length():
     assert union_length(np.array([[3.0, 4.0], [0.0, 2.0], [1.0, 1.5], [1.0, 2.5]])) == 3.5
     assert union_length(np.zeros((0, 2))) == 0
 
 
-def test_nothing_on_one_side():
+def test_an_empty_map_or_reference():
     nothing, missing, false = evaluate(NONE, NONE), evaluate(NONE, SQUARE), evaluate(SQUARE, NONE)
     assert math.isnan(nothing.precision)
     assert math.isnan(nothing.recall)
@@ -167,7 +167,7 @@ def test_a_segment_of_no_length_matches_nothing():
     assert math.isnan(evaluate(dot, dot).precision_length)
 
 
-def test_json_and_table_tell_the_same():
+def test_json_and_table_agree():
     result = evaluate(SQUARE + np.array([0.03, 0.0]), SQUARE)
     told = json.loads(json.dumps(result.as_json(), allow_nan=False))
     assert told["distance_max_m"] == pytest.approx(0.03)
@@ -182,7 +182,7 @@ def test_json_and_table_tell_the_same():
         assert words in text
 
 
-def test_what_cannot_be_evaluated_is_refused():
+def test_invalid_input_is_refused():
     bad = SQUARE.copy()
     bad[2, 1, 0] = np.nan
     with pytest.raises(SonarError, match="segment of the map is not finite"):

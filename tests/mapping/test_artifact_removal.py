@@ -1,4 +1,4 @@
-"""Corners, poles and what is no longer there leave the map; walls and openings stay. Pieces are built by hand."""
+"""Lines of corners and poles, and vanished walls, are removed; walls and openings stay. Segments are made by hand."""
 
 import dataclasses
 import itertools
@@ -23,7 +23,7 @@ LEFT_EXACT = 1e-9
 
 
 def segment(start, end, *, seen_from=None, last_seen=0.0, scan=0, info=1e4, echoes=10, count=2):
-    """One piece from start to end; its normal points away from where it was seen from (default: 1 m to the right)."""
+    """One segment from start to end, seen from a position on its right (default: 1 m away); its normal points away."""
     start, end = np.array(start, float), np.array(end, float)
     middle, along = (start + end) / 2, (end - start) / np.linalg.norm(end - start)
     normal = np.array([-along[1], along[0]])
@@ -47,7 +47,7 @@ def segment(start, end, *, seen_from=None, last_seen=0.0, scan=0, info=1e4, echo
 
 
 def answer_of(point, pose, *, half=0.15, **about):
-    """The line that a point leaves in the scan of one pose: through it, square to the line of sight."""
+    """The line that a point produces at one pose: through the point, perpendicular to the line of sight."""
     sight = (np.array(point) - pose) / np.linalg.norm(np.array(point) - pose)
     across = half * np.array([-sight[1], sight[0]])
     return segment(point - across, point + across, seen_from=pose, **about)
@@ -59,7 +59,7 @@ def moved(segments, turn, shift):
 
 
 def echoes_of(segments):
-    """Pieces are told apart by their numbers of echoes."""
+    """Segments are identified by their numbers of echoes."""
     return sorted(segments.echoes.tolist())
 
 
@@ -69,7 +69,7 @@ def numbered(parts):
 
 
 def cleaned(walls):
-    """Without what corners leave, then without what poles leave."""
+    """Without the lines of corners, then without those of poles."""
     walls = remove_corner_lines(walls, walls)
     return walls.take(~is_pole_line(walls))
 
@@ -78,13 +78,13 @@ ROOM_CORNER = [
     segment((-2.0, 0.0), (-0.1, 0.0), seen_from=(-1.0, -1.0)),
     segment((0.0, -2.0), (0.0, -0.1), seen_from=(-1.0, -1.0)),
 ]
-"""Two walls that would meet at the origin; the last 10 cm of each were not seen."""
+"""Two walls that meet at the origin; the last 10 cm of each were not observed."""
 
 
 @settings(max_examples=60)
 @given(st.integers(0, 10_000))
-def test_the_lines_of_a_corner_go_and_its_walls_stay(seed):
-    """Seen from several poses in the room; however the room lies, and in whatever order the lines come."""
+def test_lines_of_a_corner_are_removed_and_its_walls_stay(seed):
+    """For several poses in the room, any orientation of the room, and any order of the lines."""
     rng = np.random.default_rng(seed)
     angle = np.radians(rng.uniform(205, 245, int(rng.integers(1, 5))))  # square to neither wall
     poses = rng.uniform(0.6, 1.8, (len(angle), 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -95,8 +95,8 @@ def test_the_lines_of_a_corner_go_and_its_walls_stay(seed):
 
 @settings(max_examples=60)
 @given(st.integers(0, 10_000))
-def test_the_lines_of_a_pole_go(seed):
-    """Lines through one place with different directions are a point, walls near by or not."""
+def test_lines_of_a_pole_are_removed(seed):
+    """Lines through one position with different directions are a point, also near walls."""
     rng = np.random.default_rng(seed)
     first = rng.uniform(-4, 4)
     angle = first + np.radians(20) * np.arange(int(rng.integers(2, 8)))
@@ -111,7 +111,7 @@ def test_the_lines_of_a_pole_go(seed):
 
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("length", [0.2, 0.3, 0.5])
-def test_a_short_wall_square_to_the_end_of_a_long_one_stays(side, length):
+def test_a_short_wall_perpendicular_to_the_end_of_a_long_one_stays(side, length):
     """The jamb of a door, the side of a cupboard."""
     long = segment((-2.0, 0.0), (0.0, 0.0))
     jamb = segment((0.02, 0.0), (0.02, side * length), seen_from=(1.0, 0.0))
@@ -119,14 +119,14 @@ def test_a_short_wall_square_to_the_end_of_a_long_one_stays(side, length):
 
 
 def test_a_short_wall_in_line_with_a_long_one_stays():
-    """Another piece of the same wall, and a step in it."""
+    """Another segment of the same wall, and a step in it."""
     long = segment((-2.0, 0.0), (0.0, 0.0))
     for offset in (0.0, 0.05):
         assert len(cleaned(concatenate([long, segment((0.05, offset), (0.35, offset))]))) == 2
 
 
 def test_short_walls_apart_from_everything_stay():
-    """The four sides of a box of 40 cm, each seen from its own side: a chair is no pole."""
+    """The four sides of a box of 40 cm, each seen from its own side: a chair is not a pole."""
     corners = [(0.0, 0.0), (0.4, 0.0), (0.4, 0.4), (0.0, 0.4)]
     sides = [
         segment(np.array(a) * 0.8 + 0.04, np.array(b) * 0.8 + 0.04)
@@ -137,8 +137,8 @@ def test_short_walls_apart_from_everything_stay():
 
 @settings(max_examples=60)
 @given(st.integers(0, 10_000), st.integers(0, 30))
-def test_long_walls_always_stay_and_nothing_depends_on_order_or_place(seed, count):
-    """Whatever else is there; and what is left is left again."""
+def test_long_walls_always_stay_in_any_order_and_frame(seed, count):
+    """Also among random segments; and the removal is idempotent."""
     rng = np.random.default_rng(seed)
     start, angle = rng.uniform(-1, 1, (count, 2)), rng.uniform(-4, 4, count)
     length = np.where(rng.random(count) < 0.5, rng.uniform(0.1, 0.58, count), rng.uniform(0.62, 3, count))
@@ -153,13 +153,13 @@ def test_long_walls_always_stay_and_nothing_depends_on_order_or_place(seed, coun
     assert echoes_of(cleaned(moved(walls, rng.uniform(-4, 4), rng.uniform(-9, 9, 2)))) == echoes_of(left)
 
 
-def test_a_corner_beyond_the_seen_end_of_its_wall_goes():
+def test_a_corner_line_beyond_the_observed_end_of_its_wall_is_removed():
     """The office's door, seed 0: the wall was seen up to 12 cm from its corner, whose line lies 3 cm off the corner."""
     door = segment((2.044, 1.971), (2.797, 2.031), seen_from=(2.4, 0.7))
     beside = segment((2.945, 1.91), (3.392, 1.939), seen_from=(3.1, 0.7))
     corner = segment((2.826, 2.066), (3.036, 1.976), seen_from=(2.4, 0.6))  # true corner: (2.916, 2.028)
     walls = numbered([door, beside, corner])
-    # The centre of a sum is where its line is known best, not the middle between its ends.
+    # The centre of a fused segment is not the middle between its ends.
     moved_on = dataclasses.replace(
         walls,
         centre=walls.centre + np.array([[0, 0], [0, 0], [0.016, -0.007]]),
@@ -169,8 +169,8 @@ def test_a_corner_beyond_the_seen_end_of_its_wall_goes():
     assert echoes_of(cleaned(moved_on)) == [100, 101]
 
 
-def test_the_line_of_a_corner_takes_no_short_wall_along():
-    """The office, seed 21: what is a corner's line already tells nothing about a short wall beside it."""
+def test_a_corner_line_does_not_remove_a_short_wall():
+    """The office, seed 21: a line that is already explained by a corner does not remove a short wall beside it."""
     door = segment((2.041, 1.974), (2.961, 2.042), seen_from=(2.4, 0.7))
     beside = segment((2.918, 1.905), (3.2, 1.926), seen_from=(3.1, 0.7))
     corner = segment((2.888, 2.045), (3.098, 1.944), seen_from=(2.4, 0.6))
@@ -178,7 +178,7 @@ def test_the_line_of_a_corner_takes_no_short_wall_along():
 
 
 WALL = segment((0.0, 0.05), (2.0, 0.05), seen_from=(1.0, -1.0), last_seen=10.0, scan=3)
-"""Twenty parts of 10 cm, in the middle of their cells; its normal looks up."""
+"""A wall of twenty parts of 10 cm, in the middle of their cells; its normal points up."""
 
 
 def cells_of(wall, parts, *, turn=0.0):
@@ -190,19 +190,19 @@ def cells_of(wall, parts, *, turn=0.0):
 
 
 def through(parts, times, *, wall=WALL, turn=0.0):
-    """Seen through at these parts of a wall, at these times."""
+    """Free space at these parts of a wall, at these times."""
     cells = cells_of(wall, list(parts), turn=turn)
     rows = np.tile(np.arange(len(cells)), len(times))
     return DirectionalFreeSpace().updated(cells[rows], np.repeat(np.array(times, float), len(cells)))
 
 
 def extents(segments):
-    """Where pieces lie in x, sorted."""
+    """Extents of segments in x, sorted."""
     return np.sort(np.sort(segments.endpoints[:, :, 0], axis=1), axis=0)
 
 
 @pytest.mark.parametrize("times", [(11, 12, 13), (5, 11, 12, 13), (30, 20, 25, 11)])
-def test_a_part_that_three_later_scans_saw_through_is_cut_out_exactly(times):
+def test_a_part_that_three_later_scans_saw_through_is_removed_exactly(times):
     left = remove_seen_through(WALL, np.zeros(1, np.int64), through(range(5, 10), times))
     np.testing.assert_allclose(extents(left), [[0.0, 0.5], [1.0, 2.0]], atol=LEFT_EXACT)
     for name in ("theta", "info_offset", "info_theta", "count", "echoes", "viewing_distance", "last_seen"):
@@ -212,19 +212,19 @@ def test_a_part_that_three_later_scans_saw_through_is_cut_out_exactly(times):
 
 
 @pytest.mark.parametrize("times", [(11, 12), (9, 11, 12), (10, 11, 12), (7, 8, 9), (1, 2, 3, 4), ()])
-def test_fewer_or_earlier_scans_cut_nothing(times):
+def test_fewer_or_earlier_scans_remove_nothing(times):
     left = remove_seen_through(WALL, np.zeros(1, np.int64), through(range(5, 10), times))
     np.testing.assert_allclose(left.endpoints, WALL.endpoints, atol=LEFT_EXACT)
 
 
-def test_the_other_side_of_a_wall_says_nothing():
-    """Silence where a wall would face the other way, or stand square to it."""
+def test_free_space_in_other_directions_removes_nothing():
+    """Free space for walls that face the other way, or are perpendicular."""
     for turn in (math.pi / 2, math.pi, -math.pi / 2):
         left = remove_seen_through(WALL, np.zeros(1, np.int64), through(range(20), (11, 12, 13), turn=turn))
         np.testing.assert_allclose(left.endpoints, WALL.endpoints, atol=LEFT_EXACT)
 
 
-def test_both_ends_the_whole_and_nothing_can_be_cut():
+def test_both_ends_or_the_whole_wall_can_be_removed():
     one = np.zeros(1, np.int64)
     ends = remove_seen_through(WALL, one, through([0, 1, 18, 19], (11, 12, 13)))
     np.testing.assert_allclose(extents(ends), [[0.2, 1.8]], atol=LEFT_EXACT)
@@ -234,8 +234,8 @@ def test_both_ends_the_whole_and_nothing_can_be_cut():
     assert remove_seen_through(WALL, one, DirectionalFreeSpace()) is WALL
 
 
-def test_a_place_where_the_same_wall_was_seen_since_is_not_cut():
-    """Two pieces of one wall: the later one renews what it covers, and nothing of another wall."""
+def test_a_part_where_the_same_wall_was_seen_since_is_kept():
+    """Two segments of one wall: the later one confirms what it covers, but nothing of another wall."""
     later = segment((0.7, 0.06), (1.5, 0.06), seen_from=(1.0, -1.0), last_seen=20.0, scan=4)
     both, seen = concatenate([WALL, later]), through(range(5, 10), (11, 12, 13))
     left = remove_seen_through(both, np.zeros(2, np.int64), seen)
@@ -255,8 +255,8 @@ def seen_through(times, part, last_seen):
 
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.integers(1, 6))
-def test_trim_is_that_of_a_loop_over_parts(seed, count):
-    """Random walls of 2 m, each its own, with parts seen through at random times: a part stays or goes as a whole."""
+def test_removal_equals_a_loop_over_parts(seed, count):
+    """Random separate walls of 2 m with parts seen through at random times; a part is kept or removed as a whole."""
     rng = np.random.default_rng(seed)
     parts, cells, when, wanted = [], [], [], 0.0
     for k in range(count):
@@ -287,26 +287,26 @@ def is_open(*sights, seen=None):
     return bool(open_)
 
 
-def test_a_gap_that_nobody_looked_at_is_no_opening():
+def test_an_unobserved_gap_is_not_an_opening():
     assert not is_open()
     assert not find_openings(np.zeros((0, 2, 2)), np.zeros(0), HERE, DirectionalFreeSpace()).any()
 
 
 @pytest.mark.parametrize(("behind", "open_"), [(1.0, True), (0.17, True), (0.08, False), (0.05, False), (-0.4, False)])
 def test_a_gap_with_a_wall_seen_behind_it_is_an_opening(behind, open_):
-    """A door's leaf in its recess is behind the wall; a chair before it, or a bump of the wall, is not."""
+    """A closed door in its recess is behind the wall; a chair in front, or a bump of the wall, is not."""
     door = segment((0.2, behind), (0.7, behind), seen_from=(0.45, -1.0))
     assert is_open(door) == open_
     beside = segment((1.2, behind), (1.7, behind), seen_from=(1.45, -1.0))
     assert not is_open(beside)
 
 
-def test_a_wall_seen_from_behind_counts_too():
+def test_a_wall_seen_from_behind_also_proves_an_opening():
     assert is_open(segment((0.2, -1.0), (0.7, -1.0), seen_from=(0.45, 0.8)))
 
 
 @pytest.mark.parametrize(("parts", "open_"), [(9, True), (3, True), (1, False)])
-def test_a_gap_that_was_silent_over_more_than_15_cm_is_an_opening(parts, open_):
+def test_a_gap_with_free_space_over_more_than_12_cm_is_an_opening(parts, open_):
     wall = segment((0.0, 0.05), (0.9, 0.05), seen_from=(0.45, -1.0))
     assert is_open(seen=through(range(parts), [1], wall=wall)) == open_
     assert not is_open(seen=through(range(parts), [1], wall=wall, turn=math.pi / 2))
@@ -314,8 +314,8 @@ def test_a_gap_that_was_silent_over_more_than_15_cm_is_an_opening(parts, open_):
 
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.integers(0, 12))
-def test_openings_are_those_of_a_loop(seed, count):
-    """Against lines of sight and gaps as shapely sees them."""
+def test_openings_equal_a_loop(seed, count):
+    """Against intersections of lines of sight and gaps by shapely."""
     rng = np.random.default_rng(seed)
     gaps = rng.uniform(-2, 2, (int(rng.integers(1, 6)), 2, 2))
     middle, view = rng.uniform(-2, 2, (count, 2)), rng.uniform(-2, 2, (count, 2))
@@ -332,5 +332,5 @@ def test_openings_are_those_of_a_loop(seed, count):
         assert open_ == any(clear)
 
 
-def test_constants_are_what_the_tests_were_written_for():
+def test_settings_are_those_that_the_tests_assume():
     assert (FREE.cell, SETTINGS.artifacts.min_wall_length, SETTINGS.artifacts.corner_radius) == (0.1, 0.6, 0.15)

@@ -1,4 +1,4 @@
-"""Global maps: laws of motion, order and sums; true walls of simulated rooms; what changed; what is refused."""
+"""Global maps: invariance to motion, order and splitting; simulated rooms; changing rooms; invalid input."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ LEAST_SCANS = SETTINGS.evidence.min_scans
 SIGMA = 0.003
 SEEDS = range(5)
 ON_WALL, ON_ANGLE, BEYOND = 0.06, math.radians(6.0), 0.12
-"""Metres across, radians, and metres beyond its ends by which a segment may be off the wall that it is."""
+"""Tolerances of a segment on a wall: offset (metres), angle (radians), length beyond its ends (metres)."""
 RING = Ring.circular()
 
 
@@ -49,7 +49,7 @@ def office_maps(office, office_logs):
 
 
 def in_order(log, rows):
-    """Some scans of a log, in the order asked for."""
+    """The given scans of a log, in the given order."""
     return Log.from_scans([log[int(row)] for row in rows])
 
 
@@ -58,7 +58,7 @@ def with_poses(log, pose):
 
 
 def world_moved(log, turn, shift):
-    """The same echoes, in a world that is turned and then shifted with the robot in it."""
+    """The same echoes in a world that was rotated and then translated together with the robot."""
     pose = log.pose.copy()
     pose[:, :2] = pose[:, :2] @ rotation(turn).T + shift
     pose[:, 2] += turn
@@ -66,7 +66,7 @@ def world_moved(log, turn, shift):
 
 
 def one_after_another(*logs):
-    """Scans of several logs, a later one after an earlier one."""
+    """The scans of several logs, one log after the other."""
     scans = [scan for log in logs for scan in log]
     return Log.from_scans([dataclasses.replace(scan, scan=k, stamp=0.5 * k) for k, scan in enumerate(scans)])
 
@@ -77,7 +77,7 @@ def apart(one, other):
 
 
 def assert_same_map(one, other, *, atol, turn=0.0, shift=(0.0, 0.0), named=True):
-    """The second map is the first one moved: lines and ends, their deviations, echoes and scans."""
+    """Assert that the second map is the first one moved: lines, ends, standard deviations, echoes and scans."""
     assert len(one) == len(other)
     segments = one.segments @ rotation(turn).T + np.asarray(shift)
     taken = []
@@ -93,7 +93,7 @@ def assert_same_map(one, other, *, atol, turn=0.0, shift=(0.0, 0.0), named=True)
 
 
 def is_on(segment, wall, *, across=ON_WALL, angle=ON_ANGLE, beyond=BEYOND):
-    """Whether a segment lies on a wall: near its line, turned little, and not beyond its ends."""
+    """Whether a segment lies on a wall: near its line, at a small angle, and not beyond its ends."""
     length = np.linalg.norm(wall[1] - wall[0])
     tangent = (wall[1] - wall[0]) / length
     along, off = (segment - wall[0]) @ tangent, (segment - wall[0]) @ np.array([-tangent[1], tangent[0]])
@@ -103,13 +103,13 @@ def is_on(segment, wall, *, across=ON_WALL, angle=ON_ANGLE, beyond=BEYOND):
 
 
 def on_walls(world, walls, **gates):
-    """(segments, walls) which segment lies on which wall."""
+    """Which segment (row) lies on which wall (column)."""
     hits = [[is_on(segment, wall, **gates) for wall in walls] for segment in world.segments]
     return np.array(hits, dtype=bool).reshape(len(world), len(walls))
 
 
 def well_heard(sim, room, scans, *, least=8):
-    """Walls with that many true echoes in each of two scans or more."""
+    """Walls with enough true echoes in each of at least two scans."""
     counts = np.zeros((scans, len(room.walls)), int)
     plane = sim.kind == EchoKind.PLANE
     np.add.at(counts, (sim.scan[plane], sim.reflector[plane]), 1)
@@ -117,7 +117,7 @@ def well_heard(sim, room, scans, *, least=8):
 
 
 def covered(world, line, *, within=0.08):
-    """How much of a line from point to point has a segment of the map along it, metres."""
+    """Length of a line that segments of the map cover, metres."""
     near = shapely.LineString(line).buffer(within, cap_style="flat")
     direction = math.atan2(*(np.subtract(line[1], line[0]))[::-1])
     total = 0.0
@@ -130,18 +130,18 @@ def covered(world, line, *, within=0.08):
 
 @pytest.mark.parametrize("merging", MERGING_METHODS)
 @pytest.mark.parametrize("shift", [(0.3, -0.7), (-12.1, 4.0), (1000.0, 0.1)])
-def test_moving_the_world_by_whole_cells_moves_the_map_and_nothing_else(office_log, shift, merging):
-    """Cells of the floor are 5 and 10 cm: shifts by tenths of a metre map them onto one another."""
+def test_map_is_equivariant_under_translations_by_whole_cells(office_log, shift, merging):
+    """Cells of the floor are 5 and 10 cm, so translations by tenths of a metre map cells to cells."""
     here = build_map(RING, office_log, merging=merging)
     there = build_map(RING, world_moved(office_log, 0.0, np.array(shift)), merging=merging)
-    # The paper's merging sums in single precision.
+    # The paper's merging votes in single precision.
     assert_same_map(here, there, shift=shift, atol=1e-6 if merging == "fused" else 1e-3)
     np.testing.assert_allclose(here.sigma_theta, there.sigma_theta, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_turning_and_moving_the_world_anyhow_turns_and_moves_the_map(office_log, seed):
-    """Cells fall otherwise, so sums are taken in other groups: 1 mm is far below what a map is good for."""
+def test_map_is_equivariant_under_rigid_motions(office_log, seed):
+    """Other cells give other groups in the fusion, so the result differs slightly: by less than 1 mm."""
     rng = np.random.default_rng(seed)
     turn, shift = (rng.integers(1, 4) * math.pi / 2 if seed == 0 else rng.uniform(-4, 4)), rng.uniform(-5, 5, 2)
     here, there = build_map(RING, office_log), build_map(RING, world_moved(office_log, turn, shift))
@@ -149,7 +149,7 @@ def test_turning_and_moving_the_world_anyhow_turns_and_moves_the_map(office_log,
 
 
 @pytest.mark.parametrize("split", [1, 8, 16])
-def test_the_evidence_of_two_parts_is_that_of_the_whole(office_log, split):
+def test_the_union_of_two_parts_is_the_evidence_of_the_whole(office_log, split):
     parts = [in_order(office_log, rows) for rows in np.split(np.arange(len(office_log)), [split])]
     one, other = (gather_evidence(RING, part, list(local_models(RING, part))) for part in parts)
     whole = gather_evidence(RING, office_log, list(local_models(RING, office_log)))
@@ -171,15 +171,15 @@ def test_the_order_of_the_scans_does_not_matter(office_log, seed, merging):
     assert_same_map(here, there, atol=1e-9 if merging == "fused" else 1e-5)
 
 
-def test_the_same_log_gives_the_same_map_to_the_last_bit(office_log):
+def test_the_same_log_gives_exactly_the_same_map(office_log):
     one, two = build_map(RING, office_log), build_map(RING, office_log)
     for name in ("segments", "rho", "theta", "sigma_rho", "sigma_theta", "echoes"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
     assert one.scans == two.scans
 
 
-def test_a_map_says_what_it_promises(office_maps):
-    """Lines through their segments, those with the most echoes first, scans ascending and enough of them."""
+def test_invariants_of_a_map(office_maps):
+    """Lines pass through their segments, walls are sorted by echoes, scans ascend, and enough scans saw each wall."""
     for world in office_maps:
         normal = np.stack([np.cos(world.theta), np.sin(world.theta)], axis=-1)
         np.testing.assert_allclose((world.segments * normal[:, None]).sum(-1), world.rho[:, None] * [1, 1], atol=1e-9)
@@ -193,14 +193,14 @@ def test_a_map_says_what_it_promises(office_maps):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("merging", MERGING_METHODS)
-def test_one_scan_is_a_map(office_log, merging, method):
-    """Nothing can confirm it: the map is its local model, in the world."""
+def test_a_single_scan_gives_a_map(office_log, merging, method):
+    """No other scan can confirm it, so the map is its local model in the world frame."""
     world = build_map(RING, office_log[:1], merging=merging, method=method)
     (model,) = local_models(RING, office_log[:1], method=method)
     assert 1 <= len(world) <= len(model.lines)
     alone = len(world) == len(model.lines)
     if alone and method == "hough":
-        assert world.sigma_theta == pytest.approx(SETTINGS.segments.theta_sd, rel=1e-9)  # what is expected of one line
+        assert world.sigma_theta == pytest.approx(SETTINGS.segments.theta_sd, rel=1e-9)  # the default of a single line
     elif alone:
         expected = [math.sqrt(line.cov[1, 1]) for line in model.lines if line.cov is not None]
         np.testing.assert_allclose(np.sort(world.sigma_theta), np.sort(expected), rtol=1e-6)
@@ -208,8 +208,8 @@ def test_one_scan_is_a_map(office_log, merging, method):
 
 
 @pytest.mark.parametrize("merging", MERGING_METHODS)
-def test_nothing_in_nothing_out(office_log, merging):
-    """No scan at all; scans that heard nothing; scans that heard only what is beyond reach."""
+def test_logs_without_usable_echoes_give_an_empty_map(office_log, merging):
+    """A log without scans; scans without echoes; scans with echoes beyond the maximum range."""
     empty = build_map(RING, office_log[:0], merging=merging)
     assert isinstance(empty, GlobalMap)
     assert empty.segments.shape == (0, 2, 2)
@@ -223,8 +223,8 @@ def test_nothing_in_nothing_out(office_log, merging):
 
 
 @pytest.mark.parametrize("merging", MERGING_METHODS)
-def test_a_robot_that_is_shut_in_still_gets_a_map(merging):
-    """All sensors hear something close by: no place is claimed to be free."""
+def test_a_robot_without_free_space_gets_a_map(merging):
+    """All sensors hear something close, so there is no free space."""
     tx = np.arange(24)
     log = Log.from_echoes(np.zeros(24, int), tx, tx, np.full(24, 0.12), stamp=np.zeros(1), pose=np.zeros((1, 3)))
     assert isinstance(build_map(RING, log, merging=merging), GlobalMap)
@@ -249,7 +249,7 @@ def test_a_log_without_a_single_pose_is_refused(office_log, merging, window):
     assert "\n" not in str(refused.value)
 
 
-def test_unknown_ways_are_refused(office_log):
+def test_unknown_methods_are_refused(office_log):
     with pytest.raises(SonarError, match=r"merging 'best'; allowed is fused or paper"):
         build_map(RING, office_log, merging="best")
     with pytest.raises(SonarError, match=r"method 'best'; allowed is ml or hough"):
@@ -263,20 +263,20 @@ def test_unknown_ways_are_refused(office_log):
         build_map(RING, stranger)
 
 
-def test_echoes_of_pairs_that_the_ring_does_not_listen_to_are_told(office_log):
+def test_echoes_of_pairs_that_the_ring_does_not_listen_to_are_reported(office_log):
     first = office_log[0]
     more = dataclasses.replace(
         first, tx=np.append(first.tx, 3), rx=np.append(first.rx, 15), range=np.append(first.range, 1.0),
         amplitude=np.append(first.amplitude, np.nan),
     )  # fmt: skip
-    told = []
-    with_it = build_map(RING, Log.from_scans([more, *list(office_log)[1:]]), on_left_out=told.append)
-    assert told == [1]
+    reported_counts = []
+    with_it = build_map(RING, Log.from_scans([more, *list(office_log)[1:]]), on_left_out=reported_counts.append)
+    assert reported_counts == [1]
     assert_same_map(with_it, build_map(RING, office_log), atol=1e-9)
 
 
 @pytest.mark.parametrize("column", ["range", "x", "theta"])
-def test_a_log_with_holes_cannot_be_made(office_log, column):
+def test_a_log_with_partial_nan_cannot_be_made(office_log, column):
     reported, pose = office_log.range.copy(), office_log.pose.copy()
     if column == "range":
         reported[7] = np.nan
@@ -286,7 +286,7 @@ def test_a_log_with_holes_cannot_be_made(office_log, column):
         dataclasses.replace(office_log, range=reported, pose=pose)
 
 
-def test_a_scan_number_that_comes_twice_is_refused_with_its_place(office_log, tmp_path):
+def test_a_repeated_scan_number_is_refused_with_its_row(office_log, tmp_path):
     number = office_log.scan.copy()
     number[4] = number[2]
     with pytest.raises(SonarError, match=r"scans\[4\], scan: 2 came; allowed is a whole number that no earlier scan"):
@@ -304,7 +304,7 @@ def test_a_scan_number_that_comes_twice_is_refused_with_its_place(office_log, tm
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_every_wall_of_the_office_within_reach_is_one_segment(office, office_logs, office_maps, seed):
-    """Walls with at least 8 true echoes in two scans, the chair among them; and no segment that is not on a wall."""
+    """Walls with at least 8 true echoes in two scans, including the chair; every segment is on a wall."""
     heard, names = well_heard(office_logs[seed][0], office.room, 17), office.room.wall_names
     hits = on_walls(office_maps[seed], office.room.walls)
     false = office_maps[seed].segments[~hits.any(axis=1)]
@@ -316,8 +316,8 @@ def test_every_wall_of_the_office_within_reach_is_one_segment(office, office_log
     assert 0.3 < np.linalg.norm(np.diff(office_maps[seed].segments[chair], axis=0)) < 0.6
 
 
-def test_the_walls_of_the_office_are_where_they_are(office, office_maps):
-    """Line by line against the true ones, over all seeds: half a centimetre and a degree, root mean square."""
+def test_walls_of_the_office_are_accurate(office, office_maps):
+    """Root mean square errors over all seeds: half a centimetre, two degrees."""
     off, turned = [], []
     for world in office_maps:
         hits = on_walls(world, office.room.walls)
@@ -334,15 +334,15 @@ def test_the_walls_of_the_office_are_where_they_are(office, office_maps):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_nothing_bridges_the_doors_recess(office, office_maps, seed):
-    """The door lies 12 cm behind the wall: along the mouth of its recess the map has no wall."""
+    """The door lies 12 cm behind the wall: across the recess the map has no wall."""
     jambs = [wall for wall, name in zip(office.room.walls, office.room.wall_names, strict=True) if name == "door jamb"]
     mouth = [jambs[0][0], jambs[1][1]]
     assert 0.85 < math.dist(*mouth) < 0.95
     assert covered(office_maps[seed], mouth, within=0.05) < 0.15
 
 
-def test_the_papers_merging_finds_the_offices_walls_too(office, office_logs):
-    """Within the gates of deviations; it keeps what corners leave and does not join what is far apart."""
+def test_the_papers_merging_finds_the_walls_of_the_office(office, office_logs):
+    """With wide tolerances: this merging keeps the lines of corners and does not bridge gaps."""
     for sim, log in office_logs[:3]:
         world = build_map(office.ring, log, method="hough", merging="paper")
         hits = on_walls(world, office.room.walls, across=0.1, angle=0.15, beyond=0.3)
@@ -367,8 +367,8 @@ def heard(walls, poses, *, seed, ring=RING):
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "rounds"), [(28, 2), (56, 1)])
 @pytest.mark.parametrize("thing", [BOX, CHAIR], ids=["box", "chair"])
-def test_what_is_gone_leaves_the_map_and_what_is_new_enters_it(thing, count, rounds):
-    """The same way twice: the thing is there only in the first half of the scans, only in the second, always."""
+def test_vanished_objects_leave_the_map_and_new_ones_enter_it(thing, count, rounds):
+    """The same trajectory twice, with an object only in the second half, always, or only in the first half."""
     poses = np.concatenate([around(count)] * rounds)
     full = [heard([*SHELL, *thing], poses, seed=seed) for seed in (0, 1)]
     free = [heard(SHELL, poses, seed=seed) for seed in (0, 1)]
@@ -389,7 +389,7 @@ DRIVE = np.column_stack([np.arange(-2.0, 2.01, 0.25), np.full(17, -1.0), np.zero
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("behind", [None, 0.3, 0.8])
 def test_an_open_door_stays_open(behind, seed):
-    """A wall with a gap of 0.9 m; behind it nothing within range, or a wall that is seen through the gap."""
+    """A wall with a gap of 0.9 m, with nothing or another wall behind it."""
     walls = [[[-3, 0], [-0.45, 0]], [[0.45, 0], [3, 0]]]
     walls += [[[-1.0, behind], [1.0, behind]]] if behind else []
     world = build_map(RING, heard(walls, DRIVE, seed=seed))
@@ -400,7 +400,7 @@ def test_an_open_door_stays_open(behind, seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_wall_partly_hidden_by_a_chair_is_one_segment(seed):
+def test_a_wall_occluded_by_a_chair_is_one_segment(seed):
     walls = [[[-3, 0], [3, 0]], [[-0.25, -0.4], [0.25, -0.4]]]
     drive = DRIVE + np.array([0.0, -0.4, 0.0])
     world = build_map(RING, heard(walls, drive, seed=seed))
@@ -409,8 +409,8 @@ def test_a_wall_partly_hidden_by_a_chair_is_one_segment(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_random_rooms_come_out_recognisable(seed):
-    """No tuned figure: most of what was well heard is there, most of what is there is true."""
+def test_random_rooms_are_recognizable(seed):
+    """Loose bounds on recall and precision."""
     rng = np.random.default_rng(seed)
     room = random_room(rng)
     poses = np.array([random_pose(rng, room) for _ in range(40)])

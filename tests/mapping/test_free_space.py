@@ -1,4 +1,4 @@
-"""Silence against a slow oracle and against true walls; what is remembered does not depend on order, nor on where."""
+"""Directional free space against a slow oracle and true walls; storage does not depend on the order of the scans."""
 
 import math
 
@@ -19,7 +19,7 @@ from jaxsonar.simulation.office import load_office
 FREE = SETTINGS.free_space
 STEP = 2 * math.pi / FREE.directions
 RAYS, POINTS = 17, 33
-"""Rays of a cone, as the code has them; the oracle shares the samples, not the arithmetic."""
+"""Samples of a cone and of an arc. The oracle uses the same samples, but its own arithmetic."""
 BUMPER = Ring(
     [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
     np.radians([-15.0, -5.0, 5.0, 15.0]),
@@ -45,7 +45,7 @@ def centre_of(cells):
 
 
 def some_cells(rng, count, *, around=(0, 0)):
-    """Cells over several tiles on both sides of a place, many of them more than once."""
+    """Random cells over several tiles around a position, many of them repeated."""
     cells = np.column_stack([rng.integers(-40, 40, (count, 2)), rng.integers(0, FREE.directions, count)])
     cells = cells[rng.integers(0, max(count // 4, 1), count)]
     return cells + np.array([*around, 0]), rng.integers(-5, 50, count).astype(float)
@@ -64,7 +64,7 @@ def copied(seen):
 @pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.integers(0, 300), st.integers(1, 6))
-def test_any_split_and_order_of_the_scans_is_remembered_alike(seed, count, parts):
+def test_split_and_order_of_the_scans_do_not_matter(seed, count, parts):
     rng = np.random.default_rng(seed)
     cells, when = some_cells(rng, count)
     whole = DirectionalFreeSpace().updated(cells, when)
@@ -76,19 +76,19 @@ def test_any_split_and_order_of_the_scans_is_remembered_alike(seed, count, parts
 
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.integers(1, 300), st.sampled_from([(0, 0), (-37, 1), (10**6, -(10**6))]))
-def test_the_latest_are_remembered_and_told_latest_first(seed, count, around):
-    """Against sorting the times of every cell by hand; also on both sides of the origin and 100 km from it."""
+def test_query_gives_the_latest_times_in_descending_order(seed, count, around):
+    """Against sorting the times of every cell, on both sides of the origin and 100 km away."""
     rng = np.random.default_rng(seed)
     cells, when = some_cells(rng, count, around=around)
     seen = DirectionalFreeSpace().updated(cells, when)
     points, theta = centre_of(cells)
-    told = seen.query(points, theta + 2 * math.pi * rng.integers(-2, 3, count))
-    for cell, times in zip(cells, told, strict=True):
+    times_found = seen.query(points, theta + 2 * math.pi * rng.integers(-2, 3, count))
+    for cell, times in zip(cells, times_found, strict=True):
         by_hand = sorted(when[(cells == cell).all(axis=1)].tolist(), reverse=True)[: FREE.remembered]
         assert times.tolist() == by_hand + [-np.inf] * (FREE.remembered - len(by_hand))
 
 
-def test_what_was_never_seen_through_is_not_told(rng):
+def test_unobserved_cells_have_no_times(rng):
     cells, when = some_cells(rng, 200)
     seen = DirectionalFreeSpace().updated(cells, when)
     known = set(map(tuple, cells.tolist()))
@@ -102,8 +102,8 @@ def test_what_was_never_seen_through_is_not_told(rng):
 @pytest.mark.slow
 @settings(max_examples=8)
 @given(st.integers(0, 10_000), st.lists(st.integers(0, 120), min_size=3, max_size=3))
-def test_joining_is_a_sum(seed, counts):
-    """Commutative, associative, neutral with nothing, and the same as including all at once."""
+def test_union_is_a_sum(seed, counts):
+    """Commutative and associative, with a neutral element, and equal to adding everything at once."""
     rng = np.random.default_rng(seed)
     parts = [some_cells(rng, count) for count in counts]
     a, b, c = (DirectionalFreeSpace().updated(*part) for part in parts)
@@ -115,7 +115,7 @@ def test_joining_is_a_sum(seed, counts):
     assert_same(a.union(b).union(c), DirectionalFreeSpace().updated(cells, when))
 
 
-def test_old_states_stay_as_they_were(rng):
+def test_updates_do_not_change_old_states(rng):
     first = DirectionalFreeSpace().updated(*some_cells(rng, 300))
     second = DirectionalFreeSpace().updated(*some_cells(rng, 300))
     before, before_second = copied(first), copied(second)
@@ -127,7 +127,7 @@ def test_old_states_stay_as_they_were(rng):
 
 
 def path_geometry(ring, path):
-    """Midpoint, first direction and width of what a path hears, from the cones of its two sensors."""
+    """Midpoint, first direction and width of the cone of a path, from the cones of its two sensors."""
     tx, rx = ring.paths[path]
     turn = oracles.wrap(ring.heading[rx] - ring.heading[tx])
     first = max(-ring.beam[tx] / 2, turn - ring.beam[rx] / 2)
@@ -135,8 +135,8 @@ def path_geometry(ring, path):
     return (ring.position[tx] + ring.position[rx]) / 2, ring.heading[tx] + first, last - first
 
 
-def slow_silence(ring, pose, echoes, walls):
-    """Cells that one scan (path, reach) saw through: loops over sensors, rays and distances, shapely for what hides."""
+def free_cells_oracle(ring, pose, echoes, walls):
+    """Oracle: free cells of one scan (path, range), by loops over sensors, rays and distances, and shapely."""
     hides = []
     for start, end in walls:
         beyond = FREE.extension * (end - start) / np.linalg.norm(end - start)
@@ -154,7 +154,7 @@ def slow_silence(ring, pose, echoes, walls):
             theta = pose[2] + first + width * (0.5 + FREE.certain * (k / (RAYS - 1) - 0.5))
             ray = np.array([math.cos(theta), math.sin(theta)])
             sight = shapely.LineString([sensor, sensor + 100 * ray])
-            # A wall may go on beyond its ends, but whoever faces it there would have heard it.
+            # A wall may extend beyond its ends, except for rays that face it and would have heard it.
             facing = [abs(oracles.wrap(2 * (theta - normal))) / 2 <= FREE.facing for normal, _, _ in hides]
             met = [seen if faces else guessed for faces, (_, seen, guessed) in zip(facing, hides, strict=True)]
             met = [sight.intersection(wall) for wall in met if sight.intersects(wall)]
@@ -185,8 +185,8 @@ def slow_silence(ring, pose, echoes, walls):
     return {(x, y, facing) for x, y, facing in votes if len(around[x // 2, y // 2, facing]) >= enough} - against
 
 
-def quick_silence(ring, poses, echoes, walls):
-    """The same from the code, for several scans: a set of cells each."""
+def free_cells(ring, poses, echoes, walls):
+    """The free cells of several scans from the product, one set per scan."""
     scan = np.repeat(np.arange(len(poses)), [len(part) for part in echoes])
     flat = [echo for part in echoes for echo in part]
     path = np.array([k for k, _ in flat], np.int64)
@@ -199,8 +199,8 @@ def quick_silence(ring, poses, echoes, walls):
 @pytest.mark.parametrize(
     "ring", [Ring.circular(), Ring.circular(count=12, beam=0.9, neighbors=1), BUMPER, load_ring("corridor8")]
 )
-def test_silence_is_that_of_the_slow_oracle(ring):
-    """Whole scans at once against one at a time by hand; poses near and far, echoes and walls at random."""
+def test_free_space_equals_the_oracle(ring):
+    """Several scans at once against one at a time; random poses, echoes and walls."""
     rng = np.random.default_rng(5)
     poses, echoes, walls = [], [], []
     for k in range(5):
@@ -209,21 +209,21 @@ def test_silence_is_that_of_the_slow_oracle(ring):
         paths = rng.integers(0, len(ring.paths), count)
         echoes.append([(int(p), float(r)) for p, r in zip(paths, rng.uniform(0.3, ring.max_range, count), strict=True)])
         walls.append(poses[-1][:2] + rng.uniform(-2, 2, (int(rng.integers(0, 4)), 2, 2)))
-    came = quick_silence(ring, poses, echoes, walls)
+    came = free_cells(ring, poses, echoes, walls)
     for pose, heard, shown, cells in zip(poses, echoes, walls, came, strict=True):
-        wanted = slow_silence(ring, pose, heard, shown)
+        wanted = free_cells_oracle(ring, pose, heard, shown)
         assert len(wanted) > 10
-        # Cells are computed in single precision in between: a point on a border may fall to either side.
+        # Intermediate values are in single precision: a point on a border may fall to either side.
         assert len(cells ^ wanted) <= 2
 
 
-def test_no_echo_at_all_rules_out_the_cones(faw_ring):
-    """Up to SURE of the maximum range and of the width, all around; and nothing farther."""
-    (cells,) = quick_silence(faw_ring, [(0.0, 0.0, 0.0)], [[]], [np.zeros((0, 2, 2))])
+def test_without_echoes_the_cones_are_free(faw_ring):
+    """Up to the certain fraction of the maximum range and of the width, in all directions, and no farther."""
+    (cells,) = free_cells(faw_ring, [(0.0, 0.0, 0.0)], [[]], [np.zeros((0, 2, 2))])
     points, theta = centre_of(sorted(cells))
     farthest = np.linalg.norm(points, axis=-1).max()
     assert 0.28 + FREE.certain * 2.0 - 2 * FREE.cell < farthest < 0.28 + FREE.certain * 2.0 + FREE.cell
-    # Most places that face a sensor, all around; farther ones lie between the rays.
+    # Most positions that face a sensor; far ones may lie between the rays.
     rng = np.random.default_rng(0)
     claimed = []
     for _ in range(2000):
@@ -234,21 +234,21 @@ def test_no_echo_at_all_rules_out_the_cones(faw_ring):
     share = [np.mean([hit for which, hit in claimed if which == sensor]) for sensor in range(24)]
     assert np.mean(share) > 0.7
     assert min(share) > 0.4
-    # None of them faces away from the robot, or along its sight.
+    # No wall that faces away from the robot, or along the line of sight.
     sight = np.arctan2(points[:, 1], points[:, 0])
     far = np.linalg.norm(points, axis=-1) > 0.6
     assert np.abs(oracles.wrap(theta - sight))[far].max() < math.radians(60)
 
 
-def test_nothing_seen_through_changes_nothing(rng):
-    """A scan that claims no place: all sensors heard something close by."""
+def test_an_empty_update_changes_nothing(rng):
+    """A scan without free cells, because all sensors heard something close."""
     nothing = (np.zeros((0, 3), np.int64), np.zeros(0))
     assert_same(DirectionalFreeSpace().updated(*nothing), DirectionalFreeSpace())
     seen = DirectionalFreeSpace().updated(*some_cells(rng, 50))
     assert_same(seen.updated(*nothing), seen)
 
 
-def test_a_deaf_ring_says_nothing(faw_ring):
+def test_no_scans_give_no_cells(faw_ring):
     cells, who = observe_free_space(
         faw_ring, np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), []
     )
@@ -258,12 +258,12 @@ def test_a_deaf_ring_says_nothing(faw_ring):
 
 @settings(max_examples=30)
 @given(st.floats(0.45, 1.9), st.floats(-3.1, 3.1), st.floats(-3.1, 3.1), st.floats(-50, 50))
-def test_the_echo_of_a_wall_keeps_its_place(rho, theta, heading, x):
-    """Of an infinite wall no place is claimed that some sensor is square to, nor anything behind it."""
+def test_a_wall_with_echoes_is_not_free(rho, theta, heading, x):
+    """No footpoint of a sensor on an infinite wall is free, and nothing behind the wall."""
     ring = Ring.circular()
     heard = oracles.wall_echoes(ring, rho, theta)
     pose = np.array([x, 1.0, heading])
-    (cells,) = quick_silence(ring, [pose], [heard], [np.zeros((0, 2, 2))])
+    (cells,) = free_cells(ring, [pose], [heard], [np.zeros((0, 2, 2))])
     normal = np.array([math.cos(theta), math.sin(theta)])
     for position in ring.position:
         for shift in (-0.03, 0.0, 0.03):
@@ -278,7 +278,7 @@ def test_the_echo_of_a_wall_keeps_its_place(rho, theta, heading, x):
 
 
 def true_places(ring, room, pose):
-    """Places of true walls that face a sensor: the foot is on the wall, in the cone, within range, and in sight."""
+    """Cells of true walls with a footpoint of a sensor that is in the cone, within range and visible."""
     places = {}
     for sensor, heading, beam in zip(ring.position, ring.heading, ring.beam, strict=True):
         at = transform_points(pose, sensor)
@@ -302,8 +302,8 @@ def true_places(ring, room, pose):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
-def test_no_true_wall_is_seen_through(faw_ring, seed):
-    """In random rooms without noise; with what the scans show of walls, and without."""
+def test_true_walls_are_never_free(faw_ring, seed):
+    """In random rooms without noise."""
     rng = np.random.default_rng(seed)
     room = random_room(rng)
     poses = np.array([random_pose(rng, room) for _ in range(6)])
@@ -321,21 +321,21 @@ def test_no_true_wall_is_seen_through(faw_ring, seed):
     assert checked > 20
 
 
-def test_the_walls_of_the_office_are_never_seen_through():
-    """What the evidence of the whole way claims, at places where some scan sees a true wall: nothing."""
+def test_walls_of_the_office_are_never_free():
+    """The evidence of the whole log has no free space where some scan sees a true wall."""
     office = load_office()
     heard = simulate(office.ring, office.room, office.poses, stamps=office.stamps)
     log = heard.as_log(office.ring, office.poses)
     seen = gather_evidence(office.ring, log, list(local_models(office.ring, log))).free_space
     truth = {place for pose in office.poses for place in true_places(office.ring, office.room, pose)}
     points, theta = centre_of(sorted(truth))
-    told = seen.query(points, theta)
+    times_found = seen.query(points, theta)
     assert len(truth) > 50
-    assert np.isneginf(told[:, -1]).all()  # three scans in agreement would remove a wall
+    assert np.isneginf(times_found[:, -1]).all()  # three scans in agreement would remove a wall
 
 
-def test_only_scans_with_a_pose_and_echoes_within_range_speak(faw_ring):
-    """An echo from beyond the maximum range is as good as none; a scan without a pose claims nothing."""
+def test_only_scans_with_a_pose_and_echoes_within_range_count(faw_ring):
+    """An echo beyond the maximum range counts as none; a scan without a pose adds no free space."""
     far = Log.from_echoes(
         np.array([0, 1]), np.array([3, 3]), np.array([3, 3]), np.array([2.6, 1.0]),
         stamp=np.arange(2.0), pose=np.array([[0.0, 0.0, 0.0], [np.nan] * 3]),

@@ -1,4 +1,4 @@
-"""The paper's merging: single linkage against SciPy, the Hough step against a loop over clusters (oracles.py)."""
+"""The paper's merging: single linkage against SciPy, the Hough transform against a loop over clusters."""
 
 import math
 
@@ -62,7 +62,7 @@ def in_two_towns(rng, n):
 
 
 def in_two_countries(rng, n):
-    """A pose that went wrong: 1000 km apart."""
+    """1000 km apart, as after a wrong pose."""
     return np.concatenate([rng.uniform(0, 3, (n, 2)), rng.uniform(0, 3, (n, 2)) + 1e6])
 
 
@@ -75,7 +75,7 @@ SETS = [
 @pytest.mark.parametrize("points", SETS, ids=lambda points: points.__name__)
 @settings(max_examples=25, phases=[Phase.generate])
 @given(seed=SEEDS, n=st.integers(2, 50), cut=st.sampled_from([0.05, 0.4, 2.0]))
-def test_single_linkage_is_that_of_scipy(points, seed, n, cut):
+def test_single_linkage_equals_scipy(points, seed, n, cut):
     found = points(np.random.default_rng(seed), n)
     cluster = single_linkage(found, cut)
     assert partition(cluster) == partition(fcluster(linkage(found, "single"), cut, "distance"))
@@ -102,7 +102,7 @@ def test_a_chain_is_one_cluster():
 
 
 def paper(segments, cut):
-    """The recipe step by step: members, and (foot, direction up to half a turn, both ends) of each merged line."""
+    """The recipe step by step: members, origin and (rho, theta) of each merged line."""
     midpoints = segments.endpoints.mean(axis=1)
     cluster = fcluster(linkage(midpoints, "single"), cut, "distance") if len(segments) > 1 else np.zeros(1)
     merged = []
@@ -141,7 +141,7 @@ def undirected(segments):
 
 
 def office(rng, count):
-    """Noisy pieces of a few walls, and some that belong to none."""
+    """Noisy segments of a few walls, and some that belong to none."""
     walls = rng.integers(1, 5)
     foot, theta = rng.uniform(-2, 2, (walls, 2)), rng.uniform(-np.pi, np.pi, walls)
     wall = rng.integers(0, walls, count)
@@ -155,7 +155,7 @@ def office(rng, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
-def test_merging_is_the_recipe_of_the_paper(seed):
+def test_merging_equals_the_recipe_of_the_paper(seed):
     rng = np.random.default_rng(seed)
     segments = office(rng, int(rng.integers(20, 50)))
     merged, expected = merge_by_hough(segments, linkage_distance=CUT), paper(segments, CUT)
@@ -171,7 +171,7 @@ def test_merging_is_the_recipe_of_the_paper(seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_every_segment_is_in_one_wall(seed):
+def test_every_segment_belongs_to_one_wall(seed):
     segments = office(np.random.default_rng(seed), 60)
     merged = merge_by_hough(segments, linkage_distance=CUT)
     assert sorted(number for numbers in merged.scan_lists() for number in numbers) == list(range(60))
@@ -190,7 +190,7 @@ def walls_apart(rng, count, each):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_merging_again_changes_nothing_where_walls_are_well_apart(seed):
+def test_merging_is_idempotent_for_separate_walls(seed):
     segments = walls_apart(np.random.default_rng(seed), 9, 6)
     merged = merge_by_hough(segments, linkage_distance=CUT)
     assert len(merged) == 9
@@ -200,8 +200,8 @@ def test_merging_again_changes_nothing_where_walls_are_well_apart(seed):
 
 
 @pytest.mark.parametrize(("cells", "shift"), [(0, (12.3, -4.5)), (1, (0.0, 0.0)), (50, (-7.0, 3.0)), (77, (1e4, 1e4))])
-def test_moving_the_world_moves_the_walls_and_nothing_else(cells, shift):
-    """Turns by whole cells of theta, which the accumulator cannot tell apart; any shift."""
+def test_merging_is_equivariant_under_rigid_motions(cells, shift):
+    """Rotations by whole cells of theta, to which the accumulator is invariant, and any translation."""
     segments = office(np.random.default_rng(4), 40)
     pose = (*shift, cells * 2 * np.pi / 100)
     here, there = (
@@ -228,7 +228,7 @@ def test_the_order_of_the_segments_does_not_matter(seed):
 
 @pytest.mark.parametrize("theta", np.linspace(-np.pi, np.pi, 9))
 def test_parallel_walls_in_one_cluster_are_two(theta):
-    """Half a metre apart, their midpoints joined by a cut of 0.6 m."""
+    """Half a metre apart, their midpoints linked by a linkage distance of 0.6 m."""
     along = np.linspace(-0.5, 0.5, 6)
     one, other = np.stack([0 * along, along], axis=-1), np.stack([0 * along + 0.5, along], axis=-1)
     segments = moved(segments_at(np.concatenate([one, other]), np.zeros(12)), (1.0, 2.0, theta))
@@ -237,8 +237,8 @@ def test_parallel_walls_in_one_cluster_are_two(theta):
     assert merged.length == pytest.approx([1.5, 1.5], abs=1e-3)
 
 
-def test_merged_walls_face_as_their_pieces_do():
-    """Normals point away from the robot, not from the middle of the cluster."""
+def test_merged_walls_face_like_their_segments():
+    """Normals point away from the robot, not away from the centre of the cluster."""
     segments = segments_at([[0, 0], [0, 0.3], [0.5, 0], [0.5, 0.3]], np.zeros(4))
     merged = merge_by_hough(segments, linkage_distance=0.6)
     assert len(merged) == 2
@@ -247,7 +247,7 @@ def test_merged_walls_face_as_their_pieces_do():
 
 @pytest.mark.parametrize("far", [50.0, 1e3, 1e5])
 def test_a_wall_far_from_the_origin_is_not_lost(far):
-    """Ten metres of the paper's accumulator, from the world's origin, would hold none of these."""
+    """The paper's accumulator covers ten metres from the world's origin and would contain none of these."""
     along = np.linspace(-0.5, 0.5, 6)
     centre = np.stack([0 * along, along], axis=-1)
     there = moved(segments_at(centre, np.zeros(6)), (far, far, 0.3))
@@ -257,8 +257,8 @@ def test_a_wall_far_from_the_origin_is_not_lost(far):
 
 
 @pytest.mark.slow
-def test_a_large_cluster_of_walls_far_from_its_middle():
-    """Walls along a street, one cluster: rho goes up to a kilometre from its middle, and more."""
+def test_a_large_cluster_with_walls_far_from_its_centre():
+    """Walls along a street form one cluster; rho exceeds a kilometre."""
     along = np.arange(0, 2500, 50.0)
     merged = merge_by_hough(segments_at(np.stack([along, 0 * along], axis=-1), 0 * along), linkage_distance=60.0)
     assert len(merged) == len(along)
@@ -270,7 +270,7 @@ def test_nothing_to_merge(count):
     assert same(merge_by_hough(segments, linkage_distance=CUT), segments)
 
 
-def test_one_wall_seen_from_both_sides_and_around_the_cluster_is_one():
+def test_a_wall_through_the_cluster_centre_seen_from_both_sides_is_one():
     """Lines around rho = 0, with normals to both sides: the seam at rho = 0."""
     along = np.linspace(-0.6, 0.6, 8)
     across = 0.01 * (-1.0) ** np.arange(8)

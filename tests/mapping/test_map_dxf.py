@@ -1,4 +1,4 @@
-"""CAD drawings: what is read back is what was written, in metres, the same bytes twice."""
+"""CAD drawings: round trip in metres, and reproducible bytes."""
 
 import sys
 
@@ -37,8 +37,8 @@ def test_a_drawing_is_read_back(ezdxf, rng, tmp_path, count):
     np.testing.assert_array_equal(ends[..., 2], 0)
 
 
-def test_the_view_on_opening_holds_all_walls(ezdxf, tmp_path):
-    """A corridor of 25 m upwards; the height of the view is given, programs make it at least as wide."""
+def test_the_initial_view_contains_all_walls(ezdxf, tmp_path):
+    """A corridor of 25 m along y; the view has a given height, and programs make it at least as wide."""
     world = a_map([[[3, 0], [3, 25]], [[5, 0], [5, 25]]])
     save_dxf(world, tmp_path / "map.dxf")
     (view,) = ezdxf.readfile(tmp_path / "map.dxf").viewports.get("*Active")
@@ -47,7 +47,7 @@ def test_the_view_on_opening_holds_all_walls(ezdxf, tmp_path):
 
 
 def test_the_same_map_gives_the_same_bytes(ezdxf, rng, tmp_path, monkeypatch):
-    """Whenever it is written: a year lies between the two."""
+    """Also if a year passes between the two writes."""
     import datetime
 
     import ezdxf.document
@@ -76,6 +76,6 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_place_that_cannot_be_written_is_named(ezdxf, tmp_path):
+def test_a_file_that_cannot_be_written_is_named(ezdxf, tmp_path):
     with pytest.raises(SonarError, match=r"no/map\.dxf.*cannot write"):
         save_dxf(a_map([]), tmp_path / "no" / "map.dxf")

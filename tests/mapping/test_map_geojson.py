@@ -1,4 +1,4 @@
-"""Global maps as GeoJSON: there and back without loss, malformed ones named, and the segments of any GeoJSON."""
+"""Global maps as GeoJSON: lossless round trip, errors for malformed files, and segments of any GeoJSON."""
 
 import json
 from dataclasses import replace
@@ -51,7 +51,7 @@ def same(one, two):
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 9), points=st.integers(0, 9))
-def test_a_saved_map_is_the_same_map(seed, count, points, tmp_path_factory):
+def test_saving_and_loading_gives_the_same_map(seed, count, points, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.geojson"
     rng = np.random.default_rng(seed)
     world = with_points(rng, some_map(rng, count), points)
@@ -62,7 +62,7 @@ def test_a_saved_map_is_the_same_map(seed, count, points, tmp_path_factory):
     assert not any(getattr(again, name).flags.writeable for name in COLUMNS)
 
 
-def test_the_file_is_what_others_rely_on(tmp_path, rng):
+def test_the_file_has_the_documented_format(tmp_path, rng):
     world = some_map(rng, 2)
     save_map(world, tmp_path / "map.geojson")
     text = (tmp_path / "map.geojson").read_text()
@@ -77,7 +77,7 @@ def test_the_file_is_what_others_rely_on(tmp_path, rng):
     assert [entry["properties"]["sigma_rho"] is None for entry in document["features"]] == [True, False]
 
 
-def test_points_of_others_need_no_more_than_kind_and_place(tmp_path, rng):
+def test_points_need_only_kind_and_position(tmp_path, rng):
     write(tmp_path / "map.geojson", feature("Point", [1, 2, 0], kind="edge"), feature("LineString", ENDS, **GOOD))
     world = load_map(tmp_path / "map.geojson")
     assert (len(world), world.points.tolist(), world.point_kinds) == (1, [[1, 2]], ("edge",))
@@ -129,7 +129,7 @@ def write(path, *features):
         ({"type": "Feature", "geometry": None}, "no geometry"),
     ],
 )
-def test_a_bad_segment_is_named_in_one_line(bad, words, tmp_path):
+def test_an_invalid_feature_is_named_in_one_line(bad, words, tmp_path):
     path = write(
         tmp_path / "map.geojson", feature("LineString", ENDS, **GOOD), feature("Point", [0, 0], kind="edge"), bad
     )
@@ -142,7 +142,7 @@ def test_a_bad_segment_is_named_in_one_line(bad, words, tmp_path):
     assert message.isprintable()
 
 
-def test_no_file_no_json(tmp_path):
+def test_a_missing_file_or_invalid_json_is_refused(tmp_path):
     (tmp_path / "bad").write_text("{")
     for act in (load_map, load_segments):
         with pytest.raises(SonarError, match="bad: no JSON"):
@@ -153,7 +153,7 @@ def test_no_file_no_json(tmp_path):
         save_map(some_map(np.random.default_rng(0), 1), tmp_path / "nowhere" / "map.geojson")
 
 
-def test_segments_of_anything_with_lines(tmp_path, rng):
+def test_segments_of_any_geojson_with_lines(tmp_path, rng):
     ring = [[0, 0], [2, 0], [2, 1], [0, 0]]
     path = write(
         tmp_path / "any.geojson",
@@ -182,7 +182,7 @@ def test_walls_of_a_room_are_its_segments(tmp_path):
     assert set(kinds) == {"wall"}
 
 
-def test_walls_of_a_reference_are_what_exists(tmp_path, rng):
+def test_walls_of_a_reference_exclude_pseudo_segments(tmp_path, rng):
     model = PolygonalModel(rng.normal(size=(3, 2, 2)), rng.normal(size=(2, 2, 2)), rng.normal(size=(1, 2)))
     save_reference(model, tmp_path / "ref.geojson")
     assert load_segments(tmp_path / "ref.geojson")[1] == ("reference",) * 3 + ("pseudo",) * 2

@@ -1,4 +1,4 @@
-"""Corners and edges of the map: sightings add up in any order, and walls end at them."""
+"""Corners and edges: fusion and clustering in any order, and walls that end at them."""
 
 import math
 from dataclasses import replace
@@ -29,8 +29,8 @@ NOWHERE = np.zeros((0, 3))
 PATHS = np.zeros((1, 2), np.int64)
 
 
-def sighting(rng, pose, place, *, kind="corner", range_sigma=0.002, bearing_sigma=0.03, noise=True):
-    """A point of a local model: its range is known well, its bearing is not."""
+def observation(rng, pose, place, *, kind="corner", range_sigma=0.002, bearing_sigma=0.03, noise=True):
+    """A point of a local model with a precise range and an imprecise bearing."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     seen = (place - pose[:2]) @ np.array([[c, -s], [s, c]])
     ray = seen / np.linalg.norm(seen)
@@ -49,18 +49,18 @@ def sighting(rng, pose, place, *, kind="corner", range_sigma=0.002, bearing_sigm
     )
 
 
-def sightings(rng, places, poses, **choices):
-    """Sightings of all places from all poses, a scan a pose."""
+def observations(rng, places, poses, **choices):
+    """Observations of all positions from all poses, one scan per pose."""
     models = []
     for scan, pose in enumerate(poses):
-        points = tuple(sighting(rng, pose, place, **choices) for place in places)
+        points = tuple(observation(rng, pose, place, **choices) for place in places)
         models.append(LocalModel(scan, math.nan, (), points=points))
     return aggregate_points(models, poses)
 
 
 def some_points(rng, count):
     poses = np.column_stack([rng.uniform(-2, 2, (count, 2)), rng.uniform(-3, 3, count)])
-    return concatenate([sightings(rng, rng.uniform(-1, 1, (1, 2)), pose[None]) for pose in poses])
+    return concatenate([observations(rng, rng.uniform(-1, 1, (1, 2)), pose[None]) for pose in poses])
 
 
 def same(one, two, tolerance=1e-9):
@@ -77,7 +77,7 @@ def in_order(points):
     return points.take(np.lexsort((*points.position.T, points.echoes)))
 
 
-def test_nothing_is_points_too():
+def test_no_points():
     nothing = aggregate_points([], NOWHERE)
     assert (
         len(nothing)
@@ -91,19 +91,19 @@ def test_nothing_is_points_too():
 
 
 def test_a_model_without_a_pose_is_left_out(rng):
-    model = LocalModel(3, math.nan, (), points=(sighting(rng, np.zeros(3), np.array([1.0, 0.5])),))
+    model = LocalModel(3, math.nan, (), points=(observation(rng, np.zeros(3), np.array([1.0, 0.5])),))
     assert len(aggregate_points([model, model], np.array([[0, 0, 0], [np.nan] * 3]))) == 1
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_a_sighting_stands_where_the_pose_puts_it(seed):
+def test_points_are_transformed_by_the_poses(seed):
     rng = np.random.default_rng(seed)
     pose, place = rng.uniform(-3, 3, 3), rng.uniform(-3, 3, 2)
-    seen = sighting(rng, pose, place, kind="edge", noise=False)
+    seen = observation(rng, pose, place, kind="edge", noise=False)
     points = aggregate_points([LocalModel(7, 1.5, (), points=(seen,))], pose[None])
     assert points.position[0] == pytest.approx(transform_points(pose, np.array([[seen.x, seen.y]]))[0])
     assert points.position[0] == pytest.approx(place)
-    # Range is known best, along the line of sight.
+    # The smallest variance is that of the range, along the line of sight.
     ray = (place - pose[:2]) / np.linalg.norm(place - pose[:2])
     assert ray @ points.cov[0] @ ray == pytest.approx(np.linalg.eigvalsh(points.cov[0])[0])
     assert points.kinds == ("edge",)
@@ -112,7 +112,7 @@ def test_a_sighting_stands_where_the_pose_puts_it(seed):
 
 @pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 12))
-def test_the_sum_of_sums_is_the_sum_of_all_in_any_order(seed, count):
+def test_fusion_of_fusions_equals_fusion_of_all_in_any_order(seed, count):
     rng = np.random.default_rng(seed)
     points = some_points(rng, count)
     points = replace(points, scans=(points.scans[0], rng.integers(0, 5, count)))
@@ -127,10 +127,10 @@ def test_the_sum_of_sums_is_the_sum_of_all_in_any_order(seed, count):
     assert at_once.position[0] == pytest.approx(mean, abs=1e-9)
 
 
-def test_two_poses_tell_what_one_cannot(rng):
+def test_two_poses_determine_a_position_that_one_cannot(rng):
     place = np.array([[1.0, 1.0]])
     poses = np.array([[0.0, 1.0, 0.3], [1.0, 0.0, -2.0]])
-    one, both = sightings(rng, place, poses[:1], noise=False), sightings(rng, place, poses, noise=False)
+    one, both = observations(rng, place, poses[:1], noise=False), observations(rng, place, poses, noise=False)
     both = cluster_points(both)[0]
     assert len(both) == 1
     assert np.linalg.eigvalsh(one.cov[0])[1] ** 0.5 > 0.02
@@ -139,12 +139,12 @@ def test_two_poses_tell_what_one_cannot(rng):
 
 
 @pytest.mark.slow
-def test_what_is_said_of_a_point_is_so(rng):
+def test_covariances_are_consistent(rng):
     poses = np.column_stack([rng.uniform(-1.5, 1.5, (8, 2)), rng.uniform(-3, 3, 8)])
     place = np.array([[2.0, 1.5]])
     nees = []
     for _ in range(200):
-        found = cluster_points(sightings(rng, place, poses))[0]
+        found = cluster_points(observations(rng, place, poses))[0]
         off = found.position[0] - place[0]
         nees.append(off @ np.linalg.solve(found.inflated_cov[0], off))
     assert 1.2 < np.mean(nees) < 3.0  # 2, if all were known
@@ -156,7 +156,7 @@ def test_clusters_do_not_depend_on_the_order_and_are_stable(seed):
     rng = np.random.default_rng(seed)
     places = np.array([[0.0, 2.0], [0.0, 1.0], [2.0, 2.0], [2.0, 0.5]])
     poses = np.column_stack([rng.uniform(0.5, 1.5, (5, 2)), rng.uniform(-3, 3, 5)])
-    points = sightings(rng, places, poses)
+    points = observations(rng, places, poses)
     found, point_of = cluster_points(points)
     order = rng.permutation(len(points))
     again, again_of = cluster_points(points.take(order))
@@ -166,20 +166,20 @@ def test_clusters_do_not_depend_on_the_order_and_are_stable(seed):
     same(cluster_points(merge_cells(merge_cells(points)))[0], cluster_points(merge_cells(points))[0])
 
 
-def test_points_apart_stay_apart_and_kinds_are_what_most_say(rng):
+def test_distant_points_stay_separate_and_the_kind_is_the_most_probable(rng):
     poses = np.column_stack([rng.uniform(-1, 1, (6, 2)), np.zeros(6)])
     near = np.array([[1.5, 2.0], [1.5 + 8 * SETTINGS.points.position_floor, 2.0]])
-    found, _ = cluster_points(sightings(rng, near, poses, bearing_sigma=0.01))
+    found, _ = cluster_points(observations(rng, near, poses, bearing_sigma=0.01))
     assert len(found) == 2
-    edges = sightings(rng, near[:1], poses[:4], kind="edge")
-    corners = sightings(rng, near[:1], poses[4:], kind="corner")
+    edges = observations(rng, near[:1], poses[:4], kind="edge")
+    corners = observations(rng, near[:1], poses[4:], kind="corner")
     assert cluster_points(concatenate([edges, corners]))[0].kinds == ("edge",)
 
 
-def test_condensed_step_by_step_is_condensed_at_once(rng):
+def test_merging_cells_step_by_step_equals_merging_at_once(rng):
     places = rng.uniform(-2, 2, (4, 2))
     poses = np.column_stack([rng.uniform(-1, 1, (30, 2)), np.zeros(30)])
-    points = sightings(rng, places, poses)
+    points = observations(rng, places, poses)
     whole, so_far = merge_cells(points), aggregate_points([], NOWHERE)
     for k in range(len(points)):
         so_far = merge_cells(concatenate([so_far, points.take(np.array([k]))]))
@@ -189,11 +189,11 @@ def test_condensed_step_by_step_is_condensed_at_once(rng):
     assert fewest.scans[1].max() == points.scans[1].max()
 
 
-def test_what_moves_along_with_the_robot_is_no_point(rng):
+def test_a_point_that_moves_with_the_robot_is_not_static(rng):
     poses = np.column_stack([np.linspace(-1, 1, 9), np.zeros((9, 2))])
     still = np.array([0.0, 2.0])
-    moving = [sightings(rng, still[None] + [[0, 0.03 * pose[0]]], pose[None]) for pose in poses]
-    for points, expected in ((sightings(rng, still[None], poses), True), (concatenate(moving), False)):
+    moving = [observations(rng, still[None] + [[0, 0.03 * pose[0]]], pose[None]) for pose in poses]
+    for points, expected in ((observations(rng, still[None], poses), True), (concatenate(moving), False)):
         found = points.fuse(np.zeros(9, np.int64))
         assert is_static(found, points, np.zeros(9, np.int64), systematic_error=0.005).tolist() == [expected]
 
@@ -202,7 +202,7 @@ def test_what_moves_along_with_the_robot_is_no_point(rng):
 
 
 def walls_of(*segments, sigma=0.001, turn=0.002, count=4):
-    """Walls as they are after merging."""
+    """Walls as after fusion."""
     ends = np.array(segments, dtype=np.float64).reshape(-1, 2, 2)
     along = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(along, axis=-1)
@@ -249,13 +249,13 @@ def test_two_walls_end_at_the_corner_between_them():
     assert np.sort(walls.length) == pytest.approx([2.0, 2.0], abs=0.005)
 
 
-def test_feet_beyond_the_corner_are_taken_back():
+def test_footpoints_beyond_the_corner_are_cut_off():
     walls = snap_endpoints(walls_of([[0, 0], [2.1, 0]]), points_at([2.0, 0.0]), shut)
     assert walls.length == pytest.approx([2.0], abs=1e-6)
 
 
 @pytest.mark.parametrize("place", [[2.0, 0.1], [3.6, 0.0], [1.0, 0.0], [0.8, 0.3]])
-def test_other_points_end_nothing(place):
+def test_points_off_the_line_end_no_wall(place):
     walls = walls_of([[0, 0], [1.6, 0]])
     assert snap_endpoints(walls, points_at(place), shut).endpoints.tolist() == walls.endpoints.tolist()
     assert snap_endpoints(walls, points_at(), shut) is walls
@@ -277,20 +277,20 @@ def test_the_far_side_of_a_doorway_ends_the_other_wall():
     assert walls.length == pytest.approx([1.6, 1.4])
 
 
-def test_a_corner_tells_a_short_wall_its_direction():
+def test_a_corner_improves_the_direction_of_a_short_wall():
     turned = walls_of([[0, 0], [0.3, 0.004]], turn=0.02)
     walls = snap_endpoints(turned, points_at([1.3, 0.0]), shut)
     assert abs(walls.theta[0] + math.pi / 2) < 0.005 < abs(turned.theta[0] + math.pi / 2)
     assert walls.info_theta[0] > 4 * turned.info_theta[0]
 
 
-def test_no_point_floats_on_a_face_but_where_walls_meet_they_stay():
+def test_points_on_a_face_are_detached_unless_walls_meet_there():
     walls = walls_of([[0, 0], [2, 0]], [[1.5, 0.05], [1.5, 1]])
     points = points_at([0.7, 0.005], [1.5, 0.0], [1.98, 0.0], [0.7, 0.4])
     assert detached_points(walls, points).tolist() == [True, False, False, False]
 
 
-def test_a_short_wall_across_a_point_is_that_point():
+def test_a_short_wall_across_a_point_is_spurious():
     short, long = [[0, 0], [0.2, 0]], [[0, 1], [2, 1]]
     walls = walls_of(short, long, count=2)
     assert spurious_walls(walls, points_at([0.1, 0.005], [1, 1])).tolist() == [True, False]
@@ -303,7 +303,7 @@ def test_a_short_wall_across_a_point_is_that_point():
 
 @pytest.fixture(scope="module")
 def office_map():
-    """The office in three runs: evidence, with the scans and the local models it comes from."""
+    """Three runs through the office: the log, its local models and its evidence."""
     office, runs = load_office(), []
     for seed in range(3):
         heard = simulate(office.ring, office.room, office.poses, sigma=0.005, seed=seed, stamps=office.stamps)
@@ -314,7 +314,7 @@ def office_map():
 
 
 def ends_off(world, room):
-    """How far the ends of segments are from the nearest true end of their wall, along it, metres."""
+    """Distance of the ends of segments from the nearest true end of their wall, along it, metres."""
     off = []
     for segment in world.segments:
         apart = point_to_segments(segment, room.walls).sum(axis=0)
@@ -341,7 +341,7 @@ def test_points_of_the_office_are_where_walls_end(office_map):
         assert (np.diff(world.point_echoes) <= 0).all()
 
 
-def test_ends_are_nearer_to_the_true_ends_than_the_outermost_feet(office_map):
+def test_snapped_ends_are_closer_to_the_true_ends_than_footpoints(office_map):
     office, runs = office_map
     with_points, without = [], []
     for _, _, evidence in runs:
@@ -358,7 +358,7 @@ def test_merging_as_in_the_paper_has_no_points(office_map):
     assert len(assemble_map(runs[0][2], merging="paper").points) == 0
 
 
-def test_parts_in_any_order_are_the_whole(office_map, rng):
+def test_scan_by_scan_in_any_order_equals_all_at_once(office_map, rng):
     office, runs = office_map
     log, models, evidence = runs[0]
     whole = assemble_map(evidence)
@@ -373,8 +373,8 @@ def test_parts_in_any_order_are_the_whole(office_map, rng):
     assert (again.point_kinds, again.point_scans) == (whole.point_kinds, whole.point_scans)
 
 
-def test_ends_do_not_cross_a_doorway():
-    """A wall with a doorway, and another behind it: what is beyond was seen through it."""
+def test_walls_do_not_extend_across_a_doorway():
+    """A wall with a doorway, through which another wall was observed."""
     walls = [[[-2, 1.2], [-0.4, 1.2]], [[0.5, 1.2], [2, 1.2]], [[-1, 1.9], [1, 1.9]], [[-2, -1], [2, -1]]]
     room = Room(np.array(walls, dtype=np.float64))
     ring = load_office().ring
@@ -388,16 +388,16 @@ def test_ends_do_not_cross_a_doorway():
     assert not ((front[..., 0].min(axis=1) < -0.4) & (front[..., 0].max(axis=1) > 0.5)).any()
 
 
-def test_no_wall_goes_on_beyond_an_edge():
+def test_edges_block_gaps():
     gaps = np.array([[[0.0, 0.0], [0.9, 0.0]], [[0.0, 1.0], [0.9, 1.0]], [[0.0, 2.0], [0.9, 2.0]]])
     points = points_at([0.02, 0.0], [0.4, 1.0], [1.3, 2.0])
     edges = replace(points, corner_log_odds=-points.corner_log_odds)
     assert blocks_gap(gaps, edges).tolist() == [True, True, False]
-    assert not blocks_gap(gaps, points).any()  # corners say nothing of the wall beside them
+    assert not blocks_gap(gaps, points).any()  # corners do not end a wall
 
 
-def test_poses_that_are_off_raise_the_floor_and_leave_one_wall(rng):
-    """As many walls as there are, whether poses are known or off by a centimetre."""
+def test_pose_errors_raise_the_systematic_error_and_leave_one_wall(rng):
+    """Segments become one wall whether poses are exact or off by a centimetre."""
     for off in (0.0, 0.01):
         ends = np.stack([np.linspace(0, 2, 9), np.linspace(0.3, 2.3, 9)], axis=-1)
         across = rng.normal(0, math.hypot(off, 0.001), (9, 1)) + rng.normal(0, 0.0002, (9, 2))
@@ -409,7 +409,7 @@ def test_poses_that_are_off_raise_the_floor_and_leave_one_wall(rng):
         )
 
 
-def test_a_line_with_foreign_echoes_counts_for_little():
+def test_a_line_with_foreign_echoes_is_down_weighted():
     segments = walls_of(*[[[k / 4, 0.0], [k / 4 + 0.3, 0.0]] for k in range(6)], [[0.5, 0.012], [0.8, 0.012]], count=1)
     segments = replace(segments, chi_squared=np.zeros(7))
     together = np.zeros(7, np.int64)
@@ -420,7 +420,7 @@ def test_a_line_with_foreign_echoes_counts_for_little():
     assert robust_refit(clean, together[:6], clean.fuse(together[:6])).centre[0, 1] == pytest.approx(0, abs=1e-12)
 
 
-def test_the_figure_of_a_map_shows_its_points(office_map):
+def test_the_map_figure_shows_the_points(office_map):
     world = assemble_map(office_map[1][0][2])
     figure = map_figure(world)
     (axes,) = figure.axes

@@ -1,4 +1,4 @@
-"""Fusion of pieces to walls: laws of order, place and direction, and no two walls left that still match."""
+"""Fusion of segments into walls: invariance to order and rigid motions, gates, and no matching walls left."""
 
 from itertools import combinations
 
@@ -18,7 +18,7 @@ NOISE = SETTINGS.segments
 GAP = 0.5
 SEEDS = st.integers(0, 2**32 - 1)
 SOME = settings(max_examples=10, phases=[Phase.generate])
-"""A smaller seed is no simpler one."""
+"""No shrinking: a smaller seed is not a simpler example."""
 DOOR, THICK = 0.9, 0.12
 HOUSE = np.array(
     [
@@ -32,7 +32,7 @@ HOUSE = np.array(
 
 
 def seen_walls(rng, walls, each, *, noise=1.0, reach=0.2):
-    """Pieces of walls, with the noise of the Hough step, and which wall each is of; the left face is seen."""
+    """Segments of walls with the noise of the Hough detector, seen from the left, and the wall of each."""
     wall = np.repeat(np.arange(len(walls)), each)
     along = walls[wall, 1] - walls[wall, 0]
     size = np.linalg.norm(along, axis=-1)
@@ -59,7 +59,7 @@ def partition(labels):
 
 
 def in_one_order(walls):
-    """The same walls in the order of the scans that saw them; here every scan sees one piece."""
+    """The walls in the order of the scans that saw them; every scan sees one segment."""
     lists = walls.scan_lists()
     return walls.take(np.array(sorted(range(len(walls)), key=lists.__getitem__), np.int64))
 
@@ -81,18 +81,18 @@ def clutter(rng, count):
 
 
 def crowd(rng):
-    """Anything: walls, and pieces that belong to none."""
+    """Walls, and segments that belong to none."""
     walls, _ = seen_walls(rng, HOUSE[rng.permutation(8)[:4]], int(rng.integers(2, 9)))
     return concatenate([walls, clutter(rng, int(rng.integers(0, 12)))])
 
 
-# --- what comes out is the walls ---
+# --- the result ---
 
 
 @SOME
 @given(SEEDS)
-def test_pieces_of_a_house_are_its_walls(seed):
-    """Doors stay open, both faces of a partition stay apart, corners do not join."""
+def test_segments_of_a_house_become_its_walls(seed):
+    """Doors stay open, the two faces of a partition stay separate, and walls do not join at corners."""
     segments, truth = seen_walls(np.random.default_rng(seed), HOUSE, 24, noise=0.7)
     walls, wall_of = fuse_segments(segments, gap=GAP)
     assert partition(wall_of) == partition(truth)
@@ -111,7 +111,7 @@ def test_no_two_walls_match(seed, gap):
 
 
 def parallels(offset, first, last, *, theta=0.0):
-    """Long walls that are well known, side by side."""
+    """Long parallel walls with small covariances."""
     first, last = np.broadcast_arrays(np.asarray(first, float), np.asarray(last, float), offset)[:2]
     centre = np.stack([np.asarray(offset, float), (first + last) / 2], axis=-1)
     sure = np.full(len(centre), 1e6)
@@ -119,8 +119,8 @@ def parallels(offset, first, last, *, theta=0.0):
 
 
 @pytest.mark.parametrize("beside", range(13))
-def test_no_two_walls_match_however_many_lie_beside_them(beside):
-    """Two that go on in one another, with 0.45 m between them, among walls 6.5 cm apart."""
+def test_no_two_walls_match_among_many_parallel_walls(beside):
+    """Two collinear walls with a gap of 0.45 m, among parallel walls 6.5 cm apart."""
     away = [0.065 * (k // 2 + 1) * (-1) ** k for k in range(beside)]
     segments = parallels([0, 0, *away], [-2, 0.45] + [-2.2] * beside, [0, 2] + [2.2] * beside)
     walls, wall_of = fuse_segments(segments, gap=GAP)
@@ -131,8 +131,8 @@ def test_no_two_walls_match_however_many_lie_beside_them(beside):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gap", [0.05, 0.1, 0.2, 0.5])
-def test_no_two_pieces_match_whatever_their_directions(gap):
-    """At one place, turned; gaps that are short beside the reach of a turn."""
+def test_no_two_walls_match_at_any_angle(gap):
+    """Also for gaps that are small compared with the search radius of directions."""
     for degrees in range(1, 40):
         segments = segments_at([[0, 0], [0, 0.3 + gap]], np.radians([0, degrees]), length=0.3)
         for one in (segments, segments_at([[0, 0], [0, 0]], np.radians([0, degrees]))):
@@ -141,7 +141,7 @@ def test_no_two_pieces_match_whatever_their_directions(gap):
 
 @SOME
 @given(SEEDS)
-def test_every_piece_lies_on_its_wall(seed):
+def test_every_segment_lies_on_its_wall(seed):
     segments = crowd(np.random.default_rng(seed))
     walls, wall_of = fuse_segments(segments, gap=GAP)
     assert sorted(set(wall_of.tolist())) == list(range(len(walls)))
@@ -160,7 +160,7 @@ def test_every_piece_lies_on_its_wall(seed):
 
 @SOME
 @given(SEEDS)
-def test_the_order_of_the_pieces_does_not_matter(seed):
+def test_order_does_not_matter(seed):
     rng = np.random.default_rng(seed)
     segments = crowd(rng)
     order = rng.permutation(len(segments))
@@ -171,7 +171,7 @@ def test_the_order_of_the_pieces_does_not_matter(seed):
 
 @SOME
 @given(SEEDS)
-def test_fusing_again_changes_nothing(seed):
+def test_fusion_is_idempotent(seed):
     walls, _ = fuse_segments(crowd(np.random.default_rng(seed)), gap=GAP)
     again, wall_of = fuse_segments(walls, gap=GAP)
     assert same(again, walls)
@@ -180,7 +180,7 @@ def test_fusing_again_changes_nothing(seed):
 
 @SOME
 @given(SEEDS, st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-4, 4)))
-def test_moving_the_world_moves_the_walls_and_nothing_else(seed, pose):
+def test_fusion_is_equivariant_under_rigid_motions(seed, pose):
     segments, _ = seen_walls(np.random.default_rng(seed), HOUSE, 9)
     walls, wall_of = fuse_segments(segments, gap=GAP)
     there, wall_of_there = fuse_segments(moved(segments, pose), gap=GAP)
@@ -198,7 +198,7 @@ def test_far_from_the_origin(shift):
     )
 
 
-def test_walls_far_apart_do_not_matter_to_each_other():
+def test_distant_walls_do_not_affect_each_other():
     segments, _ = seen_walls(np.random.default_rng(5), HOUSE, 9)
     far = moved(segments, (1e4, -1e4, 1.0))
     both, _ = fuse_segments(concatenate([segments, far]), gap=GAP)
@@ -220,7 +220,7 @@ def test_nothing_to_fuse(count):
 
 @pytest.mark.parametrize("gap", [0.3, 0.5, 1.0])
 @pytest.mark.parametrize("theta", [0.0, 2.0, np.pi])
-def test_gaps(gap, theta):
+def test_gaps_up_to_the_limit_are_closed(gap, theta):
     def two(between):
         there = moved(segments_at([[0, 0], [0, 0.4 + between]], [0, 0], length=0.4), (1, 2, theta))
         return len(fuse_segments(there, gap=gap)[0])
@@ -232,7 +232,7 @@ def test_gaps(gap, theta):
 @SOME
 @given(SEEDS, st.sampled_from([(0.10, 2), (0.02, 1)]))
 def test_parallel_walls(seed, apart):
-    """10 cm apart they are two, 2 cm apart the noise makes them one."""
+    """At 10 cm they are two; at 2 cm the noise makes them one."""
     offset, expected = apart
     side = np.array([[[0, 0], [0, 2.0]], [[offset, 0], [offset, 2.0]]])
     segments, _ = seen_walls(np.random.default_rng(seed), side, 8, noise=0.5)
@@ -257,8 +257,8 @@ def test_walls_that_meet_at_20_degrees_are_two(seed):
     assert partition(fuse_segments(segments, gap=GAP)[1]) == partition(truth)
 
 
-def test_the_gate_of_directions_is_that_many_standard_deviations():
-    """Of their difference, with what walls and odometry add to it."""
+def test_the_gate_of_directions_is_in_standard_deviations():
+    """Standard deviation of the difference, including the systematic error."""
     spread = np.hypot(np.sqrt(2) * NOISE.theta_sd, np.sqrt(2) * np.radians(1.5))
     for turn, expected in ((0.9 * SETTINGS.fusion.gate * spread, 1), (1.1 * SETTINGS.fusion.gate * spread, 2)):
         assert len(fuse_segments(segments_at([[0, 0], [0, 0]], [0, turn]), gap=GAP)[0]) == expected, np.degrees(turn)
@@ -270,7 +270,7 @@ def test_two_lines_that_cross_at_20_degrees_are_two():
 
 @SOME
 @given(SEEDS)
-def test_mismatch_does_not_depend_on_which_comes_first(seed):
+def test_mismatch_is_symmetric(seed):
     segments = crowd(np.random.default_rng(seed))
     pairs = every_pair(len(segments))
     there, back = mismatch(segments, pairs, gap=GAP), mismatch(segments, pairs[:, ::-1].copy(), gap=GAP)
@@ -302,13 +302,13 @@ def test_openings_stay_open():
 
 @SOME
 @given(SEEDS)
-def test_an_opening_that_is_never_there_changes_nothing(seed):
+def test_without_openings_nothing_changes(seed):
     segments = crowd(np.random.default_rng(seed))
     walls, _ = fuse_segments(segments, gap=GAP, is_opening=lambda gaps, theta: np.zeros(len(gaps), bool))
     assert same(walls, fuse_segments(segments, gap=GAP)[0])
 
 
-def test_where_pieces_overlap_there_is_no_opening():
-    """What lies between two pieces is a gap only if something does."""
+def test_overlapping_segments_have_no_opening():
+    """Overlapping segments have no gap."""
     segments = segments_at([[0, 0], [0, 0.3]], [0, 0], length=1.0)
     assert len(fuse_segments(segments, gap=GAP, is_opening=lambda gaps, theta: np.ones(len(gaps), bool))[0]) == 1

@@ -1,4 +1,4 @@
-"""Pieces of walls: where poses put them, and how they add up, against matrices and SciPy's least squares."""
+"""Wall segments: transformation to the world frame, and fusion, against matrices and SciPy's least squares."""
 
 import math
 
@@ -18,11 +18,11 @@ from jaxsonar.mapping.wall_segments import WallSegments, aggregate_segments
 NOISE = SETTINGS.segments
 SEEDS = st.integers(0, 2**32 - 1)
 SOME = settings(max_examples=40, phases=[Phase.generate])
-"""A smaller seed is no simpler one."""
+"""No shrinking: a smaller seed is not a simpler example."""
 
 
 def one_wall(rng, count, *, noise=1.0, theta=0.7, length=3.0):
-    """Pieces of one straight wall with a distinct value in every column; noise 1 is that of the Hough step."""
+    """Segments of one straight wall with a distinct value in every column; noise 1 is that of the Hough detector."""
     along, across = rng.uniform(-length / 2, length / 2, count), rng.normal(0, noise * NOISE.offset_sd, count)
     centre = np.array([2.0, -1.0]) + np.stack([across, along], axis=-1) @ rotation(theta).T
     seen = [sorted(rng.choice(40, rng.integers(1, 5), replace=False).tolist()) for _ in range(count)]
@@ -42,7 +42,7 @@ def one_wall(rng, count, *, noise=1.0, theta=0.7, length=3.0):
 
 
 def near(one, two, tolerance, *, extent=None):
-    """The largest deviation of lines (m, rad) and of ends (m) is below the tolerance, all else the same."""
+    """Assert that lines (m, rad) and ends (m) differ by less than the tolerance, and nothing else differs."""
     turn = np.abs(wrap_angle(one.theta - two.theta))
     across = np.abs(((one.centre - two.centre) * one.normal).sum(-1))
     assert turn.max() < tolerance
@@ -56,12 +56,12 @@ def near(one, two, tolerance, *, extent=None):
 
 
 def all_of(segments):
-    """All of them as one."""
+    """The fusion of all."""
     return segments.fuse(np.zeros(len(segments), np.int64))
 
 
 def some_groups(rng, count):
-    """A group for each of so many pieces, none of the groups empty."""
+    """Random group numbers without an empty group."""
     return np.unique(rng.integers(0, max(1, count // 3), count), return_inverse=True)[1]
 
 
@@ -81,7 +81,7 @@ def some_model(rng, scan, lines):
 
 @SOME
 @given(SEEDS)
-def test_segments_stand_where_the_poses_put_them(seed):
+def test_segments_are_transformed_by_the_poses(seed):
     rng = np.random.default_rng(seed)
     models = [some_model(rng, 11 * k, int(rng.integers(0, 4))) for k in range(1, 6)]
     poses = np.concatenate([rng.uniform(-9, 9, (5, 2)), rng.uniform(-7, 7, (5, 1))], axis=1)
@@ -110,7 +110,7 @@ def test_segments_stand_where_the_poses_put_them(seed):
     assert (segments.chi_squared == 0).all()
 
 
-def test_scans_without_stamp_count_by_their_number():
+def test_scans_without_stamp_use_their_number_as_time():
     rng = np.random.default_rng(0)
     models = [some_model(rng, 7, 1), some_model(rng, 8, 1)]
     assert aggregate_segments(models, np.zeros((2, 3))).last_seen.tolist() == [7, 0.8]
@@ -130,11 +130,11 @@ def test_models_without_lines_or_without_poses():
     assert len(aggregate_segments([some_model(rng, 1, 2)], np.full((1, 3), np.nan))) == 0
 
 
-# --- adding up ---
+# --- fusion ---
 
 
 def least_squares_line(segments, origin):
-    """Offset at ``origin`` and direction of the line that fits best, its misfit and its information matrix."""
+    """Offset at ``origin`` and direction of the line that fits best, its chi-squared and its information matrix."""
 
     def deviations(line):
         offset, theta = line
@@ -149,22 +149,22 @@ def least_squares_line(segments, origin):
 
 @SOME
 @given(SEEDS, st.integers(2, 12))
-def test_the_sum_is_the_line_of_least_squares(seed, count):
+def test_fusion_is_the_least_squares_line(seed, count):
     segments = one_wall(np.random.default_rng(seed), count, noise=0.02)  # small angles
     total = all_of(segments)
     (offset, theta), misfit, information = least_squares_line(segments, total.centre[0])
     assert wrap_angle(total.theta - theta) == pytest.approx(0, abs=1e-6)
     assert offset == pytest.approx(0, abs=1e-7)
     assert total.chi_squared - segments.chi_squared.sum() == pytest.approx(misfit, rel=1e-3)
-    # At the centre the errors of offset and direction are independent.
+    # At the centre the errors of offset and direction are uncorrelated.
     assert np.diag(information) == pytest.approx([total.info_offset[0], total.info_theta[0]], rel=1e-3)
     assert abs(information[0, 1]) < 1e-3 * math.sqrt(information[0, 0] * information[1, 1])
 
 
 @SOME
 @given(SEEDS, st.integers(2, 15))
-def test_sums_of_sums_are_the_sum_of_all(seed, count):
-    """Only the ends, projected twice, may differ: by across the wall times turned, 3 cm times 6 degrees."""
+def test_fusion_of_fusions_equals_fusion_of_all(seed, count):
+    """Only the ends may differ, because they are projected twice: by offset times angle, 3 cm times 6 degrees."""
     rng = np.random.default_rng(seed)
     segments = one_wall(rng, count)
     near(all_of(segments.fuse(some_groups(rng, count))), all_of(segments), 1e-6, extent=3e-3)
@@ -172,7 +172,7 @@ def test_sums_of_sums_are_the_sum_of_all(seed, count):
 
 @SOME
 @given(SEEDS, st.integers(1, 15))
-def test_the_order_does_not_matter(seed, count):
+def test_order_does_not_matter(seed, count):
     rng = np.random.default_rng(seed)
     segments, group, order = one_wall(rng, count), some_groups(rng, count), rng.permutation(count)
     near(segments.take(order).fuse(group[order]), segments.fuse(group), 1e-9)
@@ -180,13 +180,13 @@ def test_the_order_does_not_matter(seed, count):
 
 @SOME
 @given(SEEDS, st.integers(2, 9), st.tuples(*[st.floats(-1e4, 1e4)] * 2, st.floats(-4, 4)))
-def test_moving_the_world_moves_the_sum_and_nothing_else(seed, count, pose):
+def test_fusion_is_equivariant_under_rigid_motions(seed, count, pose):
     segments = one_wall(np.random.default_rng(seed), count)
     near(all_of(moved(segments, pose)), moved(all_of(segments), pose), 1e-8)
 
 
-def test_the_sum_of_three_does_not_depend_on_where_north_is():
-    """The least one of the law above: which piece is left or right of which must not count."""
+def test_fusion_of_three_is_equivariant_under_half_a_turn():
+    """The smallest example of the law above: the order along the wall must not matter."""
     segments = segments_at([[0, -1], [0, 0], [0, 1]], np.radians([3, 0, 0]))
     half_turn = (0.0, 0.0, np.pi)
     near(all_of(moved(segments, half_turn)), moved(all_of(segments), half_turn), 1e-8)
@@ -194,7 +194,7 @@ def test_the_sum_of_three_does_not_depend_on_where_north_is():
 
 @SOME
 @given(SEEDS, st.integers(1, 9))
-def test_a_group_of_one_stays_what_it_is(seed, count):
+def test_a_group_with_one_member_is_unchanged(seed, count):
     rng = np.random.default_rng(seed)
     segments = one_wall(rng, count + 3, theta=rng.uniform(-np.pi, np.pi))
     group = np.append(rng.permutation(count), [count] * 3)  # the last three add up
@@ -207,7 +207,7 @@ def test_a_group_of_one_stays_what_it_is(seed, count):
 
 @SOME
 @given(SEEDS, st.integers(2, 9))
-def test_faces_seen_from_the_other_side_are_the_same_line(seed, count):
+def test_the_side_of_observation_does_not_change_the_line(seed, count):
     rng = np.random.default_rng(seed)
     segments = one_wall(rng, count)
     behind = rng.random(count) < 0.5
@@ -220,7 +220,7 @@ def test_faces_seen_from_the_other_side_are_the_same_line(seed, count):
 
 @SOME
 @given(SEEDS, st.integers(1, 15))
-def test_what_is_known_of_the_pieces_is_known_of_their_sum(seed, count):
+def test_fusion_adds_up_the_columns(seed, count):
     rng = np.random.default_rng(seed)
     segments, group = one_wall(rng, count), some_groups(rng, count)
     total, lists = segments.fuse(group), segments.scan_lists()
@@ -240,8 +240,8 @@ def test_what_is_known_of_the_pieces_is_known_of_their_sum(seed, count):
 
 
 @pytest.mark.parametrize("theta", [-np.pi, np.pi - 1e-9, np.pi / 2, -np.pi / 2, 0.0])
-def test_seams(theta):
-    """Directions on both sides of +-pi are near one another."""
+def test_fusion_across_the_seam_of_angles(theta):
+    """Directions on both sides of +-pi are close to each other."""
     rng = np.random.default_rng(3)
     turn, along = rng.normal(0, NOISE.theta_sd, 20), rng.uniform(-1, 1, 20)
     lying = segments_at(np.stack([0 * along, along], axis=-1), turn)
@@ -251,14 +251,14 @@ def test_seams(theta):
     assert -np.pi <= total.theta[0] < np.pi
 
 
-def test_two_far_apart_tell_the_direction_of_their_wall():
-    """The parallel-axis theorem: 1 cm at 2 m says more than 3 degrees."""
+def test_distant_segments_determine_the_direction_of_their_wall():
+    """Parallel-axis theorem: 1 cm at a distance of 2 m is more precise than 3 degrees."""
     total = all_of(segments_at([[0, -1], [0, 1]], np.radians([3, 3])))
     assert abs(total.theta[0]) < np.radians(0.2)
     assert total.info_theta[0] == pytest.approx(2 * NOISE.theta_sd**-2 + 2 * NOISE.offset_sd**-2, rel=0.01)
 
 
-def test_far_from_the_origin_nothing_is_lost():
+def test_no_precision_is_lost_far_from_the_origin():
     segments = one_wall(np.random.default_rng(1), 9)
     far = all_of(moved(segments, (1e4, -1e4, 0.0)))
     near(moved(far, (-1e4, 1e4, 0.0)), all_of(segments), 1e-9)
@@ -269,7 +269,7 @@ def test_far_from_the_origin_nothing_is_lost():
 
 @SOME
 @given(SEEDS, st.integers(1, 12))
-def test_what_is_taken_apart_can_be_joined_again(seed, count):
+def test_take_and_concatenate_are_inverse(seed, count):
     rng = np.random.default_rng(seed)
     segments, order = one_wall(rng, count), rng.permutation(count)
     cut = int(rng.integers(0, count + 1))
@@ -281,7 +281,7 @@ def test_what_is_taken_apart_can_be_joined_again(seed, count):
 
 @SOME
 @given(SEEDS, st.integers(1, 12))
-def test_taking_by_number_and_by_mask(seed, count):
+def test_take_by_number_equals_take_by_mask(seed, count):
     rng = np.random.default_rng(seed)
     segments, mask = one_wall(rng, count), rng.random(count) < 0.5
     some = segments.take(mask)
@@ -291,6 +291,6 @@ def test_taking_by_number_and_by_mask(seed, count):
     assert some.length == pytest.approx(np.linalg.norm(some.endpoints[:, 1] - some.endpoints[:, 0], axis=-1))
 
 
-def test_a_row_taken_twice_is_there_twice():
+def test_take_may_repeat_a_row():
     segments = one_wall(np.random.default_rng(1), 3)
     assert segments.take(np.array([1, 1])).scan_lists() == (segments.scan_lists()[1],) * 2

@@ -1,4 +1,4 @@
-"""Occupancy grids say what is free, occupied and unknown, whatever the order of scans; shapely knows the truth."""
+"""Occupancy grids against true rooms (by shapely), for any order of scans, and their files."""
 
 import ast
 from itertools import pairwise
@@ -30,7 +30,7 @@ def office():
 
 @pytest.fixture(scope="module")
 def heard(office):
-    """What the ring hears in the office."""
+    """A log of the office."""
     simulation = simulate(office.ring, office.room, office.poses, sigma=0.003, seed=1, stamps=office.stamps)
     return simulation.as_log(office.ring, office.poses)
 
@@ -41,13 +41,13 @@ def office_grid(office, heard):
 
 
 def listen(ring, walls, poses, *, poles=(), **errors):
-    """A log of what a ring hears at the given poses."""
+    """A simulated log at the given poses."""
     room = Room(np.array(walls).reshape(-1, 2, 2), (), np.array(poles).reshape(-1, 2))
     return simulate(ring, room, poses, **errors).as_log(ring, poses)
 
 
 def silent(poses):
-    """A log in which nothing was heard."""
+    """A log without echoes."""
     nothing = np.zeros(0, int)
     return Log.from_echoes(nothing, nothing, nothing, np.zeros(0), stamp=np.arange(len(poses)) / 10, pose=poses)
 
@@ -61,7 +61,7 @@ def centres(grid):
 
 
 def truly_free(room, points):
-    """Inside the outermost walls and outside the boxes that stand within, by shapely."""
+    """Whether points are inside the outermost walls and outside the boxes, by shapely."""
     found = shapely.polygonize([shapely.LineString(wall) for wall in room.walls]).geoms
     faces = [face for face in found if isinstance(face, shapely.Polygon)]
     outline = max((shapely.Polygon(face.exterior) for face in faces), key=lambda face: face.area)
@@ -72,8 +72,8 @@ def truly_free(room, points):
     return free
 
 
-def way(rng, room, *, step=0.1, clearance=0.35):
-    """Poses along straight lines between places with space, those too near to something left out."""
+def free_trajectory(rng, room, *, step=0.1, clearance=0.35):
+    """Poses along straight lines between free positions, without those too close to an obstacle."""
     stops = [random_pose(rng, room) for _ in range(4)]
     legs = []
     for start, end in pairwise(stops):
@@ -87,7 +87,7 @@ def way(rng, room, *, step=0.1, clearance=0.35):
 
 
 def circle(centre, radius, count):
-    """Poses on a circle, looking along it."""
+    """Poses on a circle with tangential headings."""
     angle = 2 * np.pi * np.arange(count) / count
     return np.stack([centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle), angle + QUARTER], axis=-1)
 
@@ -101,7 +101,7 @@ def shuffled(log, order):
     return Log.from_echoes(scan, **columns, **numbers)
 
 
-def test_halves_add_up_to_the_whole_in_any_order(office, heard, office_grid, rng):
+def test_parts_add_up_to_the_whole_in_any_order(office, heard, office_grid, rng):
     walls = office.room.walls
     first, second = (occupancy(office.ring, part, walls=walls) for part in (heard[:6], heard[6:]))
     assert first + second == office_grid
@@ -111,7 +111,7 @@ def test_halves_add_up_to_the_whole_in_any_order(office, heard, office_grid, rng
     assert OccupancyGrid.empty() + office_grid == office_grid
 
 
-def test_scan_by_scan_is_the_same_as_at_once(office, heard, office_grid):
+def test_scan_by_scan_equals_all_at_once(office, heard, office_grid):
     grid = OccupancyGrid.empty()
     for scan in heard:
         grid = grid.add(office.ring, scan, walls=office.room.walls)
@@ -120,7 +120,7 @@ def test_scan_by_scan_is_the_same_as_at_once(office, heard, office_grid):
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_the_world_turned_by_a_quarter_gives_the_grid_turned_by_a_quarter(office, heard, known):
+def test_the_grid_is_equivariant_under_quarter_turns(office, heard, known):
     walls = office.room.walls if known else NO_WALLS
     turned_pose = np.concatenate([heard.pose[:, :2] @ rotation(QUARTER).T, heard.pose[:, 2:] + QUARTER], axis=1)
     turned = Log.from_echoes(
@@ -129,24 +129,24 @@ def test_the_world_turned_by_a_quarter_gives_the_grid_turned_by_a_quarter(office
     straight = occupancy(office.ring, heard, walls=walls).classify()
     image = occupancy(office.ring, turned, walls=walls @ rotation(QUARTER).T).classify()
     assert image.shape == straight.shape[::-1]
-    # Numbers on the border of a cell, as the first pose is, may round to either side.
+    # Coordinates on the border of a cell, like those of the first pose, may round to either side.
     assert np.mean(image == np.rot90(straight)) > 0.99
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("errors", [{}, {"clutter": 0.2, "dropout": 0.3}], ids=["clean", "clutter and loss"])
-def test_free_is_free_and_near_the_robot_most_is_known(faw_ring, seed, errors):
+def test_free_cells_are_truly_free_and_most_cells_near_the_robot_are_known(faw_ring, seed, errors):
     rng = np.random.default_rng(seed)
     room = random_room(rng)
-    poses = way(rng, room)
+    poses = free_trajectory(rng, room)
     log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed, **errors).as_log(faw_ring, poses)
     grid = occupancy(faw_ring, log, walls=room.walls)
     image, points = grid.classify(), centres(grid)
     inside = truly_free(room, points)
     free = image == FREE
     assert inside[free].mean() >= 0.99
-    assert not free[~inside].any()  # behind walls that are known nothing is free
+    assert not free[~inside].any()  # nothing is free behind known walls
     clear = point_to_segments(points.reshape(-1, 2), room.walls).min(axis=1).reshape(inside.shape) > 0.1
     for pole in room.poles:
         clear &= np.linalg.norm(points - pole, axis=-1) > 0.3
@@ -156,10 +156,10 @@ def test_free_is_free_and_near_the_robot_most_is_known(faw_ring, seed, errors):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_walls_that_nobody_told_are_not_driven_through(faw_ring, seed):
+def test_unknown_walls_become_obstacles(faw_ring, seed):
     rng = np.random.default_rng(seed)
     room = random_room(rng, recess=0.0, box=0.0, segment=0.0, pole=0.0)
-    poses = way(rng, room, step=0.05)
+    poses = free_trajectory(rng, room, step=0.05)
     log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed).as_log(faw_ring, poses)
     grid = occupancy(faw_ring, log)
     image, points = grid.classify(), centres(grid)
@@ -168,7 +168,7 @@ def test_walls_that_nobody_told_are_not_driven_through(faw_ring, seed):
     assert np.mean(gap[image == OCCUPIED] < 0.15) > 0.6
 
 
-def test_the_office_is_free_inside_and_nothing_is_known_outside(office, office_grid):
+def test_the_office_is_free_inside_and_unknown_outside(office, office_grid):
     image, points = office_grid.classify(), centres(office_grid)
     shell = office.room.walls[[name != "chair back-rest" for name in office.room.wall_names]]
     inside = shapely.contains_xy(shapely.Polygon(shell[:, 0]), points[..., 0], points[..., 1])
@@ -202,7 +202,7 @@ def test_no_echo_is_free_space_and_never_a_wall(faw_ring):
     assert occupancy(faw_ring, at_max) == grid
 
 
-def test_a_pole_that_no_map_knows_becomes_an_obstacle_at_its_place(faw_ring):
+def test_an_unknown_pole_becomes_an_obstacle_at_its_position(faw_ring):
     pole = np.array([0.33, 0.21])
     poses = circle(pole, 0.9, 24)
     grid = occupancy(faw_ring, listen(faw_ring, [], poses, poles=pole))
@@ -213,7 +213,7 @@ def test_a_pole_that_no_map_knows_becomes_an_obstacle_at_its_place(faw_ring):
     assert (image[(gap > 0.2) & (gap < 1.0)] == FREE).mean() > 0.55  # the pole hides much of it from each side
 
 
-def test_a_robot_that_stands_still_does_not_make_a_wall_of_an_arc(faw_ring):
+def test_an_arc_from_a_single_viewpoint_is_not_an_obstacle(faw_ring):
     poses = np.tile([0.1, 0.1, 0.3], (50, 1))
     grid = occupancy(faw_ring, listen(faw_ring, [], poses, poles=[1.0, 0.4]))
     image, points = grid.classify(), centres(grid)
@@ -221,7 +221,7 @@ def test_a_robot_that_stands_still_does_not_make_a_wall_of_an_arc(faw_ring):
     assert not (image[np.linalg.norm(points - [1.0, 0.4], axis=-1) < 0.05] == FREE).any()
 
 
-def test_an_obstacle_stays_beside_a_sensor_that_sees_past_it(faw_ring):
+def test_an_obstacle_in_front_of_a_known_wall_is_kept(faw_ring):
     wall = [[-3.0, 1.5], [3.0, 1.5]]
     poses = np.stack([np.linspace(-1, 1, 21), np.zeros(21), np.zeros(21)], axis=-1)
     grid = occupancy(faw_ring, listen(faw_ring, [wall], poses, poles=[0.1, 0.9]), walls=np.array([wall]))
@@ -230,7 +230,7 @@ def test_an_obstacle_stays_beside_a_sensor_that_sees_past_it(faw_ring):
     assert not (image[points[..., 1] > 1.5] == FREE).any()
 
 
-def test_a_wall_hides_what_a_sensor_that_misses_it_obliquely_looks_at(faw_ring):
+def test_a_known_wall_bounds_oblique_beams(faw_ring):
     wall = np.array([[[-3.0, 0.8], [3.0, 0.8]]])
     poses = np.stack([np.linspace(-1, 1, 21), np.zeros(21), np.zeros(21)], axis=-1)
     log = listen(faw_ring, wall, poses)
@@ -240,13 +240,13 @@ def test_a_wall_hides_what_a_sensor_that_misses_it_obliquely_looks_at(faw_ring):
         behind[known] = centres(grid)[grid.classify() == FREE]
         behind[known] = behind[known][behind[known][:, 1] > 0.8]
     assert not len(behind[True])
-    # By agreement: beside the robot's path there are always sensors that look straight at it and hear it.
+    # Beside the trajectory there are always sensors that face the wall and hear it.
     assert np.abs(behind[False][:, 0]).min() > 1.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
-def test_walls_of_a_map_that_end_too_early_let_nothing_out(faw_ring, seed):
+def test_walls_that_end_too_early_are_extended(faw_ring, seed):
     rng = np.random.default_rng(1000 + seed)
     room = random_room(rng)
     poses = np.stack([random_pose(rng, room) for _ in range(40)])
@@ -260,7 +260,7 @@ def test_walls_of_a_map_that_end_too_early_let_nothing_out(faw_ring, seed):
     assert (image == FREE)[inside & clear & near].mean() > 0.9
 
 
-def test_the_office_with_walls_of_its_map_is_free_inside_only(office, heard):
+def test_the_office_with_the_walls_of_its_map_is_free_inside_only(office, heard):
     grid = occupancy(office.ring, heard, walls=build_map(office.ring, heard).segments)
     image, points = grid.classify(), centres(grid)
     inside = truly_free(office.room, points)
@@ -268,7 +268,7 @@ def test_the_office_with_walls_of_its_map_is_free_inside_only(office, heard):
     assert np.mean(image[inside] == FREE) > 0.85
 
 
-def test_an_open_door_stays_open_for_who_looks_squarely_through_it(faw_ring):
+def test_an_open_door_is_free_for_beams_perpendicular_to_it(faw_ring):
     walls = np.array([[[-3.0, 1.0], [-0.4, 1.0]], [[0.4, 1.0], [3.0, 1.0]]])
     past = np.stack([np.linspace(-1, 1, 21), np.zeros(21), np.zeros(21)], axis=-1)
     grid = occupancy(faw_ring, listen(faw_ring, walls, past), walls=walls)
@@ -276,13 +276,13 @@ def test_an_open_door_stays_open_for_who_looks_squarely_through_it(faw_ring):
     x, y = np.abs(points[..., 0]), points[..., 1]
     assert (grid.classify()[(x < 0.3) & (y > 0.9) & (y < 1.6)] == FREE).all()
     assert not (grid.classify()[(x > 0.6) & (y > 1.05)] == FREE).any()
-    # Those who only pass obliquely cannot know whether the wall goes on.
+    # From oblique views it is unknown whether the wall continues.
     aside = past[past[:, 0] < -0.65]
     grid = occupancy(faw_ring, listen(faw_ring, walls, aside), walls=walls)
     assert not (grid.classify()[centres(grid)[..., 1] > 1.05] == FREE).any()
 
 
-def test_a_wall_goes_on_until_somebody_would_have_heard_it_or_it_meets_another():
+def test_a_wall_extends_until_a_sensor_would_have_heard_it_or_it_meets_another():
     walls = WallMap.of(np.array([[[0.0, 1.0], [2.0, 1.0]], [[2.0, 1.02], [2.0, -1.0]]]), 0.05)
     position, sure = np.array([[-0.5, 0.0], [-0.8, 0.0]]), np.full(2, 0.2)
     far, up = np.full(2, 2.0), np.full(2, QUARTER)
@@ -290,13 +290,13 @@ def test_a_wall_goes_on_until_somebody_would_have_heard_it_or_it_meets_another()
     def beyond(heading=up, silent=far):
         return estimate_extensions(position, heading, sure, silent, walls)
 
-    np.testing.assert_allclose(beyond()[0], [0.5 - SETTINGS.no_wall, 0.0])  # the nearer foot counts
+    np.testing.assert_allclose(beyond()[0], [0.5 - SETTINGS.no_wall, 0.0])  # the nearer footpoint counts
     np.testing.assert_allclose(beyond(heading=up + np.array([0.3, 0.1]))[0], [0.8 - SETTINGS.no_wall, 0.0])
     for unheard in (beyond(heading=-up), beyond(silent=far / 2)):
         np.testing.assert_allclose(unheard, [[SETTINGS.max_extension, 0.0], [0.0, SETTINGS.max_extension]])
 
 
-def test_free_cells_are_those_that_can_be_reached_from_where_the_robot_drove(rng):
+def test_free_cells_are_connected_to_the_trajectory(rng):
     counts = np.zeros((5, 40, 50), np.int32)
     counts[0] = 4 * (rng.random((40, 50)) < 0.6)
     counts[4, [0, 20, 21], [0, 25, 25]] = 1
@@ -311,7 +311,7 @@ def test_free_cells_are_those_that_can_be_reached_from_where_the_robot_drove(rng
     assert 3 < reached.sum() < (grid.free > 0).sum()
 
 
-def test_the_part_of_the_ring_that_did_not_fire_says_nothing(faw_ring):
+def test_sensors_that_did_not_fire_contribute_nothing(faw_ring):
     poses = circle((0.0, 0.0), 0.5, 12)
     fired = np.zeros((12, 24), bool)
     grid = occupancy(faw_ring, silent(poses), fired=fired)
@@ -320,7 +320,7 @@ def test_the_part_of_the_ring_that_did_not_fire_says_nothing(faw_ring):
     assert gap[grid.classify() == FREE].max() < 0.28  # only the robot's own body
 
 
-def test_a_ring_of_few_sensors_has_no_body_and_a_bumper_none_either():
+def test_sensors_without_an_outline_have_no_footprint_area():
     for position in ([(0.2, 0.0)], [(0.2, -0.2), (0.2, 0.0), (0.2, 0.2)]):
         ring = Ring(position, np.zeros(len(position)), beam=0.5, neighbors=0, max_range=1.0)
         grid = occupancy(ring, silent(np.zeros((3, 3))))
@@ -329,7 +329,7 @@ def test_a_ring_of_few_sensors_has_no_body_and_a_bumper_none_either():
         assert points[grid.classify() == FREE][:, 0].max() == pytest.approx(1.175)
 
 
-def test_a_saved_map_is_what_map_server_reads(tmp_path, office, heard, office_grid):
+def test_a_saved_grid_is_read_by_map_server(tmp_path, office, heard, office_grid):
     path = tmp_path / 'a "b": #c.yaml'
     save_nav2(office_grid, path)
     header = dict(line.split(": ", 1) for line in path.read_text().splitlines())
@@ -387,7 +387,7 @@ def test_another_suffix_is_refused_before_anything_is_written(tmp_path, office_g
     assert grid_image_filename("a/map.YAML").name == "map.pgm"
 
 
-def test_what_no_grid_can_hold_is_refused_in_one_line(faw_ring):
+def test_impossible_grids_are_refused_in_one_line(faw_ring):
     far = np.array([[0.0, 0.0, 0.0], [1e7, 1e7, 0.0]])
     here = silent(np.zeros((1, 3)))
     for call, words in (

@@ -1,4 +1,4 @@
-"""segments."""
+"""Wall segments for tests: construction, rigid motion and exact comparison."""
 
 from dataclasses import fields
 
@@ -12,7 +12,7 @@ COLUMNS = [field.name for field in fields(WallSegments) if field.name != "scans"
 
 
 def segments_at(centre, theta, *, length: np.ndarray | float = 0.5, **columns):
-    """Pieces as single lines of local models leave them, a scan each; any column may be given."""
+    """Segments as of single lines of local models, one scan each; any column can be given."""
     theta = wrap_angle(np.asarray(theta, float).reshape(-1))
     count = len(theta)
     half = np.broadcast_to(np.asarray(length, float), count) / 2
@@ -33,14 +33,14 @@ def segments_at(centre, theta, *, length: np.ndarray | float = 0.5, **columns):
 
 
 def moved(segments, pose):
-    """The same pieces in a world that was turned by pose[2] and then shifted."""
+    """The same segments in a world that was rotated by pose[2] and then translated."""
     columns = {name: getattr(segments, name) for name in COLUMNS}
     columns["centre"] = segments.centre @ rotation(pose[2]).T + pose[:2]
     return WallSegments(**columns | {"theta": wrap_angle(segments.theta + pose[2])}, scans=segments.scans)
 
 
 def same(one, two):
-    """To the last bit."""
+    """Whether two tables are exactly equal."""
     return one.scan_lists() == two.scan_lists() and all(
         np.array_equal(getattr(one, name), getattr(two, name)) for name in COLUMNS
     )
