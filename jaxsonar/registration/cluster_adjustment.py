@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsonar.geometry.se2 import perpendicular, rotate, tangent_of, unit, wrap_angle
+from jaxsonar.geometry.se2 import perpendicular, rotate, wrap_angle
 from jaxsonar.registration.echo_clusters import ScanObservations
 from jaxsonar.registration.reflector_fit import fit_reflectors
 from jaxsonar.registration.scan_cluster import ScanCluster
 from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS
-from jaxsonar.sensors.range_models import predict_ranges
+from jaxsonar.sensors.range_models import plane_footpoint, predict_ranges
 
 
 def single_scan(observations: ScanObservations, scan: int | np.integer) -> ScanCluster:
@@ -152,11 +152,7 @@ def _observed_intervals(
     clusters: int,
 ) -> Float[np.ndarray, "clusters 2"]:
     """Intervals between the outermost points of reflection of each cluster on its wall (``ScanCluster.observed``)."""
-    normal, tangent = unit(plane[:, 1]), tangent_of(plane[:, 1])
-    height = plane[:, 0] - (midpoint * normal).sum(-1)
-    height = np.where(np.abs(height) < SETTINGS.corner_tolerance, SETTINGS.corner_tolerance, height)
-    lean = (half_baseline * tangent).sum(-1) * (half_baseline * normal).sum(-1)
-    along = (midpoint * tangent).sum(-1) + lean / height
+    along = plane_footpoint(plane, midpoint, half_baseline, min_height=SETTINGS.corner_tolerance)
     out = np.tile([np.inf, -np.inf], (clusters, 1))
     np.minimum.at(out[:, 0], cluster, along)
     np.maximum.at(out[:, 1], cluster, along)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar import kernels
+from jaxsonar.geometry.se2 import tangent_of, unit
 
 KINDS = kernels.PLANE, kernels.CORNER, kernels.EDGE
 
@@ -61,6 +62,28 @@ def plane_range(
         np.stack([-cos * upright, -sin * upright], axis=-1),
         np.stack([-sin * along, cos * along], axis=-1),
     )
+
+
+def plane_footpoint(
+    plane: Float[np.ndarray, "*#batch 2"],
+    midpoint: Float[np.ndarray, "*#batch 2"],
+    half_baseline: Float[np.ndarray, "*#batch 2"],
+    *,
+    min_height: float,
+) -> Float[np.ndarray, "*#batch"]:
+    """Coordinate of the point of reflection along a wall, metres from the foot of the origin.
+
+    Args:
+        plane: (rho, theta), metres and radians; rho may be negative.
+        midpoint: midpoint between transmitter and receiver, metres.
+        half_baseline: half the vector from transmitter to receiver, metres.
+        min_height: smallest distance of the midpoint from the wall, metres; a smaller one is replaced.
+    """
+    normal, tangent = unit(plane[..., 1]), tangent_of(plane[..., 1])
+    height = plane[..., 0] - (midpoint * normal).sum(-1)
+    height = np.where(np.abs(height) < min_height, min_height, height)
+    baselines = (half_baseline * tangent).sum(-1) * (half_baseline * normal).sum(-1)
+    return (midpoint * tangent).sum(-1) + baselines / height
 
 
 def corner_range(

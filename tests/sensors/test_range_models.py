@@ -6,7 +6,7 @@ import pytest
 
 from jaxsonar import Ring, kernels
 from jaxsonar.kernels import measurement_model
-from jaxsonar.sensors.range_models import RANGE_OF_KIND, predict_ranges
+from jaxsonar.sensors.range_models import RANGE_OF_KIND, plane_footpoint, predict_ranges
 
 KERNEL_OF_KIND = {
     kernels.PLANE: measurement_model.plane_echo,
@@ -30,6 +30,15 @@ def test_range_models_agree_with_the_kernels(kind, rng):
     moved = range_of(parameters[None], paths.midpoint + step[0], paths.half_baseline + step[1])
     change = found.d_range_d_midpoint @ step[0] + found.d_range_d_half_baseline @ step[1]
     np.testing.assert_allclose(moved.range - found.range, change, atol=1e-10)
+
+
+def test_the_footpoint_of_a_plane_agrees_with_the_kernel():
+    paths = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), Ring.circular().echo_paths)
+    plane = np.array([1.3, 0.4])
+    with jax.enable_x64(True):
+        exact = jax.vmap(measurement_model.plane_echo, in_axes=(None, 0))(jax.numpy.asarray(plane), paths).footpoint
+    found = plane_footpoint(plane, paths.midpoint, paths.half_baseline, min_height=1e-6)
+    np.testing.assert_allclose(found, exact, atol=1e-12)
 
 
 def test_mixed_kinds_give_the_ranges_of_each_kind(rng):
