@@ -32,9 +32,7 @@ def test_mean_lines_agree_with_the_oracle(rng):
     np.testing.assert_array_equal(np.isnan(came_theta), np.isnan(came_rho))
     for k, row in [(0, 0), (1, 1), (3, 2)]:
         points = [(float(r), float(t)) for r, t, m in zip(rho[row], theta[row], used[row], strict=True) if m]
-        expected = oracles.centre_of_gravity(
-            sorted(points, key=lambda line: abs(oracles.wrap(line[1] - centers[row][1])))
-        )
+        expected = oracles.mean_line(sorted(points, key=lambda line: abs(oracles.wrap(line[1] - centers[row][1]))))
         assert float(came_rho[k]) == pytest.approx(expected[0], abs=1e-9)
         assert abs(oracles.wrap(float(came_theta[k]) - expected[1])) < 1e-9
 

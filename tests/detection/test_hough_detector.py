@@ -49,7 +49,7 @@ def dense(ring, echoes, slots=3):
 
 def a_scan(ring, rng, walls=THREE_WALLS, noise=0.003, false=10):
     """Echoes of infinite walls with noise, and false ones."""
-    echoes = [(k, r + rng.normal(0, noise)) for wall in walls for k, r in oracles.wall_echoes(ring, *wall)]
+    echoes = [(k, r + rng.normal(0, noise)) for wall in walls for k, r in oracles.echoes_of_wall(ring, *wall)]
     return echoes + [(int(k), float(rng.uniform(0.2, 2.2))) for k in rng.integers(0, len(ring.paths), false)]
 
 
@@ -78,7 +78,7 @@ def test_lines_agree_with_the_slow_oracle(ring, seed):
     echoes = a_scan(ring, rng)
     lines = extract_lines(ring, dense(ring, echoes, 6), settings=setup)
     level = setup.threshold * float(kernels.full_wall_votes(ring.echo_paths, setup))
-    wanted = oracles.local_model(ring, [(k, float(np.float32(r))) for k, r in echoes], setup, level)
+    wanted = oracles.hough_lines(ring, [(k, float(np.float32(r))) for k, r in echoes], setup, level)
     assert len(wanted) > 0
     came = found(lines)
     assert len(came) == len(wanted)
@@ -92,7 +92,7 @@ def test_lines_agree_with_the_slow_oracle(ring, seed):
 
 
 def test_walls_are_detected_at_their_positions(faw_ring):
-    echoes = [(k, r) for wall in THREE_WALLS for k, r in oracles.wall_echoes(faw_ring, *wall)]
+    echoes = [(k, r) for wall in THREE_WALLS for k, r in oracles.echoes_of_wall(faw_ring, *wall)]
     came = found(extract_lines(faw_ring, dense(faw_ring, echoes)))
     assert len(came) == 3
     for rho, theta in THREE_WALLS:
@@ -216,7 +216,7 @@ def test_an_empty_model_states_the_reason(faw_ring, echoes, why):
 
 
 def test_involved_sensors_bound_the_segment(faw_ring):
-    model = next(local_models(faw_ring, as_log(faw_ring, [oracles.wall_echoes(faw_ring, 1.2, 0.3)])))
+    model = next(local_models(faw_ring, as_log(faw_ring, [oracles.echoes_of_wall(faw_ring, 1.2, 0.3)])))
     (line,) = model.lines
     assert line.echoes == len(line.paths)
     middle = faw_ring.position[line.paths].mean(axis=1)
@@ -244,7 +244,7 @@ def test_json_is_complete(faw_ring, rng):
 def test_offsets_and_speed_of_sound_are_corrected():
     plain = Ring.circular()
     ring = dataclasses.replace(plain, range_offset=np.linspace(0.0, 0.1, 24), speed_of_sound=350.0)
-    echoes = oracles.wall_echoes(plain, 1.1, 0.7)
+    echoes = oracles.echoes_of_wall(plain, 1.1, 0.7)
     reported = [(k, r * 343.2 / 350.0 + ring.range_offset[list(ring.paths[k])].mean()) for k, r in echoes]
     lines = extract_lines(ring, dense(ring, reported))
     wanted = extract_lines(plain, dense(plain, echoes))
@@ -290,7 +290,7 @@ def test_the_maximum_range_applies_to_corrected_ranges(offset, speed):
     """Echoes just within it vote and those beyond it do not, whatever the sensors add and the air does."""
     ring = dataclasses.replace(Ring.circular(), range_offset=offset, speed_of_sound=speed)
     for rho, heard in [(2.2, True), (2.5, False)]:
-        near = oracles.wall_echoes(Ring.circular(max_range=3.0), rho, 0.4)
+        near = oracles.echoes_of_wall(Ring.circular(max_range=3.0), rho, 0.4)
         near = [(k, r) for k, r in near if (r < 2.0) == heard]
         reported = [(k, r * 343.2 / speed + offset) for k, r in near]
         model = next(local_models(ring, as_log(ring, [reported])))
@@ -300,14 +300,14 @@ def test_the_maximum_range_applies_to_corrected_ranges(offset, speed):
 
 
 def test_ranges_beyond_single_precision_are_ignored(faw_ring):
-    echoes = [*oracles.wall_echoes(faw_ring, 1.2, 0.3), (3, 1e39)]
+    echoes = [*oracles.echoes_of_wall(faw_ring, 1.2, 0.3), (3, 1e39)]
     assert len(next(local_models(faw_ring, as_log(faw_ring, [echoes]))).lines) == 1
 
 
 @pytest.mark.slow
 def test_large_accumulators_use_smaller_batches(faw_ring):
     fine = HoughSettings(theta_cells=720, rho_cells=300, rho_cell=0.01)
-    ranges = np.concatenate([dense(faw_ring, oracles.wall_echoes(faw_ring, 1.2, 0.3))] * 40)
+    ranges = np.concatenate([dense(faw_ring, oracles.echoes_of_wall(faw_ring, 1.2, 0.3))] * 40)
     lines = extract_lines(faw_ring, ranges, settings=fine)
     assert (lines.rho[:, 0] == lines.rho[0, 0]).all()
     assert lines.rho[0, 0] == pytest.approx(1.2, abs=0.03)
@@ -349,5 +349,5 @@ def test_pairs_that_are_no_paths_are_counted(faw_ring):
 
 def test_a_ring_with_a_long_range_gets_a_larger_accumulator():
     ring = Ring.circular(max_range=6.0)
-    echoes = oracles.wall_echoes(ring, 5.5, 1.0)
+    echoes = oracles.echoes_of_wall(ring, 5.5, 1.0)
     assert extract_lines(ring, dense(ring, echoes)).rho[0, 0] == pytest.approx(5.5, abs=0.03)

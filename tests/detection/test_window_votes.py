@@ -118,7 +118,10 @@ def test_scans_of_a_moving_robot_vote_for_the_wall_in_the_frame_of_the_last_pose
     echoes = [echo for pose in poses for echo in oracles.plane_echoes(RING, pose, rho, theta)][::7]
     assert len(echoes) > 20
     wanted = oracles.accumulate(
-        [oracles.cell(r, t, SETTINGS) for r, t in oracles.gathered_lines(RING, echoes, last, SETTINGS.point_pitch)],
+        [
+            oracles.cell(r, t, SETTINGS)
+            for r, t in oracles.tangent_lines_in_frame(RING, echoes, last, SETTINGS.point_pitch)
+        ],
         SETTINGS,
     )
     gathered = packed([(relative(last, pose), path, reach) for pose, path, reach in echoes], gathered=5.0)

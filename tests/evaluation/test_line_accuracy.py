@@ -95,7 +95,7 @@ def image_ranges(line, tx, rx):
 
 def wall_seen_by(ring, rho, theta):
     """Transmitters and receivers of the echoes of one wall."""
-    tx, rx = ring.paths[[path for path, _ in oracles.wall_echoes(ring, rho, theta)]].T
+    tx, rx = ring.paths[[path for path, _ in oracles.echoes_of_wall(ring, rho, theta)]].T
     return np.asarray(ring.position)[tx], np.asarray(ring.position)[rx]
 
 

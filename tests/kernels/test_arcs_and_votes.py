@@ -122,7 +122,7 @@ def test_points_of_an_arc_have_the_path_length_and_the_tangent(reach, path, shar
 @given(st.floats(0.4, 1.9), angles)
 def test_a_wall_is_a_tangent_line_of_each_of_its_echoes(rho, theta):
     ring = Ring.circular()
-    for path, reach in oracles.wall_echoes(ring, rho, theta):
+    for path, reach in oracles.echoes_of_wall(ring, rho, theta):
         tx, rx = ring.position[ring.paths[path]]
         assert oracles.ellipse_tangent_rho(tx, rx, reach, theta) == pytest.approx(rho, abs=1e-9)
 

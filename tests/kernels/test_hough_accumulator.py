@@ -33,7 +33,7 @@ def peaks_of(smooth, level=0.0, size=20):
 
 def value(smooth, row, column):
     """Occupancy of a cell, also across the seams; 0 beyond the last column."""
-    where = oracles.beyond(row, column, SMALL)
+    where = oracles.cell_across_seams(row, column, SMALL)
     return 0.0 if where is None else smooth[where]
 
 

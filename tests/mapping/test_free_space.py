@@ -261,7 +261,7 @@ def test_no_scans_give_no_cells(faw_ring):
 def test_a_wall_with_echoes_is_not_free(rho, theta, heading, x):
     """No footpoint of a sensor on an infinite wall is free, and nothing behind the wall."""
     ring = Ring.circular()
-    heard = oracles.wall_echoes(ring, rho, theta)
+    heard = oracles.echoes_of_wall(ring, rho, theta)
     pose = np.array([x, 1.0, heading])
     (cells,) = free_cells(ring, [pose], [heard], [np.zeros((0, 2, 2))])
     normal = np.array([math.cos(theta), math.sin(theta)])

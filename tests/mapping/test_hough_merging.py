@@ -121,7 +121,7 @@ def paper(segments, cut):
         for component in oracles.components(mask):
             mine = [i for i, cell in enumerate(cells) if cell in component]
             if mine:
-                merged.append((members[mine], origin, oracles.centre_of_gravity([lines[i] for i in mine])))
+                merged.append((members[mine], origin, oracles.mean_line([lines[i] for i in mine])))
     return merged
 
 

@@ -29,8 +29,6 @@ from jaxsonar.hardware.transport_base import EndOfStream, LinkEvent, Source, ope
 from jaxsonar.live.replay import messages_of
 from jaxsonar.scans.recording_journal import TruncatedRecording, journal_filename, open_log_recorder
 
-SUFFIXES = (".csv", ".parquet", ".mcap")
-
 
 def read_all(source: Source, recorder: Recorder | None = None, **choices) -> tuple[list[RawScan], ReaderThread]:
     queue: DropOldestQueue[RawScan] = DropOldestQueue()

@@ -106,9 +106,9 @@ def test_windows_contain_the_fresh_echoes_of_their_section_in_the_frame_of_its_e
     windows, left_out = gather_windows(FOUR, log, length=length)
     scans = heard(FOUR, log)
     assert left_out == len(log.tx) - sum(len(scan) for scan in scans)
-    waits = oracles.moved(log.pose, WINDOWS.place_distance, WINDOWS.place_rotation)
-    fresh = [[new and here for new in scan] for scan, here in zip(oracles.renewed(scans), waits, strict=True)]
-    spans = oracles.windows(log.pose, length)
+    waits = oracles.is_first_at_place(log.pose, WINDOWS.place_distance, WINDOWS.place_rotation)
+    fresh = [[new and here for new in scan] for scan, here in zip(oracles.is_fresh(scans), waits, strict=True)]
+    spans = oracles.window_spans(log.pose, length)
     np.testing.assert_array_equal(windows.last, [last for _, last in spans])
     assert windows.gap == max(WINDOWS.min_gap, length / 4)
     flat = windows.echoes
@@ -136,7 +136,7 @@ def test_windows_cover_the_trajectory_with_their_length_and_cross_no_gap(seed, l
     known = np.array([bool(np.isfinite(pose).all()) for pose in log.pose])
     covered = np.zeros(len(log), bool)
     assert (np.diff(windows.last) > 0).all()
-    for first, last in oracles.windows(log.pose, length):
+    for first, last in oracles.window_spans(log.pose, length):
         way = np.hypot(*np.diff(log.pose[first : last + 1, :2], axis=0).T)
         assert known[first : last + 1].all()
         assert way.sum() <= length + 1e-9
@@ -201,7 +201,7 @@ def test_every_second_repeated_reading_is_fresh_and_a_gap_restarts_the_count(tim
 def test_fresh_readings_agree_with_the_slow_oracle(seed):
     log = a_log(seed, strangers=False)
     flat, _ = FlatEchoes.from_log(FOUR, log)
-    wanted = [new for scan in oracles.renewed(heard(FOUR, log)) for new in scan]
+    wanted = [new for scan in oracles.is_fresh(heard(FOUR, log)) for new in scan]
     assert is_fresh_reading(flat).tolist() == wanted
 
 
@@ -216,7 +216,9 @@ def test_duplicates_in_a_scan_are_fresh_like_single_readings(times):
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.3, 1.0]))
 def test_has_moved_agrees_with_the_slow_oracle(seed, missing):
     log = a_log(seed, missing=missing)
-    assert has_moved(log.pose).tolist() == oracles.moved(log.pose, WINDOWS.place_distance, WINDOWS.place_rotation)
+    assert has_moved(log.pose).tolist() == oracles.is_first_at_place(
+        log.pose, WINDOWS.place_distance, WINDOWS.place_rotation
+    )
 
 
 def test_a_robot_at_rest_counts_once_and_a_rotating_robot_moves():

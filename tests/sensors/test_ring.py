@@ -73,7 +73,7 @@ def test_detection_ranges_are_the_intersection_of_both_cones(ring):
             edges = [abs(abs(oracles.wrap(direction - ring.heading[s])) - ring.beam[s] / 2) for s in (tx, rx)]
             if min(edges) < 1e-4:
                 continue  # on the edge of a cone
-            both = all(oracles.hears(ring.heading[s], ring.beam[s], direction) for s in (tx, rx))
+            both = all(oracles.receives(ring.heading[s], ring.beam[s], direction) for s in (tx, rx))
             assert both == ((direction - first[k]) % (2 * np.pi) < last[k] - first[k])
 
 

@@ -1,4 +1,4 @@
-"""Slow, readable NumPy versions of the kernels, one loop a sum: what the fast ones are held against."""
+"""Slow, readable NumPy versions of kernels with one loop for each sum, as oracles of the tests."""
 
 import math
 from collections import deque
@@ -11,7 +11,7 @@ def wrap(angle):
 
 
 def paths(count, neighbors):
-    """Echo paths in the documented order, for rings in which no offset leads to the same receiver twice."""
+    """Echo paths in the documented order, for rings in which different offsets lead to different receivers."""
     found = []
     for distance in range(neighbors + 1):
         for offset in [0] if distance == 0 else [distance, -distance]:
@@ -20,13 +20,13 @@ def paths(count, neighbors):
     return found
 
 
-def hears(heading, beam, direction):
-    """Whether a sensor with this heading and cone hears a far plane in this direction."""
+def receives(heading, beam, direction):
+    """Whether a sensor with this heading and cone receives a far plane in this direction."""
     return abs(wrap(direction - heading)) < beam / 2
 
 
 def arc_normals(ring, tx, rx, pitch):
-    """Normals of the points of one path's arc: the cones' intersection in equal pieces, a point in each middle."""
+    """Normals at the points of one path's arc: the middles of equal intervals of the intersection of both cones."""
     turn = wrap(ring.heading[rx] - ring.heading[tx])
     first = max(-ring.beam[tx] / 2, turn - ring.beam[rx] / 2)
     last = min(ring.beam[tx] / 2, turn + ring.beam[rx] / 2)
@@ -36,24 +36,24 @@ def arc_normals(ring, tx, rx, pitch):
     return [ring.heading[tx] + first + (k + 0.5) * (last - first) / pieces for k in range(pieces)]
 
 
-def ellipse_tangent_rho(tx, rx, reach, theta):
+def ellipse_tangent_rho(tx, rx, distance, theta):
     """Distance of the tangent line with normal theta, from the semi-axes of the ellipse (a circle if tx = rx)."""
     middle, half = (tx + rx) / 2, (rx - tx) / 2
     psi = math.atan2(half[1], half[0])
-    minor_squared = reach**2 - half @ half
-    height = math.sqrt(reach**2 * math.cos(theta - psi) ** 2 + minor_squared * math.sin(theta - psi) ** 2)
+    minor_squared = distance**2 - half @ half
+    height = math.sqrt(distance**2 * math.cos(theta - psi) ** 2 + minor_squared * math.sin(theta - psi) ** 2)
     return middle @ np.array([math.cos(theta), math.sin(theta)]) + height
 
 
 def lines_of_echo(ring, tx, rx, reported, pitch):
-    """Tangent lines (rho >= 0, theta) at the points of one echo's arc; none for an echo that does not count."""
-    reach = (reported - (ring.range_offset[tx] + ring.range_offset[rx]) / 2) * float(ring.speed_of_sound) / 343.2
+    """Tangent lines (rho >= 0, theta) at the points of one echo's arc; an empty list for an invalid echo."""
+    distance = (reported - (ring.range_offset[tx] + ring.range_offset[rx]) / 2) * float(ring.speed_of_sound) / 343.2
     baseline = np.linalg.norm(ring.position[rx] - ring.position[tx])
-    if not (reach < ring.max_range and reach > baseline / 2 and reach > 0):
+    if not (distance < ring.max_range and distance > baseline / 2 and distance > 0):
         return []
     lines = []
     for theta in arc_normals(ring, tx, rx, pitch):
-        rho = ellipse_tangent_rho(ring.position[tx], ring.position[rx], reach, theta)
+        rho = ellipse_tangent_rho(ring.position[tx], ring.position[rx], distance, theta)
         lines.append((rho, wrap(theta)) if rho >= 0 else (-rho, wrap(theta + math.pi)))
     return lines
 
@@ -72,8 +72,8 @@ def accumulate(cells, settings):
     return votes
 
 
-def beyond(row, column, settings):
-    """The cell at (row, column) on the surface of lines: theta wraps, and column -1 is column 0 half a turn on."""
+def cell_across_seams(row, column, settings):
+    """The cell at (row, column): theta wraps, and column -1 is column 0 shifted by half a turn."""
     if column < 0:
         row, column = row + settings.theta_cells // 2, -1 - column
     return (row % settings.theta_cells, column) if column < settings.rho_cells else None
@@ -87,31 +87,31 @@ def lowpass(votes, settings):
         for column in range(settings.rho_cells):
             for down in range(-half, half + 1):
                 for right in range(-half, half + 1):
-                    where = beyond(row + down, column + right, settings)
+                    where = cell_across_seams(row + down, column + right, settings)
                     if where is not None:
                         smooth[row, column] += taps[down + half] * taps[right + half] * votes[where]
     return smooth
 
 
 def full_wall_votes(ring, settings):
-    """Paths that hear a plane, averaged over the directions that any path hears, times points an arc has in a cell."""
-    listeners = []
+    """Mean number of paths that receive a plane, over all directions with any, times points of an arc per cell."""
+    counts = []
     for k in range(7200):
         direction = -math.pi + (k + 0.5) * 2 * math.pi / 7200
-        heard = [hears(heading, beam, direction) for heading, beam in zip(ring.heading, ring.beam, strict=True)]
-        listeners.append(sum(heard[tx] and heard[rx] for tx, rx in ring.paths))
-    covered = [count for count in listeners if count]
+        receives = [receives(heading, beam, direction) for heading, beam in zip(ring.heading, ring.beam, strict=True)]
+        listeners.append(sum(receives[tx] and receives[rx] for tx, rx in ring.paths))
+    covered = [count for count in counts if count]
     return np.mean(covered) * settings.theta_cell / settings.point_pitch
 
 
 def components(mask):
-    """Sets of cells, 8-connected, joined where theta wraps and across rho = 0, by flood fill."""
+    """8-connected components of cells, also across both seams, by flood fill."""
     rows = mask.shape[0]
-    unseen = {tuple(where) for where in np.argwhere(mask)}
+    unvisited = {tuple(where) for where in np.argwhere(mask)}
     found = []
-    while unseen:
-        start = min(unseen)
-        unseen.remove(start)
+    while unvisited:
+        start = min(unvisited)
+        unvisited.remove(start)
         queue, members = deque([start]), {start}
         while queue:
             row, column = queue.popleft()
@@ -121,16 +121,16 @@ def components(mask):
                     if c < 0:
                         r, c = r + rows // 2, 0
                     where = (r % rows, c)
-                    if where in unseen:
-                        unseen.remove(where)
+                    if where in unvisited:
+                        unvisited.remove(where)
                         members.add(where)
                         queue.append(where)
         found.append(frozenset(members))
     return found
 
 
-def centre_of_gravity(lines):
-    """Mean line of (rho, theta) points that lie within a quarter turn of the first one, up to the fold at rho = 0."""
+def mean_line(lines):
+    """Mean of lines (rho, theta) within a quarter turn of the first one, in canonical form."""
     reference = lines[0][1]
     signed = [
         (rho, theta) if math.cos(theta - reference) >= 0 else (-rho, wrap(theta + math.pi)) for rho, theta in lines
@@ -140,8 +140,8 @@ def centre_of_gravity(lines):
     return (rho, theta) if rho >= 0 else (-rho, wrap(theta + math.pi))
 
 
-def local_model(ring, echoes, settings, level):
-    """The paper's section 4 for one scan: echoes (path, reported) to lines (rho, theta, votes, echoes, ends)."""
+def hough_lines(ring, echoes, settings, level):
+    """The paper's section 4 for one scan: from echoes (path, reported) to (rho, theta, votes, echoes, endpoints)."""
     per_echo = []
     for path, reported in echoes:
         tx, rx = ring.paths[path]
@@ -155,28 +155,28 @@ def local_model(ring, echoes, settings, level):
         involved = [k for k, lines in enumerate(per_echo) if any(where in members for _, where in lines)]
         if len(involved) < settings.min_echoes:
             continue
-        rho, theta = centre_of_gravity(points)
+        rho, theta = mean_line(points)
         n, t = np.array([math.cos(theta), math.sin(theta)]), np.array([-math.sin(theta), math.cos(theta)])
-        feet = [ring.position[list(ring.paths[echoes[k][0]])].mean(axis=0) @ t for k in involved]
-        ends = np.array([rho * n + min(feet) * t, rho * n + max(feet) * t])
+        footpoints = [ring.position[list(ring.paths[echoes[k][0]])].mean(axis=0) @ t for k in involved]
+        ends = np.array([rho * n + min(footpoints) * t, rho * n + max(footpoints) * t])
         found.append((rho, theta, len(points), len(involved), ends))
     return sorted(found, key=lambda line: -line[2])
 
 
-def wall_echoes(ring, rho, theta):
-    """Noise-free echoes (path, range) of one infinite wall: image of tx behind it, far cones."""
+def echoes_of_wall(ring, rho, theta):
+    """Noise-free echoes (path, range) of one infinite wall, by the image source and far-field cones."""
     n = np.array([math.cos(theta), math.sin(theta)])
     echoes = []
     for k, (tx, rx) in enumerate(ring.paths):
-        if hears(ring.heading[tx], ring.beam[tx], theta) and hears(ring.heading[rx], ring.beam[rx], theta):
+        if receives(ring.heading[tx], ring.beam[tx], theta) and receives(ring.heading[rx], ring.beam[rx], theta):
             image = ring.position[tx] + 2 * (rho - ring.position[tx] @ n) * n
-            reach = np.linalg.norm(image - ring.position[rx]) / 2
-            if reach < ring.max_range:
-                echoes.append((k, reach))
+            distance = np.linalg.norm(image - ring.position[rx]) / 2
+            if distance < ring.max_range:
+                echoes.append((k, distance))
     return echoes
 
 
-# Windows of the path: poses as 3x3 matrices, scans one after the other.
+# Windows of the trajectory: poses as 3x3 matrices, scans in a loop.
 
 
 def matrix(pose):
@@ -186,23 +186,23 @@ def matrix(pose):
 
 
 def relative(world_from_a, world_from_b):
-    """Pose a_from_b: through matrices and back."""
+    """Pose a_from_b, computed with matrices."""
     a_from_b = np.linalg.inv(matrix(world_from_a)) @ matrix(world_from_b)
     return np.array([a_from_b[0, 2], a_from_b[1, 2], math.atan2(a_from_b[1, 0], a_from_b[0, 0])])
 
 
-def gathered_lines(ring, echoes, last, pitch):
-    """Tangent lines of echoes (pose, path, range) in the frame of the pose ``last``: points on arcs in the world first.
+def tangent_lines_in_frame(ring, echoes, last, pitch):
+    """Tangent lines of echoes (pose, path, range) in the frame of the pose ``last``, from points of arcs in the world.
 
-    With d half the baseline and b the minor semi-axis, the ellipse is the image of the unit circle under the square
-    root of b^2 + d d', and the point with the normal n is m + M n / sqrt(n' M n).
+    With half the baseline d, the minor semi-axis b and M = b^2 + d d', the point of the ellipse with the normal n is
+    m + M n / sqrt(n' M n).
     """
     found = []
-    for pose, path, reach in echoes:
+    for pose, path, distance in echoes:
         tx, rx = ring.paths[path]
         ends = [(matrix(pose) @ np.append(ring.position[sensor], 1))[:2] for sensor in (tx, rx)]
         middle, half = (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2
-        ellipse = (reach**2 - half @ half) * np.eye(2) + np.outer(half, half)
+        ellipse = (distance**2 - half @ half) * np.eye(2) + np.outer(half, half)
         for direction in arc_normals(ring, tx, rx, pitch):
             n = np.array([math.cos(direction + pose[2]), math.sin(direction + pose[2])])
             point = middle + ellipse @ n / math.sqrt(n @ ellipse @ n)
@@ -213,8 +213,8 @@ def gathered_lines(ring, echoes, last, pitch):
     return found
 
 
-def moved(poses, same_place, same_heading):
-    """Of the scans taken in one place the first; places are counted along the path, steps and turns added up."""
+def is_first_at_place(poses, same_place, same_heading):
+    """Whether each scan is the first at its place; places are counted along the trajectory by distance and rotation."""
     first, place = [], 0.0
     for k, pose in enumerate(poses):
         if not np.isfinite(pose).all():
@@ -228,8 +228,8 @@ def moved(poses, same_place, same_heading):
     return first
 
 
-def renewed(scans):
-    """Per scan and reading: whether an even number of scans just before it had the same one."""
+def is_fresh(scans):
+    """Whether an even number of consecutive earlier scans have the same reading; for each reading of each scan."""
     fresh = []
     for k, readings in enumerate(scans):
         fresh.append([])
@@ -241,17 +241,19 @@ def renewed(scans):
     return fresh
 
 
-def windows(poses, length):
-    """(first, last) scan of every window: one ends wherever another length/2 is complete, and where poses end."""
-    found, begin, way = [], 0, []
+def window_spans(poses, length):
+    """(first, last) scan of every window; a window ends after each length/2 and where the poses end."""
+    found, begin, travelled = [], 0, []
     for k, pose in enumerate(poses):
         if not np.isfinite(pose).all():
-            begin, way = k + 1, []
+            begin, travelled = k + 1, []
             continue
-        way.append(way[-1] + math.hypot(*(pose - poses[k - 1])[:2]) if way else 0.0)
-        complete = len(way) > 1 and math.floor(way[-1] / (length / 2)) > math.floor(way[-2] / (length / 2))
+        travelled.append(travelled[-1] + math.hypot(*(pose - poses[k - 1])[:2]) if travelled else 0.0)
+        complete = len(travelled) > 1 and math.floor(travelled[-1] / (length / 2)) > math.floor(
+            travelled[-2] / (length / 2)
+        )
         if complete or k == len(poses) - 1 or not np.isfinite(poses[k + 1]).all():
-            first = min(j for j, gone in enumerate(way) if gone >= way[-1] - length)
+            first = min(j for j, distance in enumerate(travelled) if distance >= travelled[-1] - length)
             found.append((begin + first, k))
     return found
 
@@ -260,9 +262,9 @@ def window_echoes(scans, poses, span, kept):
     """Kept echoes of one window: (scan, path, range, pose in the frame of the last scan)."""
     first, last = span
     return [
-        (k, path, reach, relative(poses[last], poses[k]))
+        (k, path, distance, relative(poses[last], poses[k]))
         for k in range(first, last + 1)
-        for (path, reach), keep in zip(scans[k], kept[k], strict=True)
+        for (path, distance), keep in zip(scans[k], kept[k], strict=True)
         if keep
     ]
 
@@ -271,24 +273,26 @@ def window_echoes(scans, poses, span, kept):
 
 
 def plane_echoes(ring, pose, rho, theta):
-    """Noise-free echoes of a wall of the world from one pose."""
+    """Noise-free echoes (pose, path, range) of a wall of the world."""
     rho = rho - pose[0] * math.cos(theta) - pose[1] * math.sin(theta)
-    return [(pose, path, reach) for path, reach in wall_echoes(ring, rho, wrap(theta - pose[2]))]
+    return [(pose, path, distance) for path, distance in echoes_of_wall(ring, rho, wrap(theta - pose[2]))]
 
 
 def point_echoes(ring, pose, place, *, corner):
-    """Noise-free echoes of a right-angled corner (tx mirrored twice), or of an edge, of the world from one pose."""
+    """Noise-free echoes (pose, path, range) of a right-angled corner (tx mirrored twice) or an edge of the world."""
     place = (np.linalg.inv(matrix(pose)) @ np.append(place, 1))[:2]
     echoes = []
     for path, (tx, rx) in enumerate(ring.paths):
         offset = place - (ring.position[tx] + ring.position[rx]) / 2
         bearing = math.atan2(offset[1], offset[0])
-        if not (hears(ring.heading[tx], ring.beam[tx], bearing) and hears(ring.heading[rx], ring.beam[rx], bearing)):
+        if not (
+            receives(ring.heading[tx], ring.beam[tx], bearing) and receives(ring.heading[rx], ring.beam[rx], bearing)
+        ):
             continue
         if corner:
-            reach = np.linalg.norm(2 * place - ring.position[tx] - ring.position[rx]) / 2
+            distance = np.linalg.norm(2 * place - ring.position[tx] - ring.position[rx]) / 2
         else:
-            reach = (np.linalg.norm(place - ring.position[tx]) + np.linalg.norm(place - ring.position[rx])) / 2
-        if reach < ring.max_range:
-            echoes.append((pose, path, reach))
+            distance = (np.linalg.norm(place - ring.position[tx]) + np.linalg.norm(place - ring.position[rx])) / 2
+        if distance < ring.max_range:
+            echoes.append((pose, path, distance))
     return echoes
