@@ -98,8 +98,9 @@ def full_wall_votes(ring, settings):
     counts = []
     for k in range(7200):
         direction = -math.pi + (k + 0.5) * 2 * math.pi / 7200
-        receives = [receives(heading, beam, direction) for heading, beam in zip(ring.heading, ring.beam, strict=True)]
-        listeners.append(sum(receives[tx] and receives[rx] for tx, rx in ring.paths))
+        sensors = zip(ring.heading, ring.beam, strict=True)
+        receiving = [receives(heading, beam, direction) for heading, beam in sensors]
+        counts.append(sum(receiving[tx] and receiving[rx] for tx, rx in ring.paths))
     covered = [count for count in counts if count]
     return np.mean(covered) * settings.theta_cell / settings.point_pitch
 
