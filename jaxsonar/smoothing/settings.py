@@ -28,6 +28,9 @@ class SmoothingSettings:
     """Least number of echoes of one landmark in a scan for them to count; 1 with windows."""
 
     # Limits
+    cost_tolerance: float = 0.01
+    """Least squares has converged when a step decreases the cost (half a sum of squares in standard deviations) by less
+    than this: far less than the uncertainty of the result."""
     large_problem: int = 100
     """Number of scans beyond which the next two limits hold: the next round continues where one stops."""
     large_problem_iterations: int = 8

@@ -133,7 +133,7 @@ class Smoother:
             prior_information=prior_information,
             landmark_prior_sd=SETTINGS.free_pose_sd[0],
             min_echoes_per_landmark=SETTINGS.min_echoes_per_landmark if self.window is None else 1,
-            sparse=True,
+            cost_tolerance=SETTINGS.cost_tolerance,
             wall_explained=None if self.models is None else wall_explained_mask(self.ring, data, self.models),
             max_iterations=SETTINGS.large_problem_iterations if is_large else data.max_iterations,
         )
