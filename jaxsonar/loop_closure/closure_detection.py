@@ -123,7 +123,7 @@ def detect_closure(
 def _negative_evidence(
     views: tuple[SubmapNeighborhood, SubmapNeighborhood], poses: Float[np.ndarray, "poses 3"], reach: float
 ) -> Float[np.ndarray, " poses"]:
-    tolerance = SETTINGS.fit_tolerance_distance
+    tolerance = SETTINGS.negative_evidence_tolerance
     return submap_negative_evidence(views[0].own, views[1].own, poses, tolerance=tolerance, reach=reach)
 
 

@@ -146,7 +146,7 @@ class LoopClosureSettings:
     """Walls may be the same if their directions differ by less, radians."""
     end_margin: float = 0.15
     """A wall is not surely detected within this distance of its ends, metres."""
-    fit_tolerance_distance: float = 0.1
+    negative_evidence_tolerance: float = 0.1
     """Tolerance of the negative evidence at a fitted pose, metres."""
 
     # Verification

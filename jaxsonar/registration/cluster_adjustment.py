@@ -92,8 +92,8 @@ def adjust_poses(
         turn = (predicted.d_range_d_midpoint * perpendicular(arm)).sum(-1)
         turn = turn + (predicted.d_range_d_half_baseline * perpendicular(base)).sum(-1)
         jacobian[every, 3 * column + 2] = root[:, 0] * turn
-        d_range_d_landmark = (root * predicted.d_range_d_landmark).T
-        jacobian[every, pose_size + 2 * row], jacobian[every, pose_size + 2 * row + 1] = d_range_d_landmark
+        by_landmark = (root * predicted.d_range_d_landmark).T
+        jacobian[every, pose_size + 2 * row], jacobian[every, pose_size + 2 * row + 1] = by_landmark
         information = jacobian.T @ jacobian + np.diag(prior)
         change = np.linalg.solve(information, jacobian.T @ (weight * residual))
         change = np.clip(change, -SETTINGS.max_step, SETTINGS.max_step)

@@ -47,7 +47,7 @@ def poses_along_walls(scan: Features, known: Features, *, extent: float, step: f
         extent: largest distance from the origin along the wall, metres.
         step: spacing of the poses, metres.
     """
-    line, wall = all_pairs(len(scan.theta), len(known.theta))
+    line, wall = _all_pairs(len(scan.theta), len(known.theta))
     heading = known.theta[wall] - scan.theta[line]
     across = _wall_distance(scan, known, line, wall, np.zeros(2), heading)
     along = np.arange(-extent, extent + step, step)
@@ -55,7 +55,7 @@ def poses_along_walls(scan: Features, known: Features, *, extent: float, step: f
     return np.concatenate([at, np.broadcast_to(heading[:, None, None], (*at.shape[:2], 1))], axis=-1).reshape(-1, 3)
 
 
-def all_pairs(first: int, second: int) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
+def _all_pairs(first: int, second: int) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
     """All pairs (i, j) with i < first and j < second."""
     a, b = np.indices((first, second))
     return a.ravel(), b.ravel()
@@ -63,7 +63,7 @@ def all_pairs(first: int, second: int) -> tuple[Int[np.ndarray, " pairs"], Int[n
 
 def _one_wall(scan: Features, known: Features, expected: Float[np.ndarray, "2"]) -> Float[np.ndarray, "poses 3"]:
     """On one wall, as near as possible to the expected position."""
-    line, wall = all_pairs(len(scan.theta), len(known.theta))
+    line, wall = _all_pairs(len(scan.theta), len(known.theta))
     heading = known.theta[wall] - scan.theta[line]
     across = _wall_distance(scan, known, line, wall, expected, heading)
     return _poses(expected + across[:, None] * known.normal[wall], heading)
@@ -73,7 +73,7 @@ def _two_walls(scan: Features, known: Features) -> Float[np.ndarray, "poses 3"]:
     """On two walls that are not parallel."""
     i, j = np.nonzero(np.triu(np.abs(np.sin(scan.theta[:, None] - scan.theta)) > SETTINGS.crossing_sine))
     a, b = np.nonzero(np.abs(np.sin(known.theta[:, None] - known.theta)) > SETTINGS.crossing_sine / 2)
-    pair, walls = all_pairs(len(i), len(a))
+    pair, walls = _all_pairs(len(i), len(a))
     i, j, a, b = i[pair], j[pair], a[walls], b[walls]
     first, second = known.theta[a] - scan.theta[i], known.theta[b] - scan.theta[j]
     fits = np.abs(wrap_angle(second - first)) < SETTINGS.same_rotation
@@ -88,8 +88,8 @@ def _wall_and_point(
     scan: Features, known: Features, p: Int[np.ndarray, " alike"], q: Int[np.ndarray, " alike"]
 ) -> Float[np.ndarray, "poses 3"]:
     """Heading from a wall, position from a point, where the distance of the wall agrees."""
-    line, wall = all_pairs(len(scan.theta), len(known.theta))
-    both, points = all_pairs(len(line), len(p))
+    line, wall = _all_pairs(len(scan.theta), len(known.theta))
+    both, points = _all_pairs(len(line), len(p))
     line, wall, p, q = line[both], wall[both], p[points], q[points]
     heading = known.theta[wall] - scan.theta[line]
     at = known.point[q] - rotate(scan.point[p], heading)
@@ -101,7 +101,7 @@ def _two_points(
     scan: Features, known: Features, p: Int[np.ndarray, " alike"], q: Int[np.ndarray, " alike"]
 ) -> Float[np.ndarray, "poses 3"]:
     """On two points of the same kinds and the same distance."""
-    first, second = all_pairs(len(p), len(p))
+    first, second = _all_pairs(len(p), len(p))
     mine, theirs = scan.point[p[second]] - scan.point[p[first]], known.point[q[second]] - known.point[q[first]]
     length = np.linalg.norm(mine, axis=1)
     fits = (p[first] < p[second]) & (length > SETTINGS.min_point_distance)

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from support.submaps import along, building, ring, room, submap, submaps
+from support.submaps import corridor_with_rooms, drive, rectangle, ring_corridor, submap, submaps
 
 from jaxsonar import kernels
 from jaxsonar.estimation.pose_graph import BetweenFactor, solve_pose_graph
@@ -19,9 +19,12 @@ from jaxsonar.loop_closure.submap_matching import Pairs, fit_pose, nearest_pairs
 from jaxsonar.loop_closure.verification import ClosureVerifier
 
 NICHE = np.array([[0, 0], [4, 0], [4, 3.2], [2.4, 3.2], [2.4, 2.7], [1.2, 2.7], [1.2, 3.2], [0, 3.2]], dtype=float)
-FIRST, SECOND = along((1, 1), (3, 1), (3, 2.2), (1.2, 2.2)), along((3, 2), (1, 1.8), (1, 1), (2.8, 1.2))
-TWINS = building(12, [(3, 0.45, 1.2, 5.2, 3.0), (7.6, 0.45, 5.8, 9.8, 3.0)])
-DOORS = building(20, [(x, 0.45, 0.15) for x in np.arange(1.5, 19, 2.0)])
+FIRST, SECOND = (
+    drive((1, 1), (3, 1), (3, 2.2), (1.2, 2.2)),
+    drive((3, 2), (1, 1.8), (1, 1), (2.8, 1.2)),
+)
+TWINS = corridor_with_rooms(12, [(3, 0.45, 1.2, 5.2, 3.0), (7.6, 0.45, 5.8, 9.8, 3.0)])
+DOORS = corridor_with_rooms(20, [(x, 0.45, 0.15) for x in np.arange(1.5, 19, 2.0)])
 
 
 def two(outline, first, second, seed, sigma):
@@ -67,7 +70,7 @@ def test_after_little_drift_a_closure_needs_no_confirmation():
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 2.0])
 def test_a_similar_room_is_not_accepted(sigma):
-    first = along((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
+    first = drive((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
     for seed in range(3):
         earlier, newest, _, prior, cov = two(TWINS, first, first + np.array([4.6, 0, 0]), seed, sigma)
         found = detect_closure(newest, earlier, prior, cov)
@@ -75,7 +78,7 @@ def test_a_similar_room_is_not_accepted(sigma):
 
 
 def test_a_similar_room_is_not_accepted_where_drift_moves_it_onto_the_known_one():
-    first = along((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
+    first = drive((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
     for seed in range(4):
         earlier, newest, _, _, cov = two(TWINS, first, first + np.array([4.6, 0, 0]), seed, 2.0)
         found = detect_closure(newest, earlier, np.zeros(3), cov)
@@ -83,7 +86,7 @@ def test_a_similar_room_is_not_accepted_where_drift_moves_it_onto_the_known_one(
 
 
 def test_a_rectangle_is_not_rotated_by_half_a_turn():
-    outline, half = room(4.0, 3.2), np.array([4.0, 3.2, np.pi])
+    outline, half = rectangle(4.0, 3.2), np.array([4.0, 3.2, np.pi])
     there = compose(half, SECOND)  # the same trajectory, rotated by half a turn about the centre of the room
     for seed in range(3):
         earlier, newest, true, prior, cov = two(outline, FIRST, SECOND, seed, 0.3)
@@ -101,16 +104,16 @@ def test_a_rectangle_is_not_rotated_by_half_a_turn():
 def test_repeating_doors_are_not_accepted_wrongly():
     for seed in range(4):
         shift = 2.0 * (seed % 3 - 1)
-        second = along((9.2 + shift, 0.8), (5.9 + shift, 0.8))
-        earlier, newest, _, prior, cov = two(DOORS, along((5.0, 0.9), (8.5, 0.9)), second, seed, 0.8)
+        second = drive((9.2 + shift, 0.8), (5.9 + shift, 0.8))
+        earlier, newest, _, prior, cov = two(DOORS, drive((5.0, 0.9), (8.5, 0.9)), second, seed, 0.8)
         found = detect_closure(newest, earlier, prior, cov)
         assert found is None or found.free is not None or found.log_odds < SETTINGS.acceptance_odds
 
 
 def test_parallel_walls_leave_the_direction_along_them_undetermined():
-    outline = building(20, [])
+    outline = corridor_with_rooms(20, [])
     for seed in range(4):
-        first, second = along((6.0, 0.9), (9.0, 0.9)), along((9.4, 0.8), (6.9, 0.8))
+        first, second = drive((6.0, 0.9), (9.0, 0.9)), drive((9.4, 0.8), (6.9, 0.8))
         earlier, newest, true, prior, cov = two(outline, first, second, seed, 0.15)
         found = detect_closure(newest, earlier, prior, cov)
         if found is None:
@@ -193,7 +196,7 @@ def test_sequential_factors_are_more_accurate_and_consistent():
     total, joint, before, better, count = 0.0, 0.0, 0.0, 0, 20
     for seed in range(count):
         rng = np.random.default_rng(seed)
-        made, true = submaps(NICHE, along((1, 1), (3, 1), (3, 2.2), (1.2, 2.2), (1, 1)), rng, scans=25, slip=3.0)
+        made, true = submaps(NICHE, drive((1, 1), (3, 1), (3, 2.2), (1.2, 2.2), (1, 1)), rng, scans=25, slip=3.0)
         link, expected = sequential_factor(made[0], made[1], 4), relative(true[0], true[1])
         assert (link.first, link.second) == (4, 5)
         off = link.first_from_second - expected
@@ -209,7 +212,10 @@ def test_sequential_factors_are_more_accurate_and_consistent():
 
 def test_without_shared_walls_the_sequential_factor_is_the_odometry_factor():
     rng = np.random.default_rng(0)
-    here, there = submap(NICHE, FIRST, FIRST[-1], rng), submap(room(9, 9), along((1.5, 4), (1.5, 6)), FIRST[-1], rng)
+    here, there = (
+        submap(NICHE, FIRST, FIRST[-1], rng),
+        submap(rectangle(9, 9), drive((1.5, 4), (1.5, 6)), FIRST[-1], rng),
+    )
     empty = replace(
         there,
         landmarks=there.landmarks.take(np.arange(0)),
@@ -237,8 +243,8 @@ def run_graph(outline, path, seed, **errors):
 def test_closures_around_a_block_are_correct(slip):
     doors = [(0, 1.7, 0.5, 0.2), (0, 3.9, 0.4, 0.2), (1, 3.0, 0.5, 0.2), (2, 2.1, 0.5, 0.2), (3, 4.0, 0.5, 0.2)]
     corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
-    path = along(*corners, *corners[:3])
-    graph, true = run_graph(ring(7, 5, doors), path, 2, slip=slip, missed=0.1, spurious=0.5)
+    path = drive(*corners, *corners[:3])
+    graph, true = run_graph(ring_corridor(7, 5, doors), path, 2, slip=slip, missed=0.1, spurious=0.5)
     assert len(graph.verifier.accepted) >= 3
     for one in graph.verifier.accepted:
         error, chi2 = off_by(one.measurement, relative(true[one.earlier], true[one.newest]))
@@ -252,7 +258,9 @@ def test_closures_around_a_block_are_correct(slip):
 @pytest.mark.slow
 def test_pending_work_in_pieces_gives_the_same_graph():
     corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
-    made, _ = submaps(ring(7, 5, [(0, 1.7, 0.5, 0.2)]), along(*corners, *corners[:2]), np.random.default_rng(3))
+    made, _ = submaps(
+        ring_corridor(7, 5, [(0, 1.7, 0.5, 0.2)]), drive(*corners, *corners[:2]), np.random.default_rng(3)
+    )
     at_once, slowly = SubmapGraph(), SubmapGraph()
     for one in made:
         at_once.add(one)
@@ -277,7 +285,7 @@ def test_pending_work_in_pieces_gives_the_same_graph():
 def test_a_wrong_closure_is_withdrawn_and_leaves_no_trace():
     corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
     doors = [(0, 1.7, 0.5, 0.2), (0, 3.9, 0.4, 0.2), (1, 3.0, 0.5, 0.2)]
-    graph, _ = run_graph(ring(7, 5, doors), along(*corners, *corners[:2]), 1)
+    graph, _ = run_graph(ring_corridor(7, 5, doors), drive(*corners, *corners[:2]), 1)
     known = graph.verifier
     good, before = known.accepted[0], graph.graph
     wrong = good.measurement._replace(
@@ -307,7 +315,7 @@ def test_a_closure_that_contradicts_the_chain_is_refused():
 
 
 def test_overlap_candidates_are_few_and_near():
-    made, true = submaps(building(30, []), along((1, 0.9), (29, 0.9), (1, 0.8)), np.random.default_rng(0))
+    made, true = submaps(corridor_with_rooms(30, []), drive((1, 0.9), (29, 0.9), (1, 0.8)), np.random.default_rng(0))
     links = [BetweenFactor(k, k + 1, relative(a, b), 1e4 * np.eye(3)) for k, (a, b) in enumerate(pairwise(true))]
     graph, newest = solve_pose_graph(true, links), len(made) - 1
     chosen = overlap_candidates(graph, made, newest, max_compared=3)
