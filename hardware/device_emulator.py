@@ -64,7 +64,7 @@ def emulate(
         SonarError: an invalid speed, or a message that cannot be encoded.
     """
     if not (speed >= 0 and math.isfinite(speed)):
-        raise SonarError(f"--speed: {speed:g} came; allowed is 0 (as fast as it goes) or more")
+        raise SonarError(f"--speed: {speed:g} came; allowed is 0 (as fast as possible) or more")
     device = _EmulatedDevice(sink, speed, FaultInjector(faults or FaultSettings()), stop or threading.Event())
     for message in messages:
         if not device.send(message):

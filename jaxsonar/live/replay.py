@@ -1,4 +1,4 @@
-"""Replay of scan logs and raw recordings: the source ``file:LOG?speed=1``, and the messages for ``jaxsonar emulate``."""
+"""Replay of scan logs and raw recordings: the source ``file:LOG?speed=1``, and messages for ``jaxsonar emulate``."""
 
 import os
 import threading

@@ -49,7 +49,8 @@ def stream(
         method: "ml" or "hough", as in ``local_models``.
         settings: as in ``local_models``.
         sigma: as in ``local_models``.
-        record: file for a recording of everything received, ``.csv``, ``.parquet`` or ``.mcap``; see ``open_log_recorder``.
+        record: file for a recording of everything received, ``.csv``, ``.parquet`` or ``.mcap``; see
+            ``open_log_recorder``.
         map_filename: GeoJSON file of the map, written atomically at intervals and at the end.
         map_interval: seconds between two writes of the map.
         odometry_noise: noise of the device's poses. If given, they are odometry, and the poses of the robot are

@@ -11,7 +11,7 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def fixed(value: float | None, digits: int) -> str:
+def fixed(value: float | int | None, digits: int) -> str:
     """A number with a fixed number of decimals; ``NO_VALUE`` for None and NaN."""
     return NO_VALUE if value is None or math.isnan(value) else f"{value:.{digits}f}"
 

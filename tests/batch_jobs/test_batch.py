@@ -1,4 +1,4 @@
-"""Batches: the numbers of local models, the same bytes however the work was done, and nothing lost by a kill."""
+"""Batches: the numbers of local models, the same bytes for every executor, and resumption after a kill."""
 
 import json
 import os
@@ -24,7 +24,7 @@ from jaxsonar.batch_jobs.scan_tables import scan_tables
 from jaxsonar.batch_jobs.shards import split_input
 from jaxsonar.batch_jobs.worker import job_spec, run_shard
 from jaxsonar.detection.settings import hough_settings
-from jaxsonar.scans.log_chunks import csv_chunks, csv_chunk_reader, parquet_chunks, parquet_chunk_reader
+from jaxsonar.scans.log_chunks import csv_chunk_reader, csv_chunks, parquet_chunk_reader, parquet_chunks
 from jaxsonar.simulation.poses_csv import load_poses
 
 pa = pytest.importorskip("pyarrow")
@@ -43,7 +43,7 @@ HEADER = "scan,stamp,x,y,theta,tx,rx,range\n"
 
 
 def office(scans, *, first=0):
-    """Scans of the office, as often as it takes; one of them heard nothing, some have no pose."""
+    """Repeated scans of the office; one has no echoes, one has no pose and no stamp."""
     data = Path(jaxsonar.__file__).with_name("data")
     poses, stamps = load_poses(data / "office-path.csv")
     room = jaxsonar.load_room(data / "office.geojson")
@@ -68,7 +68,7 @@ def logs(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def done(logs, tmp_path_factory):
-    """What a batch of them gives, by one worker without an interruption."""
+    """The results of one worker without interruption."""
     folder = tmp_path_factory.mktemp("done")
     batch([logs], RING, folder, **HOUGH)
     return folder
@@ -96,7 +96,7 @@ def as_rows(name, columns):
     return pq.read_table(pa.BufferReader(encode_parquet(name, columns))).to_pylist()
 
 
-# What it gives
+# Results
 
 
 @pytest.mark.parametrize("method", ["ml", "hough"])
@@ -150,12 +150,12 @@ def test_each_table_opens_as_one_data_set_with_units(done):
     assert (done / "lines" / "a.csv-000004.parquet").exists()
 
 
-# The same, however it was done
+# Reproducibility
 
 
 @pytest.mark.parametrize(("method", "sizes"), [("hough", (1, 5, 16)), ("ml", (5,))])
 def test_shards_of_any_size_give_the_same_rows(method, sizes):
-    """A scan's result is its own, to the bit."""
+    """The result of a scan does not depend on the other scans, bit by bit."""
     log = office(17)
     whole = found(log, method=method)
     for size in sizes:
@@ -185,7 +185,7 @@ def test_a_dask_cluster_writes_the_same_bytes(logs, done, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_folder_in_which_nothing_was_done_is_begun_anew(logs, done, tmp_path):
+def test_a_folder_without_results_is_started_again(logs, done, tmp_path):
     pytest.importorskip("distributed")
     with pytest.raises(SonarError, match=r"nonsense.*allowed is an address"):
         batch([logs], RING, tmp_path, engine="dask", scheduler="nonsense://x", method="ml")
@@ -196,7 +196,7 @@ def test_a_folder_in_which_nothing_was_done_is_begun_anew(logs, done, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_and_taken_up_again_it_is_as_if_nothing_had_been(logs, done, tmp_path):
+def test_a_killed_batch_is_resumed_with_the_same_bytes(logs, done, tmp_path):
     code = f"""
 from jaxsonar import batch, load_ring
 def wait(done):
@@ -211,7 +211,7 @@ batch([{str(logs)!r}], load_ring("faw"), {str(tmp_path)!r}, on_done=wait, **{HOU
         with pytest.raises(SonarError, match="another batch is running there; allowed is one at a time"):
             batch([logs], RING, tmp_path, **HOUGH)
         process.send_signal(signal.SIGKILL)
-    # What a process leaves that is killed while it writes.
+    # Files that a process leaves when it is killed while writing.
     (tmp_path / "lines" / ".0123456789abcdef.tmp").write_bytes(b"half")
     (tmp_path / "lines" / "a.csv-000001.parquet").write_bytes(b"damaged")
     with open(tmp_path / "manifest.jsonl", "ab") as file:
@@ -222,7 +222,7 @@ batch([{str(logs)!r}], load_ring("faw"), {str(tmp_path)!r}, on_done=wait, **{HOU
 
 
 @pytest.mark.slow
-def test_what_is_done_stays_done(done, logs, monkeypatch):
+def test_finished_shards_are_not_repeated(done, logs, monkeypatch):
     before = contents(done)
     monkeypatch.setattr(process_pool, "run_local", None)
     assert batch([logs], RING, done, **HOUGH).resumed == 8
@@ -270,7 +270,7 @@ worker.worker_loop(int(sys.argv[1]))
     assert not batch([logs / "b.parquet"], RING, tmp_path / "out", **HOUGH).set_aside, "it is tried again in a new run"
 
 
-# What is wrong is set aside
+# Faulty inputs are set aside
 
 
 def shard(path, *, scans=100, part=0):
@@ -308,7 +308,7 @@ def test_a_bad_row_sets_its_scan_aside_and_nothing_else(tmp_path, bad, why, scan
     assert [row["row"] for row in rows] == [0, 1, 2, 3, 5, 6, 7] if "2,0.0" in bad else len(rows) == 7
 
 
-def test_rows_without_a_number_spoil_the_scans_beside_them(tmp_path):
+def test_rows_without_a_scan_number_set_the_adjacent_scans_aside(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(HEADER + "0,,,,,1,1,1.0\n1,,,,,1,1,1.0\nrubbish\n2,,,,,1,1,1.0\n3,,,,,1,1,1.0\n4,,,,,1,1")
     came = run_shard(JOB, shard(path))
@@ -366,7 +366,7 @@ def test_logs_that_cannot_be_read_are_set_aside_and_the_others_done(logs, done, 
     assert contents(out).items() >= expected.items()
 
 
-def test_a_log_that_changes_meanwhile_is_set_aside(tmp_path):
+def test_a_log_that_changes_during_the_batch_is_set_aside(tmp_path):
     save_log(office(8), tmp_path / "log.csv")
     one = shard(tmp_path / "log.csv")
     with open(tmp_path / "log.csv", "a") as file:
@@ -376,16 +376,14 @@ def test_a_log_that_changes_meanwhile_is_set_aside(tmp_path):
     assert run_shard(JOB, one).failure.startswith("log.csv: No such file or directory")
 
 
-# Going on with something else
+# Resuming with other inputs or parameters
 
 
 @pytest.mark.slow
-def test_another_job_is_refused(logs, done):
+def test_other_parameters_are_rejected(logs, done):
     before = contents(done)
     other = replace(RING, neighbors=2)
-    with pytest.raises(
-        SonarError, match="another ring came; allowed is the ring and the settings of the first"
-    ):
+    with pytest.raises(SonarError, match="another ring came; allowed is the ring and the settings of the first"):
         batch([logs], other, done, **HOUGH)
     with pytest.raises(SonarError, match='method "ml", before "hough", came'):
         batch([logs], RING, done, **with_(method="ml"))
@@ -395,7 +393,7 @@ def test_another_job_is_refused(logs, done):
 
 
 @pytest.mark.slow
-def test_another_log_of_the_same_name_is_refused(logs, done, tmp_path):
+def test_a_changed_log_is_rejected(logs, done, tmp_path):
     save_log(office(36, first=1000), tmp_path / "a.csv")
     with pytest.raises(SonarError, match=r"a.csv: changed since .* was begun; allowed is the log as it was"):
         batch([tmp_path / "a.csv", logs / "b.parquet"], RING, done, **HOUGH)
@@ -403,7 +401,7 @@ def test_another_log_of_the_same_name_is_refused(logs, done, tmp_path):
         batch([tmp_path / "a.csv", logs], RING, tmp_path / "out", **HOUGH)
 
 
-def test_a_folder_with_other_things_is_refused(logs, tmp_path):
+def test_a_folder_with_other_content_is_rejected(logs, tmp_path):
     (tmp_path / "lines").mkdir()
     (tmp_path / "lines" / "mine.parquet").write_bytes(b"")
     with pytest.raises(SonarError, match=r"tables without a manifest.jsonl lie there"):
@@ -413,12 +411,12 @@ def test_a_folder_with_other_things_is_refused(logs, tmp_path):
         pass
 
 
-# Logs in parts
+# Chunks of logs
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 @pytest.mark.parametrize("scans", [1, 7, 50])
-def test_parts_make_the_log(tmp_path, suffix, scans):
+def test_chunks_concatenate_to_the_log(tmp_path, suffix, scans):
     log, path = office(40), tmp_path / f"log.{suffix}"
     save_log(log, path)
     plan, reader = (csv_chunks, csv_chunk_reader) if suffix == "csv" else (parquet_chunks, parquet_chunk_reader)
@@ -456,7 +454,7 @@ def test_a_log_without_scans_has_no_shards(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_planning_holds_no_log(tmp_path, suffix, monkeypatch):
+def test_planning_takes_bounded_memory(tmp_path, suffix, monkeypatch):
     """Four times the scans, the same memory."""
     monkeypatch.setattr("jaxsonar.scans.log_chunks.BLOCK", 1 << 16)
     monkeypatch.setattr("jaxsonar.scans.log_chunks.ROWS_PER_READ", 1 << 10)
@@ -478,7 +476,7 @@ def test_planning_holds_no_log(tmp_path, suffix, monkeypatch):
     assert peaks[1] < 1.3 * peaks[0] + 1e5
 
 
-def test_huge_row_groups_are_made_small_first(tmp_path, monkeypatch):
+def test_large_row_groups_are_staged(tmp_path, monkeypatch):
     monkeypatch.setattr("jaxsonar.batch_jobs.shards.MAX_ROW_GROUP", 8)
     save_log(office(20), tmp_path / "log.parquet")
     parts = split_input(*find_inputs([tmp_path / "log.parquet"]), staging=tmp_path / "copies", sensors=24, scans=4)
@@ -487,7 +485,7 @@ def test_huge_row_groups_are_made_small_first(tmp_path, monkeypatch):
     assert load_log(parts[0].filename) == load_log(tmp_path / "log.parquet")
 
 
-def test_names_are_safe_and_different():
+def test_keys_are_valid_filenames_and_distinct():
     keys = [
         Input(name, "", "csv").key for name in ("a.csv", "a b.csv", "a_b.csv", "_a.csv", "ä.csv", ".a.csv", "x" * 300)
     ]

@@ -1,4 +1,4 @@
-"""``jaxsonar batch`` as a person calls it: exit codes, one line for every mistake; bags and raw records."""
+"""``jaxsonar batch``: exit codes, one line per error, bags and raw recordings."""
 
 import json
 import math
@@ -16,7 +16,7 @@ from jaxsonar.batch_jobs.inputs import find_inputs
 from jaxsonar.batch_jobs.shards import split_input
 from jaxsonar.cli import app as cli
 from jaxsonar.fileio.compilation_cache import CACHE_VARIABLE, use_compilation_cache
-from jaxsonar.scans.rosbag_log import bag_scans
+from jaxsonar.scans.rosbag_log import read_bag_scans
 from jaxsonar.simulation.device_messages import log_messages
 
 pq = pytest.importorskip("pyarrow.parquet")
@@ -26,10 +26,10 @@ GOOD = "scan,stamp,x,y,theta,tx,rx,range\n" + "".join(f"{k},{k}.0,0,0,0,{k},{k},
 
 
 def call(*arguments):
-    """Exit code of one command, in this process."""
+    """Run one command in this process. Returns its exit code."""
     try:
         return cli.main([str(argument) for argument in arguments])
-    except SystemExit as end:  # how argparse ends
+    except SystemExit as end:  # raised by argparse
         return end.code
 
 
@@ -70,7 +70,7 @@ WRONG = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("words", "answer"), WRONG.items())
-def test_a_wrong_call_is_one_line(here, capsys, words, answer):
+def test_an_invalid_call_is_answered_in_one_line(here, capsys, words, answer):
     pytest.importorskip("distributed")
     assert call("batch", *words.split()) == 2
     out, error = capsys.readouterr()
@@ -82,7 +82,7 @@ def test_a_wrong_call_is_one_line(here, capsys, words, answer):
 
 @pytest.mark.slow
 def test_set_aside_is_exit_code_1_and_one_more_line(here, capsys):
-    for _ in range(2):  # going on says it again
+    for _ in range(2):  # resuming reports it again
         assert call("batch", ".", "--ring", "faw", "--method", "hough", "-o", "out", "--workers", 1) == 1
         out, error = capsys.readouterr()
         assert out == ""
@@ -96,7 +96,7 @@ def test_set_aside_is_exit_code_1_and_one_more_line(here, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("module", "extra"), [("distributed", "cluster"), ("rosbags", "ros"), ("pyarrow", "parquet")])
-def test_a_missing_extra_is_one_line(here, module, extra):
+def test_a_missing_extra_is_answered_in_one_line(here, module, extra):
     (here / "x.bag").write_bytes(b"#ROSBAG V2.0\n")
     source = "x.bag" if extra == "ros" else "log.csv"
     arguments = ["batch", source, "--ring", "faw", "-o", "out", "--engine", "dask" if extra == "cluster" else "local"]
@@ -122,7 +122,7 @@ def parts_of(path, tmp_path):
     return load_log(shards[0].filename)
 
 
-def test_a_raw_record_is_the_log_that_was_sent(tmp_path):
+def test_a_raw_recording_gives_the_sent_log(tmp_path):
     pytest.importorskip("mcap")
     from jaxsonar.hardware.mcap_recorder import McapRecorder
 
@@ -150,7 +150,7 @@ def test_a_raw_record_is_the_log_that_was_sent(tmp_path):
 
 @pytest.fixture(params=["ros1", "ros2"])
 def bag(request, tmp_path):
-    """Two scans of three sensors at two poses; one of the sensors heard nothing once."""
+    """Two scans of three sensors at two poses; one measurement has no echo."""
     pytest.importorskip("rosbags")
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
@@ -200,11 +200,11 @@ def test_a_bag_gives_scans_of_direct_echoes(bag, tmp_path):
     assert log.range.tolist() == [1.0, 1.25, 1.5, 0.5]
     assert log.stamp.tolist() == [1.5, 3.5]
     np.testing.assert_allclose(log.pose, [[1.0, 0.0, 0.5], [2.0, 0.0, -0.5]])
-    alone = Log.from_scans(list(bag_scans(next(bag.glob("*.db3")) if bag.is_dir() else bag, name="log")))
+    alone = Log.from_scans(list(read_bag_scans(next(bag.glob("*.db3")) if bag.is_dir() else bag, name="log")))
     assert alone == log
 
 
-def test_a_bag_that_is_none_is_one_line(tmp_path):
+def test_an_invalid_bag_is_answered_in_one_line(tmp_path):
     pytest.importorskip("rosbags")
     for name in ("x.bag", "x.db3", "x.mcap"):
         (tmp_path / name).write_bytes(b"#ROSBAG V2.0\nrubbish")
@@ -212,7 +212,7 @@ def test_a_bag_that_is_none_is_one_line(tmp_path):
             parts_of(tmp_path / name, tmp_path)
 
 
-def test_a_recording_that_has_not_ended_is_read_as_far_as_it_is_whole(tmp_path):
+def test_an_unfinished_recording_is_read_up_to_its_last_complete_scan(tmp_path):
     (tmp_path / "log.csv").write_text(GOOD + "20,20.0,0,0,")
     (tmp_path / "log.csv.recording").write_text(f"{len(GOOD):20d}\n")
     assert len(parts_of(tmp_path / "log.csv", tmp_path)) == 20

@@ -1,4 +1,4 @@
-"""Command calibrate: a ring file as documented, one line for every mistake, and nothing written then."""
+"""``jaxsonar calibrate``: the ring file is as documented; an error is one line and writes nothing."""
 
 import shlex
 import shutil
@@ -10,14 +10,14 @@ from support.commands import HEADER, OFFICE, PATH, RING, call, contents
 
 from jaxsonar import load_ring
 
-# With one mode nothing is sharpened, and the shapes are those of test_calibration.
+# With one free parameter there is no autofocus, and the shapes are those of test_calibrate.
 CALIBRATE = "calibrate log.csv --ring faw --free speed"
 FASTER = 1.01
 
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory):
-    """The office as a ring in warmer air hears it, and the ring that is found from it."""
+    """A log of the office in warmer air, and the ring calibrated from it."""
     folder = tmp_path_factory.mktemp("office")
     (folder / "warm.toml").write_text(RING.replace("name = 'r'", f"name = 'r'\nspeed_of_sound = {FASTER * 343.2}"))
     simulated = ["simulate", OFFICE, "--ring", folder / "warm.toml", "--path", PATH, "--sigma", "0.001"]
@@ -36,7 +36,7 @@ def here(office, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_ring_that_is_written_is_a_ring_with_its_calibration(office):
+def test_the_written_ring_has_its_calibration(office):
     ring = load_ring(office / "ring.toml")
     assert float(ring.speed_of_sound) == pytest.approx(FASTER * 343.2, rel=1e-3)
     np.testing.assert_allclose(ring.position, load_ring("faw").position, atol=1e-12)
@@ -55,7 +55,7 @@ def test_the_figure_is_drawn(office):
 
 
 @pytest.mark.slow
-def test_a_dash_writes_to_standard_output_and_words_go_elsewhere(here, capsys):
+def test_a_dash_writes_the_ring_to_standard_output(here, capsys):
     before = contents(here)
     assert call(*CALIBRATE.split(), "-o", "-") == 0
     came = capsys.readouterr()
@@ -118,7 +118,7 @@ MISTAKES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("command", "files", "words"), MISTAKES.values(), ids=MISTAKES.keys())
-def test_a_mistake_is_one_line_and_writes_nothing(here, capsys, command, files, words):
+def test_an_invalid_call_is_answered_in_one_line_and_writes_nothing(here, capsys, command, files, words):
     for name, text in files.items():
         (here / name).mkdir() if text is None else (here / name).write_text(text)
     before = contents(here)

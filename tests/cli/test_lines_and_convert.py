@@ -1,4 +1,4 @@
-"""The command line: files as documented, the same result from the same call, one line for every mistake."""
+"""Commands lines, simulate and convert: files are as documented, results are reproducible, an error is one line."""
 
 import csv
 import json
@@ -18,7 +18,7 @@ from support.commands import DATA, HEADER, OFFICE, PATH, RING, SIMULATE, call, c
 from jaxsonar import load_log, load_ring, save_log
 from jaxsonar.cli import app as cli
 from jaxsonar.detection.settings_toml import load_settings
-from jaxsonar.reports.plot_style import FORMATS
+from jaxsonar.reports.plot_style import FIGURE_FORMATS
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +46,10 @@ def read_models(path):
     return [json.loads(line, parse_constant=refuse) for line in Path(path).read_text().splitlines()]
 
 
-# What is written
+# Results
 
 
-def test_a_simulated_log_is_a_scan_log_of_the_path(here):
+def test_a_simulated_log_has_the_poses_of_the_trajectory(here):
     with open("log.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == [*HEADER.strip().split(","), "amplitude"]
@@ -94,7 +94,7 @@ def test_lines_are_as_documented(here, method):
                 assert (np.linalg.eigvalsh(line["cov"]) > 0).all()
 
 
-def test_settings_are_written_beside_the_result_and_give_it_again(here, office):
+def test_written_settings_reproduce_the_result(here, office):
     settings = office / "lines.settings.toml"
     assert set(tomllib.loads(settings.read_text())) == {
         *("theta_cells", "rho_cells", "rho_cell", "point_pitch", "smoothing", "threshold", "min_echoes")
@@ -104,7 +104,7 @@ def test_settings_are_written_beside_the_result_and_give_it_again(here, office):
     assert Path("again.settings.toml").read_bytes() == settings.read_bytes()
 
 
-def test_settings_change_the_result_and_are_those_that_are_written(here):
+def test_given_settings_are_used_and_written(here):
     Path("mine.toml").write_text("threshold = 0.35\nmin_echoes = 5\nsmoothing = [1, 2, 3, 2, 1]\n")
     paper = ["lines", "log.csv", "--ring", "faw", "--method", "hough"]
     assert call(*paper, "-o", "paper.jsonl") == 0
@@ -180,7 +180,7 @@ def test_conversions_lose_nothing(here):
     assert Path("named.csv").read_bytes() == Path("log.csv").read_bytes()
 
 
-def test_parquet_is_as_good_as_csv(here):
+def test_parquet_and_csv_give_the_same_result(here):
     pytest.importorskip("pyarrow")
     assert call(*SIMULATE, "-o", "log.parquet") == 0
     assert call("lines", "log.parquet", "--ring", "faw", "-o", "again.jsonl") == 0
@@ -196,7 +196,7 @@ def test_a_figure_of_one_scan(here, suffix, start):
 
 
 @pytest.mark.slow
-def test_scan_chooses_what_is_drawn(here):
+def test_the_scan_option_selects_the_figure(here):
     def drawn(*chosen):
         assert call("lines", "log.csv", "--ring", "faw", "-o", "again.jsonl", "--figure", "a.svg", *chosen) == 0
         return Path("a.svg").read_bytes()
@@ -205,11 +205,11 @@ def test_scan_chooses_what_is_drawn(here):
     assert drawn() != drawn("--scan", 3)
 
 
-def test_the_command_line_knows_the_figures_formats():
-    assert cli.FIGURES == FORMATS
+def test_the_command_line_knows_the_figure_formats():
+    assert cli.FIGURES == FIGURE_FORMATS
 
 
-def test_logs_without_scans_or_echoes_are_no_mistake(here, capsys):
+def test_logs_without_scans_or_echoes_are_valid(here, capsys):
     Path("empty.csv").write_text(HEADER)
     assert call("lines", "empty.csv", "--ring", "faw", "-o", "empty.jsonl") == 0
     assert Path("empty.jsonl").read_bytes() == b""
@@ -224,13 +224,13 @@ def test_logs_without_scans_or_echoes_are_no_mistake(here, capsys):
     assert "2 scans, 0 lines" in capsys.readouterr().err
 
 
-def test_echoes_that_the_ring_does_not_listen_to_are_told(here, capsys):
+def test_echoes_of_no_path_are_reported(here, capsys):
     Path("wide.csv").write_text(HEADER + "0,,,,,3,12,1.0\n0,,,,,3,3,1.0\n")
     assert call("lines", "wide.csv", "--ring", "faw", "--method", "hough", "-o", "wide.jsonl") == 0
     assert "left out 1 echo" in capsys.readouterr().err
 
 
-# Mistakes: what came, what is allowed, and nothing written
+# Errors: one line with what came and what is allowed, and nothing is written
 
 ROOM = '{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"kind": "%s"}, "geometry": %s}]}'
 SIMULATE_ANY = "simulate {office} --ring faw --path {path} -o out.csv"
@@ -412,7 +412,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize(("line", "files", "said"), list(MISTAKES.values()), ids=list(MISTAKES))
-def test_a_mistake_is_one_line_and_leaves_everything_as_it_was(here, capsys, line, files, said):
+def test_an_invalid_call_is_answered_in_one_line_and_changes_nothing(here, capsys, line, files, said):
     if "parquet" in line:
         pytest.importorskip("pyarrow")
     for name, text in files.items():
@@ -431,21 +431,21 @@ def test_a_mistake_is_one_line_and_leaves_everything_as_it_was(here, capsys, lin
     assert contents(here) == before
 
 
-def test_a_mistake_with_a_line_break_is_one_line(here, capsys):
+def test_an_error_with_a_line_break_is_one_line(here, capsys):
     assert call("lines", "log.csv", "--ring", "faw", "-o", "out.jsonl", "--two\nlines") == 2
     assert call("lines", "two\nlines.csv", "--ring", "faw", "-o", "out.jsonl") == 2
     assert call("lines", "log.csv", "--ring", "two\nlines", "-o", "out.jsonl") == 2
     assert len(capsys.readouterr().err.splitlines()) == 3
 
 
-def test_mistakes_of_the_installed_command(here):
+def test_the_installed_command_answers_in_one_line(here):
     done = script("convert", "no.csv", "out.csv")
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1
     assert "no.csv" in done.stderr
 
 
-def test_ctrl_c_leaves_no_half_result(here, capsys, monkeypatch, faw_ring):
+def test_ctrl_c_leaves_no_partial_result(here, capsys, monkeypatch, faw_ring):
     from jaxsonar.detection import extract as local
 
     models = list(local.local_models(faw_ring, load_log("log.csv")[:2]))
@@ -462,10 +462,10 @@ def test_ctrl_c_leaves_no_half_result(here, capsys, monkeypatch, faw_ring):
 @pytest.mark.parametrize(
     "command", [SIMULATE, ["lines", "long.csv", "--ring", "faw", "--method", "hough"]], ids=["simulate", "lines"]
 )
-def test_a_reader_that_leaves_early_is_no_accident(here, command):
+def test_a_closed_pipe_is_not_an_error(here, command):
     log = load_log("log.csv")
     rows = Path("log.csv").read_text().splitlines(keepends=True)
-    if command[0] == "lines":  # more than a pipe holds
+    if command[0] == "lines":  # more than the capacity of a pipe
         texts = [
             f"{k * len(log) + int(row.partition(',')[0])},{row.partition(',')[2]}"
             for k in range(20)
@@ -481,13 +481,13 @@ def test_a_reader_that_leaves_early_is_no_accident(here, command):
         err = process.stderr.read()
         code = process.wait(timeout=120)
     assert first.startswith("scan," if command[0] == "simulate" else '{"scan": 0')
-    assert code in (0, 1)  # 0 where all was written before the reader had gone
+    assert code in (0, 1)  # 0 if everything was written before the pipe was closed
     assert "Traceback" not in err
     assert "Exception" not in err
     assert len(err.splitlines()) <= 1
 
 
-def test_version(capsys):
+def test_the_version_is_that_of_the_project(capsys):
     project = tomllib.loads((DATA.parents[1] / "pyproject.toml").read_text())["project"]
     assert call("--version") == 0
     assert capsys.readouterr().out == f"jaxsonar {project['version']}\n"
@@ -500,7 +500,7 @@ def test_a_saved_log_is_what_the_command_reads(here):
     assert call("lines", "part.csv", "--ring", "faw", "-o", "part.jsonl") == 0
     part, whole = read_models("part.jsonl"), read_models("lines.jsonl")
     assert len(part) == 2
-    for mine, its in zip(part, whole[3:5], strict=True):  # the sums of other shapes may round differently
+    for mine, its in zip(part, whole[3:5], strict=True):  # sums of other shapes may be rounded differently
         assert mine["scan"] == its["scan"]
         assert [line["paths"] for line in mine["lines"]] == [line["paths"] for line in its["lines"]]
         for key in ("rho", "theta", "segment"):

@@ -1,4 +1,4 @@
-"""Commands map, reference and evaluate: files as documented, no input harmed, one line for every mistake."""
+"""Commands map, reference and evaluate: files are as documented, inputs stay unchanged, an error is one line."""
 
 import csv
 import json
@@ -27,7 +27,7 @@ EVALUATE = "evaluate map.geojson office.geojson"
 
 
 def record(folder, scans=12):
-    """A laser in a room of 4 m x 3 m, moving along: what corridor8 records, in mm and tenths of a degree."""
+    """Write a corridor8 recording of a laser that moves through a room of 4 m x 3 m (mm, tenths of a degree)."""
     folder.mkdir()
     bearing = np.radians(-90.4 + 0.5 * np.arange(361))
     beam = np.stack([np.cos(bearing), np.sin(bearing)], -1)
@@ -62,7 +62,7 @@ def here(office, tmp_path, monkeypatch):
 
 
 def strict(text):
-    """JSON as everybody reads it: no NaN, no Infinity."""
+    """Parse JSON without NaN and Infinity."""
 
     def refuse(constant):
         raise ValueError(f"{constant} is no JSON")
@@ -115,7 +115,7 @@ def assert_map_as_documented(path, scans):
 
 
 def edited(rows, **columns):
-    """Rows of a log with some columns computed anew from the row."""
+    """The rows of a log with some columns recomputed from the row."""
     out = [HEADER]
     for row in rows:
         row = {**row, **{name: change(row) for name, change in columns.items()}}
@@ -128,7 +128,7 @@ def rows_of(path):
         return list(csv.DictReader(file))
 
 
-# What is written
+# Results
 
 
 @pytest.mark.slow
@@ -140,7 +140,7 @@ def test_a_map_is_as_documented(here, merging):
 
 
 @pytest.mark.slow
-def test_the_office_is_found_and_evaluated(here, capsys):
+def test_the_map_of_the_office_matches_the_room(here, capsys):
     assert call(*EVALUATE.split(), "--json", "out.json") == 0
     table = capsys.readouterr().out
     assert "precision" in table
@@ -162,7 +162,7 @@ def test_the_office_is_found_and_evaluated(here, capsys):
 
 
 @pytest.mark.slow
-def test_a_map_agrees_with_itself_and_gates_part(here):
+def test_a_map_matches_itself_and_gates_separate(here):
     assert call("evaluate", "map.geojson", "map.geojson", "--json", "same.json") == 0
     same = strict(Path("same.json").read_text())
     assert [same[name] for name in ("precision", "recall", "precision_length", "recall_length")] == pytest.approx(
@@ -176,7 +176,7 @@ def test_a_map_agrees_with_itself_and_gates_part(here):
 
 
 @pytest.mark.slow
-def test_a_map_to_standard_output_leaves_only_what_was_asked_for(here, capsys):
+def test_a_map_to_standard_output_writes_no_other_file(here, capsys):
     before = contents(here)
     assert call("map", "log.csv", "--ring", "faw", "-o", "-", "--figure", "a.svg", "--grid", "g.yaml") == 0
     came = capsys.readouterr()
@@ -187,17 +187,17 @@ def test_a_map_to_standard_output_leaves_only_what_was_asked_for(here, capsys):
 
 
 @pytest.mark.slow
-def test_settings_beside_the_map_give_it_again(here):
+def test_written_settings_reproduce_the_map(here):
     assert call(*MAP.split(), "--settings", "map.settings.toml") == 0
     assert Path("out.geojson").read_bytes() == Path("map.geojson").read_bytes()
     assert Path("out.settings.toml").read_bytes() == Path("map.settings.toml").read_bytes()
-    before = Path("map.geojson").read_bytes()  # in place, too
+    before = Path("map.geojson").read_bytes()  # also when input and output are the same
     assert call("map", "log.csv", "--ring", "faw", "-o", "map.geojson", "--settings", "map.settings.toml") == 0
     assert Path("map.geojson").read_bytes() == before
 
 
 @pytest.mark.slow
-def test_figure_grid_and_drawing_are_of_the_map(here):
+def test_figure_grid_and_drawing_show_the_map(here):
     ezdxf = pytest.importorskip("ezdxf")
     assert call(*MAP.split(), "--figure", "A.PDF", "--grid", "g.YML", "--dxf", "D.DXF") == 0
     assert Path("out.geojson").read_bytes() == Path("map.geojson").read_bytes()
@@ -211,7 +211,7 @@ def test_figure_grid_and_drawing_are_of_the_map(here):
 
 
 @pytest.mark.slow
-def test_parquet_is_as_good_as_csv(here):
+def test_parquet_and_csv_give_the_same_map(here):
     pytest.importorskip("pyarrow")
     assert call("convert", "log.csv", "log.parquet") == 0
     assert call(*MAP.replace("log.csv", "log.parquet").split()) == 0
@@ -219,7 +219,7 @@ def test_parquet_is_as_good_as_csv(here):
 
 
 @pytest.mark.slow
-def test_a_scan_without_a_pose_is_as_none(here, capsys):
+def test_a_scan_without_a_pose_does_not_change_the_map(here, capsys):
     rows = [row for row in rows_of("log.csv") if int(row["scan"]) < 5]
     nowhere = {axis: lambda row, axis=axis: "" if row["scan"] == "2" else row[axis] for axis in ("x", "y", "theta")}
     Path("some.csv").write_text(edited(rows, **nowhere))
@@ -239,7 +239,7 @@ def test_a_scan_without_a_pose_is_as_none(here, capsys):
     [HEADER, HEADER + "0,0,0,0,0,,,\n1,1,1,0,0,,,\n", HEADER + "0,,0,0,0,3,3,1.9\n", HEADER + "0,0,0,0,0,3,15,1\n"],
     ids=["no scan", "no echo", "one echo", "an echo that is not listened to"],
 )
-def test_logs_that_tell_of_no_wall_are_no_mistake(here, capsys, text):
+def test_logs_without_walls_are_valid(here, capsys, text):
     Path("log.csv").write_text(text)
     assert call(*MAP.split(), "--figure", "a.svg") == 0
     assert features("out.geojson") == []
@@ -294,7 +294,7 @@ def test_a_recording_through_all_three_commands(tmp_path, monkeypatch, capsys):
     folder = recorded("corridor8")
     monkeypatch.chdir(tmp_path)
     Path("rec").mkdir()
-    for name in ("laser.txt", "measurement.txt", "poses.txt"):  # the first corridor of it
+    for name in ("laser.txt", "measurement.txt", "poses.txt"):  # only the first corridor
         Path("rec", name).write_text("".join(Path(folder, name).read_text().splitlines(keepends=True)[:210]))
     assert call("convert", "rec", "log.csv", "--from", "corridor8") == 0
     extras = ["--figure", "a.png", "--grid", "g.yaml", "--laser", "rec"]
@@ -311,7 +311,7 @@ def test_a_recording_through_all_three_commands(tmp_path, monkeypatch, capsys):
     assert found["distance_rms_m"] < 0.08
 
 
-# Mistakes: what came, what is allowed, and nothing written
+# Errors: one line with what came and what is allowed, and nothing is written
 
 FAR = HEADER + "0,0,0,0,0,3,3,1.0\n1,1,{},0,0,3,3,1.0\n"
 LOG = "map bad.csv --ring faw -o out.geojson"
@@ -382,7 +382,7 @@ MISTAKES = {
     "drawing of unknown suffix": (f"{MAP} --dxf a.dwg", {}, ["--dxf", "a.dwg", ".dxf"]),
     "grid of no scan": (f"{LOG} --grid a.yaml", {"bad.csv": HEADER}, ["a.yaml", "no scan", "needed"]),
     "grid of half the country": (f"{LOG} --grid a.yaml", {"bad.csv": FAR.format("1e8")}, ["grid", "allowed"]),
-    # outputs where none can be
+    # outputs that cannot be written
     "map into a missing folder": ("map log.csv --ring faw -o no/out.geojson", {}, ["no/out.geojson", "folder"]),
     "figure into a missing folder": (f"{MAP} --figure no/a.svg", {}, ["no/a.svg", "folder"]),
     "grid into a missing folder": (f"{MAP} --grid no/a.yaml", {}, ["no/a.yaml", "folder"]),
@@ -485,7 +485,7 @@ MISTAKES = {
 
 
 def mistaken(here, capsys, line, files):
-    """The one line that answers a wrong call, which leaves everything as it was."""
+    """The one line that answers an invalid call, which changes no file."""
     for name, text in files.items():
         if isinstance(text, Path):
             Path(name).symlink_to(os.path.relpath(text, Path(name).parent))
@@ -506,7 +506,7 @@ def mistaken(here, capsys, line, files):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("line", "files", "said"), list(MISTAKES.values()), ids=list(MISTAKES))
-def test_a_mistake_is_one_line_and_leaves_everything_as_it_was(here, capsys, line, files, said):
+def test_an_invalid_call_is_answered_in_one_line_and_changes_nothing(here, capsys, line, files, said):
     if "--dxf" in line and ".dwg" not in line:
         pytest.importorskip("ezdxf")
     if "/proc/" in line and not Path("/proc").is_dir():
@@ -554,7 +554,7 @@ NO_MAPS = {
 @pytest.mark.slow
 @pytest.mark.parametrize(("text", "said"), list(NO_MAPS.values()), ids=list(NO_MAPS))
 @pytest.mark.parametrize("place", ["evaluate bad.json office.geojson", "evaluate map.geojson bad.json"])
-def test_what_is_no_map_is_named(here, capsys, place, text, said):
+def test_an_invalid_map_is_named(here, capsys, place, text, said):
     err = mistaken(here, capsys, f"{place} --json out.json", {"bad.json": text, "out.json": "before"})
     assert f"bad.json: {said}" in err
     assert "allowed" in err
@@ -566,7 +566,7 @@ def test_what_is_no_map_is_named(here, capsys, place, text, said):
     [lines(), lines([[0, 0, 5], [1, 0, 5]]), lines([[0, 0], [0, 0]]), lines([[0, 0], [9e11, 1e-300]])],
     ids=["no feature", "three coordinates", "no length", "very long"],
 )
-def test_unusual_maps_are_no_mistake(here, capsys, text):
+def test_unusual_maps_are_valid(here, capsys, text):
     Path("odd.json").write_text(text)
     assert call("evaluate", "odd.json", "office.geojson", "--json", "-") == 0
     assert call("evaluate", "map.geojson", "odd.json", "--json", "out.json") == 0
@@ -577,7 +577,7 @@ def test_unusual_maps_are_no_mistake(here, capsys, text):
 
 
 @pytest.mark.slow
-def test_a_drawing_needs_its_extra_and_a_map_does_not(here, capsys, monkeypatch):
+def test_only_a_drawing_needs_its_extra(here, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "ezdxf", None)
     err = mistaken(here, capsys, f"{MAP} --dxf a.dxf", {})
     assert "a.dxf" in err
@@ -585,11 +585,11 @@ def test_a_drawing_needs_its_extra_and_a_map_does_not(here, capsys, monkeypatch)
     assert call(*MAP.split()) == 0
 
 
-# What ends a command early
+# Early ends
 
 
 @pytest.mark.slow
-def test_ctrl_c_leaves_no_half_result(here, capsys, monkeypatch, faw_ring):
+def test_ctrl_c_leaves_no_partial_result(here, capsys, monkeypatch, faw_ring):
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
@@ -611,7 +611,7 @@ def test_ctrl_c_leaves_no_half_result(here, capsys, monkeypatch, faw_ring):
     ["map log.csv --ring faw -o -", "reference rec --scan 0 -o -", EVALUATE, f"{EVALUATE} --json -"],
     ids=["map", "reference", "table", "json"],
 )
-def test_a_reader_that_has_gone_is_no_accident(here, capsys, monkeypatch, line):
+def test_a_closed_pipe_is_not_an_error(here, capsys, monkeypatch, line):
     read, write = os.pipe()
     os.close(read)
     before = contents(here)
@@ -623,7 +623,7 @@ def test_a_reader_that_has_gone_is_no_accident(here, capsys, monkeypatch, line):
 
 
 @pytest.mark.slow
-def test_the_installed_command_says_what_it_says_here(here, capsys):
+def test_the_installed_command_prints_the_same(here, capsys):
     done = script(*EVALUATE.split(), "--json", "-")
     assert (done.returncode, done.stderr) == (0, "")
     assert call(*EVALUATE.split(), "--json", "-") == 0

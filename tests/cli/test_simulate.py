@@ -1,4 +1,4 @@
-"""What ``jaxsonar simulate`` puts beside the echoes: odometry that drifts, no poses, the truth in a file of its own."""
+"""``jaxsonar simulate``: poses with odometry errors or none, and the true poses in another file."""
 
 import tomllib
 from pathlib import Path
@@ -25,11 +25,11 @@ def here(tmp_path, monkeypatch):
 def call(*arguments):
     try:
         return cli.main([str(argument) for argument in (*SIMULATE, *arguments)])
-    except SystemExit as end:  # how argparse ends
+    except SystemExit as end:  # raised by argparse
         return end.code
 
 
-def test_the_same_echoes_with_any_poses():
+def test_the_logged_poses_do_not_change_the_echoes():
     assert call("-o", "true.csv") == 0
     assert call("-o", "drift.csv", "--odometry", "2,1", "--truth", "truth.tum") == 0
     assert call("-o", "none.csv", "--no-odometry") == 0
@@ -46,7 +46,7 @@ def test_the_same_echoes_with_any_poses():
     np.testing.assert_allclose(truth.poses, OFFICE.poses, atol=1e-15)
 
 
-def test_what_was_asked_for_stands_beside_the_log():
+def test_the_settings_are_written_beside_the_log():
     assert call("-o", "a.csv") == 0
     assert call("-o", "b.csv", "--odometry", "0.5,1e-1", "--truth", "b.tum") == 0
     assert call("-o", "c.csv", "--no-odometry") == 0
@@ -79,7 +79,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_wrong_call_is_one_line(mistake, capsys):
+def test_an_invalid_call_is_answered_in_one_line(mistake, capsys):
     arguments, said = MISTAKES[mistake]
     assert call("-o", "out.csv", *arguments) == 2
     shown = capsys.readouterr()

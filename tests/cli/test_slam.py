@@ -1,4 +1,4 @@
-"""Commands slam, localize and stream --slam: files as documented, errors told, one line for every mistake."""
+"""Commands slam, localize and stream --slam: files are as documented, errors are printed in one line."""
 
 import json
 import shutil
@@ -7,20 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.commands import call
-from support.slam_scene import RING, ROOM, SLIP, log, truth
+from support.slam_scene import ODOMETRY_NOISE, RING, ROOM, log, truth
 
 from jaxsonar import load_log, save_log
 from jaxsonar.estimation.trajectory import Trajectory, load_trajectory, save_trajectory, stamps_of
 from jaxsonar.mapping.build_map import build_map
 from jaxsonar.mapping.map_geojson import load_map, save_map
 
-ODOMETRY = f"{100 * SLIP.position_per_meter:g},{np.degrees(SLIP.heading_per_meter):g}"
+ODOMETRY = f"{100 * ODOMETRY_NOISE.position_per_meter:g},{np.degrees(ODOMETRY_NOISE.heading_per_meter):g}"
 COUNT = 14
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A log with odometry, the truth, a map made with the true poses; and what the command made of the log."""
+    """A log with odometry, the truth, a map from the true poses, and the outputs of the command."""
     folder = tmp_path_factory.mktemp("slam")
     some = log()[:COUNT]
     save_log(some, folder / "log.csv")
@@ -41,7 +41,7 @@ def here(made, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_slam_writes_what_it_was_asked_for(here):
+def test_slam_writes_all_requested_files(here):
     poses, given = load_trajectory(here / "poses.tum"), load_trajectory(here / "truth.tum")
     assert len(poses) == COUNT
     np.testing.assert_allclose(poses.poses[0], load_log(here / "log.csv").pose[0], atol=0.02)
@@ -59,7 +59,7 @@ def test_slam_writes_what_it_was_asked_for(here):
 
 
 @pytest.mark.slow
-def test_errors_are_told_and_a_trajectory_may_go_to_standard_output(here, capsys):
+def test_errors_are_printed_and_the_trajectory_may_go_to_standard_output(here, capsys):
     arguments = ("--odometry", ODOMETRY, "--no-smoothing", "--truth", "truth.tum", "--trajectory", "-")
     assert call("slam", "log.csv", "--ring", "faw", "-o", "again.geojson", *arguments) == 0
     out, said = capsys.readouterr()
@@ -95,7 +95,7 @@ BAD = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", BAD)
-def test_a_bad_call_is_answered_in_one_line(here, capsys, line):
+def test_an_invalid_call_is_answered_in_one_line(here, capsys, line):
     save_trajectory(Trajectory(np.array([1e6]), np.zeros((1, 3))), here / "other.tum")
     text = (here / "log.csv").read_text().splitlines()
     header = text[0].split(",")
@@ -113,14 +113,14 @@ def test_a_bad_call_is_answered_in_one_line(here, capsys, line):
 
 @pytest.mark.slow
 def test_localize_in_a_map(here, capsys):
-    """From nothing, and from about where it is."""
+    """Without a start pose, and with an approximate one."""
     pose = truth()[0]
     start = f"--start={pose[0] + 0.2:.2f},{pose[1] - 0.1:.2f},{np.degrees(pose[2]) + 5:.1f}"
     for more in ((), (start, "--figure", "where.svg")):
         files = ("--map", "known.geojson", "--trajectory", "where.tum")
         assert call("localize", "log.csv", "--ring", "faw", *files, *more) == 0
         found = load_trajectory(here / "where.tum")
-        np.testing.assert_allclose(found.poses, truth()[:COUNT], atol=0.06)  # some scans see no wall across the way
+        np.testing.assert_allclose(found.poses, truth()[:COUNT], atol=0.06)  # some scans see no perpendicular wall
         assert "the first is at" in capsys.readouterr().err
     assert (here / "where.svg").exists()
 
@@ -135,14 +135,14 @@ def test_localize_in_a_floor_plan_with_a_negative_start(here, capsys):
     arguments = ("localize", "log.csv", "--ring", "faw", "--map", "plan.geojson", "--trajectory")
     assert call(*arguments, "p.tum", "--start", near) == 0
     np.testing.assert_allclose(load_trajectory(here / "p.tum").poses, truth()[:COUNT], atol=0.06)
-    # Far below the origin: understood, and nothing there.
+    # A start far below the origin is parsed; there is no map.
     assert call(*arguments, "q.tum", "--start", "-9,-9,0") == 1
     assert "no place" in capsys.readouterr().err
     assert not (here / "q.tum").exists()
 
 
 @pytest.mark.slow
-def test_truth_needs_stamps_that_rise(here, capsys):
+def test_truth_needs_ascending_stamps(here, capsys):
     falling = load_log(here / "log.csv")
     save_log(replace(falling, stamp=falling.stamp[::-1].copy()), here / "falling.csv")
     assert call("slam", "falling.csv", "--ring", "faw", "-o", "out.geojson", "--truth", "truth.tum") == 2
@@ -151,8 +151,8 @@ def test_truth_needs_stamps_that_rise(here, capsys):
 
 
 @pytest.mark.slow
-def test_localize_says_where_it_is_not_sure(here, capsys):
-    """Half a turn of a rectangle: code 1, both places, no file."""
+def test_localize_reports_an_uncertain_pose(here, capsys):
+    """A rectangle is symmetric under half a turn: exit code 1, both poses, no file."""
     from jaxsonar import Room, simulate
 
     corners = np.array([[0, 0], [3, 0], [3, 2], [0, 2]], dtype=float)
@@ -160,7 +160,7 @@ def test_localize_says_where_it_is_not_sure(here, capsys):
     poses = np.array([[0.8 + 0.12 * k, 0.7 + 0.03 * k, 0.2 + 0.05 * k] for k in range(5)])
     given = simulate(RING, room, poses, sigma=0.001, seed=2).as_log(RING, poses)
     save_log(given, here / "alike.csv")
-    # The map knows both ends of the room.
+    # The map contains both ends of the room.
     both = np.concatenate([poses, np.array([3.0, 2.0, 0.0]) - poses * [1, 1, -1] + [0, 0, np.pi]])
     known = simulate(RING, room, both, sigma=0.001, seed=3).as_log(RING, both)
     save_map(build_map(RING, known), here / "alike.geojson")
@@ -174,7 +174,7 @@ def test_localize_says_where_it_is_not_sure(here, capsys):
 
 @pytest.mark.slow
 def test_stream_estimates_poses(here):
-    """Poses of the device are odometry; the trajectory is written at the end."""
+    """The device's poses are odometry; the trajectory is written at the end."""
     options = ("--slam", "--odometry", ODOMETRY, "--trajectory", "live.tum", "--map", "live.geojson")
     assert call("stream", "file:log.csv", "--ring", "faw", *options) == 0
     found = load_trajectory(here / "live.tum")

@@ -1,4 +1,4 @@
-"""Recordings of real devices come in as they were taken: counts, units, frames; and a malformed row is named."""
+"""Readers of published data sets: counts, units and frames are right, and a malformed row is named."""
 
 import math
 
@@ -13,7 +13,7 @@ from jaxsonar.sensors.ring_toml import load_ring
 
 
 def dense(recording, sensors):
-    """(scans, sensors) ranges in metres, NaN where nothing was heard."""
+    """(scans, sensors) ranges in metres, NaN without an echo."""
     table = np.full((len(recording.stamp), sensors), np.nan)
     table[recording.scan_index, recording.tx] = recording.range
     return table
@@ -32,7 +32,7 @@ def corridor8(tmp_path):
     return tmp_path
 
 
-def test_corridor8_in_metres_seconds_and_radians(corridor8):
+def test_corridor8_is_read_in_si_units(corridor8):
     heard = read_corridor8(corridor8)
     nan = math.nan
     expected = [[0.11, 0.12, 0.13, 0.14, nan, 0.16, 0.17, 0.18], [0.21, nan, 0.23, 0.24, 0.25, 0.26, 0.27, 5.1]]
@@ -71,14 +71,14 @@ def test_corridor8_headings_wrap(corridor8, tenths, degrees):
         ("poses.txt", "-2600", "\0", "row 2, column y_mm: '\\x00' came; allowed is a finite number"),
     ],
 )
-def test_bad_corridor8_is_named(corridor8, file, old, new, message):
+def test_a_malformed_corridor8_row_is_named(corridor8, file, old, new, message):
     text = (corridor8 / file).read_text()
     assert old in text
     (corridor8 / file).write_text(text.replace(old, new))
     assert f"/{file}: {message}" in refused(read_corridor8, corridor8)
 
 
-def test_corridor8_as_recorded():
+def test_the_published_corridor8_is_read():
     folder = recorded("corridor8")
     heard = read_corridor8(folder)
     columns = np.loadtxt(folder / "measurement.txt")
@@ -90,7 +90,7 @@ def test_corridor8_as_recorded():
     steps = np.hypot(*np.diff(heard.pose[:, :2], axis=0).T)
     assert steps.sum() == pytest.approx(25, abs=1)  # metres of corridor
     forward = np.einsum("ij,ij->i", np.diff(heard.pose[:, :2], axis=0), _direction(heard.pose[:-1, 2]))
-    assert forward.sum() > 0.9 * steps.sum()  # it drives the way it looks: headings are counter-clockwise radians
+    assert forward.sum() > 0.9 * steps.sum()  # it drives forward: headings are counter-clockwise radians
     np.testing.assert_array_equal(read_corridor8(folder / "measurement.txt").range, heard.range)
 
 
@@ -127,7 +127,7 @@ def scitos24(tmp_path):
 def test_scitos24_in_metres_at_9_hz(scitos24):
     heard = read_scitos24(scitos24)
     expected = 0.1 * np.arange(1, 25) + np.array([[0.0], [1.0], [4.0]])
-    expected = np.where(expected > 4.999, np.nan, expected)  # 5.000 itself is no echo
+    expected = np.where(expected > 4.999, np.nan, expected)  # 5.000 means no echo
     np.testing.assert_allclose(dense(heard, 24), expected)
     np.testing.assert_allclose(heard.stamp, [0, 1 / 9, 2 / 9])
     assert np.isnan(heard.pose).all()
@@ -144,13 +144,13 @@ def test_scitos24_in_metres_at_9_hz(scitos24):
         ("S1,S2", "S2,S1", "row 1: 'S2,S1"),
     ],
 )
-def test_bad_scitos24_is_named(scitos24, old, new, message):
+def test_a_malformed_scitos24_row_is_named(scitos24, old, new, message):
     file = scitos24 / "sensor_readings_24.data"
     file.write_text(file.read_text().replace(old, new))
     assert f"/{file.name}: {message}" in refused(read_scitos24, file)
 
 
-def test_scitos24_as_recorded():
+def test_the_published_scitos24_is_read():
     heard = read_scitos24(recorded("scitos24"))
     assert len(heard.stamp) == 5456
     assert heard.stamp[-1] == pytest.approx(5455 / 9)
@@ -159,7 +159,7 @@ def test_scitos24_as_recorded():
 
 
 def test_scitos24_front_left_and_right_are_where_the_ring_says():
-    """The set's own minima over the sectors at 0, +90 and -90 deg: what bearings S_k = -180 + 15 (k - 1) deg give."""
+    """The minima over sectors that the set contains agree with bearings S_k = -180 + 15 (k - 1) deg."""
     folder = recorded("scitos24")
     bearing = np.degrees(np.asarray(load_ring("scitos24").heading))
     minima = np.loadtxt(folder / "sensor_readings_4.csv", delimiter=",", usecols=(0, 1, 2))
@@ -175,7 +175,7 @@ def test_scitos24_front_left_and_right_are_where_the_ring_says():
 
 
 def sew_text(messages):
-    """``dist.csv`` of messages {(tx, rx): [(begin, end), ...]} in mm."""
+    """``dist.csv`` of messages {(tx, rx): [(start, end), ...]} in mm."""
     lines = ["rx0,rx1,rx2,rx3"]
     for message in messages:
         table = np.full((4, 12, 4), 65535)
@@ -185,7 +185,7 @@ def sew_text(messages):
     return "\n".join([*lines, ""])
 
 
-# begins that name themselves: 1000 (message + 1) + 100 tx + 10 rx + object
+# each start is a distinct number: 1000 (message + 1) + 100 tx + 10 rx + object
 MESSAGES = [
     {
         (tx, rx): [(1000 * (n + 1) + 100 * tx + 10 * rx + k, 1000 * (n + 1) + 500) for k in range((tx + rx + n) % 7)]
@@ -197,13 +197,13 @@ MESSAGES = [
 
 
 def echoes(messages):
-    """What has to be heard, in the order of scan, tx, rx, object."""
+    """The expected echoes, in order of scan, tx, rx, object."""
     return [
         (n, tx, rx, begin / 1000) for n, m in enumerate(messages) for (tx, rx), pairs in m.items() for begin, _ in pairs
     ]
 
 
-def test_sew_begins_are_the_echoes_of_each_pair(tmp_path):
+def test_starts_of_sew_objects_are_the_echoes_of_each_path(tmp_path):
     (tmp_path / "dist.csv").write_text(sew_text(MESSAGES))
     heard = read_sew_amr(tmp_path / "dist.csv")
     columns = (heard.scan_index, heard.tx, heard.rx, heard.range)
@@ -226,20 +226,20 @@ def test_sew_folder_is_read_in_the_order_of_its_numbers(tmp_path):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
 
 
-def test_sew_message_without_an_object_is_a_silent_scan(tmp_path):
+def test_a_sew_message_without_objects_is_a_scan_without_echoes(tmp_path):
     (tmp_path / "dist.csv").write_text(sew_text([{}, {(3, 2): [(700, 800)]}]))
     log = convert(tmp_path / "dist.csv", tmp_path / "log.csv", from_="sew-amr")
     assert [len(scan.range) for scan in log] == [0, 1]
     assert load_log(tmp_path / "log.csv") == log
 
 
-def test_sew_ring_takes_the_offsets_off():
+def test_the_sew_ring_corrects_the_range_offsets():
     ring = load_ring("sew-amr")
     tx, rx = np.array([0, 0, 3]), np.array([0, 3, 1])
     metres = ring.corrected(np.array([1.252, 1.2545, 1.2565]), tx, rx)
     np.testing.assert_allclose(metres, 1.0)
     np.testing.assert_allclose(np.asarray(ring.position)[:, 1], [-0.266, 0.089, -0.089, 0.266])
-    assert len(ring.paths) == 16  # each hears all
+    assert len(ring.paths) == 16  # every sensor receives all others
 
 
 @pytest.mark.parametrize(
@@ -255,7 +255,7 @@ def test_sew_ring_takes_the_offsets_off():
         (lambda lines: [], "row 1: nothing came"),
     ],
 )
-def test_bad_sew_is_named(tmp_path, change, message):
+def test_a_malformed_sew_row_is_named(tmp_path, change, message):
     lines = sew_text(MESSAGES[:1]).splitlines()
     (tmp_path / "dist.csv").write_text("".join(f"{line}\n" for line in change(lines)))
     assert f"/dist.csv: {message}" in refused(read_sew_amr, tmp_path)
@@ -265,7 +265,7 @@ def test_bad_sew_is_named(tmp_path, change, message):
 
 
 @pytest.mark.parametrize("reader", [read_corridor8, read_scitos24, read_sew_amr])
-def test_no_recording_there(reader, tmp_path):
+def test_a_missing_recording_is_named(reader, tmp_path):
     assert "No such file or directory" in refused(reader, tmp_path / "missing")
     assert str(tmp_path) in refused(reader, tmp_path)
     (tmp_path / "picture").write_bytes(b"\x89PNG\xff\xfe")
@@ -274,7 +274,7 @@ def test_no_recording_there(reader, tmp_path):
 
 @pytest.mark.parametrize("name", ["corridor8", "scitos24"])
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_convert_keeps_all_of_a_recording(name, suffix, tmp_path):
+def test_convert_keeps_every_echo_of_a_recording(name, suffix, tmp_path):
     if suffix == ".parquet":
         pytest.importorskip("pyarrow")
     log = convert(recorded(name), tmp_path / f"log{suffix}", from_=name)
@@ -287,7 +287,7 @@ def test_convert_keeps_all_of_a_recording(name, suffix, tmp_path):
     assert (ring.path_index[log.tx, log.rx] >= 0).all()  # the shipped ring has every path of the recording
 
 
-def test_convert_refuses_what_it_does_not_know(corridor8, tmp_path):
+def test_convert_rejects_unknown_formats(corridor8, tmp_path):
     known = "corridor8, scitos24, sew-amr, csv, parquet"
     assert known in refused(convert, corridor8, tmp_path / "a.csv")
     assert f"format 'corridor9' came; allowed are {known}" in refused(

@@ -1,4 +1,4 @@
-"""The emulated device: a log comes out of the line as it went in, in time, and as badly as was asked for."""
+"""The emulated device: a log is transmitted unchanged and in real time, with the requested faults."""
 
 import threading
 import time
@@ -33,7 +33,7 @@ def log(office):
 
 
 def log_of(messages):
-    """What a receiver makes of undamaged messages: an oracle, as plain as it can be."""
+    """Oracle: the scans in undamaged messages, by a simple receiver."""
     scans, pose = {}, (np.nan,) * 3
     for message in messages:
         if isinstance(message, Pose):
@@ -71,7 +71,7 @@ def assert_same(heard, log):
     a, b = in_order(heard), in_order(log)
     assert np.array_equal(heard.tx[a], log.tx[b])
     assert np.array_equal(heard.rx[a], log.rx[b])
-    assert np.allclose(heard.range[a], log.range[b], rtol=0, atol=1e-5)  # a tenth of the 0.1 mm that are asked for
+    assert np.allclose(heard.range[a], log.range[b], rtol=0, atol=1e-5)  # a tenth of the required 0.1 mm
     assert np.allclose(heard.amplitude[a], log.amplitude[b], rtol=1e-6, equal_nan=True)
 
 
@@ -86,7 +86,7 @@ def test_a_log_comes_back_from_its_messages(office, log):
 
 
 def test_the_farthest_echo_keeps_a_tenth_of_a_millimetre():
-    """float32 microseconds at 100 m, the largest ring there is."""
+    """float32 microseconds at 100 m, the largest possible range."""
     ring = Ring.circular(max_range=100.0)
     distance = np.linspace(99.9, 100.0, 1001)
     tx = np.arange(1001) % 24
@@ -97,8 +97,8 @@ def test_the_farthest_echo_keeps_a_tenth_of_a_millimetre():
     assert np.abs(heard.range[in_order(heard)] - distance[in_order(log)]).max() < 1e-4 / 4
 
 
-def test_messages_of_a_scan(office, log):
-    """A pose, then the groups in their order; numbers without gaps; times that rise; who fires in which group."""
+def test_a_scan_becomes_one_pose_and_its_groups(office, log):
+    """A pose, then the groups in order; consecutive numbers, ascending times, and the right transmitters per group."""
     sent = list(log_messages(log, office.ring, temperature=21.5))
     assert [message.sequence for message in sent] == list(range(17 * 9))
     groups = [message for message in sent if isinstance(message, Group)]
@@ -115,8 +115,8 @@ def test_messages_of_a_scan(office, log):
             assert own["echo"][np.argsort(own["time_us"])].tolist() == list(range(len(own)))
 
 
-def test_a_log_with_hardly_anything_in_it(office):
-    """Silent scans are sent, poses that are not there are not, stamps that are not there follow one another."""
+def test_logs_with_hardly_any_data_are_sent(office):
+    """Scans without echoes are sent, missing poses are not, and missing stamps are consecutive."""
     nothing = np.zeros(0, dtype=int)
     log = Log.from_echoes(
         nothing,
@@ -134,7 +134,7 @@ def test_a_log_with_hardly_anything_in_it(office):
     assert list(log_messages(log[:0], office.ring)) == []
 
 
-def test_scans_closer_than_sound_allows(office, log):
+def test_scans_closer_than_the_time_of_flight_are_rejected(office, log):
     quick = Log.from_echoes(
         log.echo_scan, log.tx, log.rx, log.range, stamp=np.arange(17) * 0.01, pose=log.pose, scan=log.scan
     )
@@ -158,7 +158,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("error", WRONG)
-def test_what_no_device_says(office, error):
+def test_logs_that_no_device_can_report_are_rejected(office, error):
     columns = {
         "scan_index": np.array([0]),
         "tx": np.array([3]),
@@ -172,21 +172,21 @@ def test_what_no_device_says(office, error):
         log_messages(log, office.ring)
 
 
-def test_more_echoes_of_a_path_than_numbers(office):
+def test_too_many_echoes_of_a_path_are_rejected(office):
     zeros = np.zeros(257, dtype=int)
     log = Log.from_echoes(zeros, zeros, zeros, np.linspace(1, 2, 257), stamp=np.zeros(1), pose=np.zeros((1, 3)))
     with pytest.raises(SonarError, match="257 echoes of one path"):
         log_messages(log, office.ring)
 
 
-def test_a_falling_stamp(office, log):
+def test_a_descending_stamp_is_rejected(office, log):
     back = Log.from_echoes(log.echo_scan, log.tx, log.rx, log.range, stamp=log.stamp[::-1], pose=log.pose)
     with pytest.raises(SonarError, match=r"scans\[1\]\) came; allowed are seconds"):
         log_messages(back, office.ring)
 
 
-def test_poses_on_the_way(office):
-    """A robot at constant speed that turns through the seam of the angles: so are the poses of its groups."""
+def test_poses_are_interpolated_between_scans(office):
+    """A robot at constant speed whose heading crosses pi: the poses of its groups follow."""
     stamps = np.arange(6) * 0.2
     poses = np.stack([1.0 + 0.5 * stamps, 2.0 - 0.3 * stamps, 3.0 + 1.0 * stamps], axis=-1)
     poses[:, 2] = (poses[:, 2] + np.pi) % (2 * np.pi) - np.pi
@@ -195,14 +195,14 @@ def test_poses_on_the_way(office):
     sent = list(log_messages(log, office.ring, moving=True))
     found = np.array([[m.time_us / 1e6, m.x, m.y, m.theta] for m in sent if isinstance(m, Pose)])
     assert [type(message) for message in sent] == [Pose, Group] * 48
-    assert np.array_equal(found[7::8, 1:], poses)  # that of the last group is the log's
-    since = np.maximum(found[:, 0] - found[7, 0], 0)  # before that there is nothing to go by
+    assert np.array_equal(found[7::8, 1:], poses)  # the last group has the pose of the log
+    since = np.maximum(found[:, 0] - found[7, 0], 0)  # before the first scan there is no motion
     expected = poses[0] + since[:, None] * np.array([0.5, -0.3, 1.0])
     assert np.abs(relative(expected, found[:, 1:])).max() < 1e-5
     assert np.abs(found[:, 3]).max() <= np.pi
 
 
-def test_a_pose_that_is_missing_on_the_way(office):
+def test_a_missing_pose_is_not_interpolated(office):
     stamps = np.arange(4.0)
     poses = np.array([[0.0, 0, 0], [np.nan] * 3, [2.0, 0, 0], [3.0, 0, 0]])
     nothing = np.zeros(0, dtype=int)
@@ -210,11 +210,11 @@ def test_a_pose_that_is_missing_on_the_way(office):
     scans = Counter(
         round(m.time_us / 1e6 - 0.05) for m in log_messages(log, office.ring, moving=True) if isinstance(m, Pose)
     )
-    assert scans == {0: 8, 1: 1, 2: 8, 3: 8}  # said once, that it is not known
+    assert scans == {0: 8, 1: 1, 2: 8, 3: 8}  # one message reports the unknown pose
 
 
 def test_a_pose_that_is_missing_is_no_lost_message(office, log):
-    """The numbers have no gap, and the log comes back without the poses that it lacks."""
+    """The sequence has no gap, and the log comes back with the same missing poses."""
     pose = log.pose.copy()
     pose[[0, 3, 4, 9]] = np.nan
     part = Log.from_echoes(
@@ -225,15 +225,15 @@ def test_a_pose_that_is_missing_is_no_lost_message(office, log):
     assert_same(log_of(sent), part)
 
 
-def test_a_robot_at_rest_hears_in_a_room_what_a_scan_hears(office):
-    """Where nothing moves, groups simulated one by one are the scan simulated at once."""
+def test_a_standing_robot_gets_the_echoes_of_a_simulated_scan(office):
+    """Without motion, separately simulated groups are the simulated scan."""
     poses = np.repeat(office.poses[3:4], 2, axis=0)
     stamps = np.array([0.0, 0.5])
     log = simulate(office.ring, office.room, poses, stamps=stamps).as_log(office.ring, poses)
     assert_same(log_of(room_messages(office.ring, office.room, poses, stamps)), log)
 
 
-def test_a_moving_robot_hears_each_group_from_its_own_pose(office):
+def test_a_moving_robot_gets_each_group_at_its_own_pose(office):
     stamps = np.array([0.0, 0.2])
     poses = office.poses[:2]
     sent = list(room_messages(office.ring, office.room, poses, stamps, seed=4, temperature=-5.0))
@@ -252,11 +252,11 @@ def test_a_moving_robot_hears_each_group_from_its_own_pose(office):
     assert compared > 50
 
 
-# --- the device on a line
+# --- the device on a link
 
 
 class Running:
-    """An emulated device in a thread, and what it did."""
+    """An emulated device in a thread, and its counters."""
 
     def __init__(self, messages, url, **settings):
         self.stop, self.sink, self.error = threading.Event(), listen(url), None
@@ -282,7 +282,7 @@ class Running:
 
 
 def receive(url, *, seconds=30.0, until=lambda decoder, found: False, **settings):
-    """(messages, decoder, when each came), until the device says that it was all."""
+    """(messages, decoder, times of arrival) until the end frame."""
     decoder, found, when = Decoder(sensors=24), [], []
     with open_source(url, **settings) as source:
         end = time.monotonic() + seconds
@@ -300,7 +300,7 @@ URLS = {"tcp": "tcp://127.0.0.1:0", "udp": "udp://127.0.0.1:0", "pty": "pty:"}
 
 
 @pytest.mark.parametrize("url", URLS.values(), ids=URLS)
-def test_the_office_comes_out_of_the_line_as_it_went_in(url, office, log):
+def test_the_office_log_survives_every_transport(url, office, log):
     sent = list(log_messages(log, office.ring))
     with Running(sent, url, speed=0.0) as device:
         found, decoder, _ = receive(device.url)
@@ -314,7 +314,7 @@ def test_the_office_comes_out_of_the_line_as_it_went_in(url, office, log):
 
 
 class Clocked(Sink):
-    """A client that takes everything at once, and looks at the clock."""
+    """A client that reads everything at once and records the time."""
 
     def __init__(self):
         self.there, self.when = time.monotonic(), []
@@ -334,8 +334,8 @@ class Clocked(Sink):
         pass
 
 
-def test_messages_come_in_time(office, log):
-    """At 20 times the speed: never early, and late only as much as a busy machine makes it."""
+def test_messages_are_sent_in_real_time(office, log):
+    """At 20 times the speed: never early, and late only because of a busy machine."""
     sent = list(log_messages(log[:4], office.ring))
     sink = Clocked()
     served = emulate(sent, sink, speed=20.0)
@@ -347,7 +347,7 @@ def test_messages_come_in_time(office, log):
     assert late.max() == pytest.approx(served.max_delay, abs=0.1)
 
 
-def test_slow_is_slower_than_fast(office, log):
+def test_the_playback_speed_scales_time(office, log):
     took = []
     for speed in (0.0, 20.0):
         with Running(list(log_messages(log[:8], office.ring)), "tcp://127.0.0.1:0", speed=speed) as device:
@@ -358,14 +358,14 @@ def test_slow_is_slower_than_fast(office, log):
 
 
 @pytest.mark.parametrize("speed", [-1.0, np.nan, np.inf])
-def test_speeds_that_are_none(speed):
+def test_invalid_speeds_are_rejected(speed):
     with listen("tcp://:0") as sink, pytest.raises(SonarError, match=r"--speed: .* came; allowed is 0"):
         emulate([], sink, speed=speed)
 
 
 @pytest.mark.parametrize("scheme", ["tcp", "pty"])
-def test_the_next_client_continues(scheme, office, log):
-    """Nothing between two clients is skipped, and the device waits without one."""
+def test_the_next_client_continues_where_the_last_one_left(scheme, office, log):
+    """No message is skipped between two clients, and the device waits without a client."""
     sent = list(log_messages(log, office.ring))
     half = len(sent) // 2
     left = threading.Event()
@@ -381,12 +381,12 @@ def test_the_next_client_continues(scheme, office, log):
         second, decoder, _ = receive(device.url)
     assert decoder.ended
     assert [message.sequence for message in first + second] == [message.sequence for message in sent]
-    # A terminal that is opened again at once looks as if it had never been closed.
+    # The device cannot see that a terminal was closed if it is reopened at once.
     assert device.served.clients == 2 or (scheme == "pty" and device.served.clients == 1)
 
 
-def test_a_pulled_plug_in_the_middle(office, log):
-    """A reset connection is made again by the source; what was on its way is missing, the rest is whole."""
+def test_an_unplugged_link_loses_only_what_was_in_flight(office, log):
+    """The source reconnects after a reset; messages in flight are lost, the others are complete."""
     sent = list(log_messages(log, office.ring))
     events = []
     sink = listen("tcp://127.0.0.1:0")
@@ -410,8 +410,8 @@ def test_a_pulled_plug_in_the_middle(office, log):
     assert numbers[-(len(sent) - 70) :] == list(range(70, len(sent)))
 
 
-def test_stopping_a_device_that_waits(office, log):
-    """For a client, for the time of a message, or for a client that takes nothing."""
+def test_a_waiting_device_can_be_stopped(office, log):
+    """While it waits for a client, for the time of a message, or for a client that does not read."""
     sent = list(log_messages(log, office.ring))
     with Running(sent, "tcp://127.0.0.1:0"):
         time.sleep(0.1)
@@ -426,17 +426,17 @@ def test_stopping_a_device_that_waits(office, log):
         assert time.monotonic() - begin < 10
 
 
-def test_a_message_that_no_frame_holds_is_an_error():
+def test_a_message_that_cannot_be_encoded_is_an_error():
     bad = Pose(0, 0, float("nan"), 0.0, 0.0)
     with listen("tcp://:0") as sink, pytest.raises(SonarError, match="pose message"):
         emulate([bad], sink)
 
 
-# --- bad links
+# --- faulty links
 
 
-def test_faults_on_the_line(office, log):
-    """What arrives is true, what is lost or damaged is counted, the order is nearly the order."""
+def test_injected_faults_never_become_echoes(office, log):
+    """Received data are correct, lost and damaged frames are counted, and the order is kept up to swaps."""
     sent = list(log_messages(log, office.ring))
     faults = FaultSettings(corrupt=0.1, drop=0.1, reorder=0.1, seed=5)
     with Running(sent, "tcp://127.0.0.1:0", speed=0.0, faults=faults) as device:
@@ -479,7 +479,7 @@ def test_each_fault_does_what_it_says():
     assert (none.damaged, lost.dropped, bad.damaged, swapped.swapped) == (0, 200, 200, 3)
 
 
-def test_damage_is_of_every_kind(rng):
+def test_every_kind_of_corruption_occurs(rng):
     whole = bytes(range(1, 100)) + b"\0"
     sizes = Counter(np.sign(len(corrupt_frame(rng, whole)) - len(whole)) for _ in range(600))
     assert min(sizes[-1], sizes[0], sizes[1]) > 150
@@ -487,8 +487,8 @@ def test_damage_is_of_every_kind(rng):
     assert all(corrupt_frame(rng, b"\0") != b"\0" for _ in range(100))
 
 
-def test_a_device_that_stalls(office, log):
-    """It falls silent, the receiver says so, and what it had to say comes afterwards."""
+def test_a_stalled_device_sends_late(office, log):
+    """The receiver reports the silence, and the delayed messages arrive afterwards."""
     sent = list(log_messages(log[:4], office.ring))
 
     def slowly():
@@ -504,7 +504,7 @@ def test_a_device_that_stalls(office, log):
     assert [event.kind for event in events][:2] == ["silent", "back"]
 
 
-def test_stalls_come_every_so_often():
+def test_stalls_are_periodic():
     link = FaultInjector(FaultSettings(stall=1.0, every=10.0))
     pauses = [(k / 10, link.stall_duration(k / 10)) for k in range(500)]
     assert [when for when, pause in pauses if pause] == [10.0, 20.0, 30.0, 40.0]
@@ -515,13 +515,13 @@ def test_stalls_come_every_so_often():
 @pytest.mark.parametrize(
     ("text", "stall"), [("2", (2.0, 10.0)), ("2@7", (2.0, 7.0)), (".5@1.5", (0.5, 1.5)), ("30", (30.0, 60.0))]
 )
-def test_stalls_as_people_write_them(text, stall):
+def test_stall_options_are_parsed(text, stall):
     assert parse_stall(text) == stall
     FaultSettings(stall=stall[0], every=stall[1])
 
 
 @pytest.mark.parametrize("text", ["", "x", "2@", "@2", "-1", "2@3@4", "nan", "1e3"])
-def test_stalls_that_are_none(text):
+def test_invalid_stalls_are_rejected(text):
     with pytest.raises(SonarError, match=r"--stall: .* came; allowed is"):
         parse_stall(text)
 
@@ -538,10 +538,10 @@ def test_stalls_that_are_none(text):
     ],
     ids=str,
 )
-def test_faults_that_are_none(faults):
+def test_invalid_faults_are_rejected(faults):
     with pytest.raises(SonarError, match=rf"--{next(iter(faults))}: .* came; allowed is"):
         FaultSettings(**faults)
 
 
-def test_the_end_is_said_often_enough_for_a_bad_line():
+def test_the_end_frame_is_repeated():
     assert emulator.END_FRAMES > 1

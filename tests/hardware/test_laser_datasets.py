@@ -1,4 +1,4 @@
-"""Laser scans of recordings come in as they were taken: metres, radians, frames; and a malformed row is named."""
+"""Readers of laser scans: metres, radians and frames are right, and a malformed row is named."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from jaxsonar.hardware.laser_datasets import read_corridor8_laser
 
 @pytest.fixture
 def corridor8(tmp_path):
-    """Two scans; beam k reads 1000 + k and 3000 + k mm, but for three that are no return."""
+    """Two scans; beam k reads 1000 + k and 3000 + k mm, except three without a return."""
     ranges = np.array([[1000], [3000]]) + np.arange(361)
     ranges[0, 5], ranges[0, 7], ranges[1, 9] = 81910, 59, 60001
     rows = [f"{t} {' '.join(map(str, row))}\n" for t, row in zip((1000, 1250), ranges, strict=True)]
@@ -19,7 +19,7 @@ def corridor8(tmp_path):
     return tmp_path
 
 
-def test_in_metres_and_radians(corridor8):
+def test_the_laser_is_read_in_si_units(corridor8):
     laser = read_corridor8_laser(corridor8)
     expected = np.array([[1.0], [3.0]]) + np.arange(361) / 1000
     expected[0, 5] = expected[0, 7] = expected[1, 9] = np.nan
@@ -44,18 +44,18 @@ def test_in_metres_and_radians(corridor8):
         ("poses.txt", "2700", "3601", "row 2, column heading: '3601' came; allowed is 0 to 3600"),
     ],
 )
-def test_a_bad_row_is_named(corridor8, file, old, new, message):
+def test_a_malformed_row_is_named(corridor8, file, old, new, message):
     text = (corridor8 / file).read_text()
     assert old in text
     (corridor8 / file).write_text(text.replace(old, new))
     assert f"/{file}: {message}" in refused(read_corridor8_laser, corridor8)
 
 
-def test_no_recording_there(tmp_path):
+def test_a_missing_recording_is_named(tmp_path):
     assert "No such file or directory" in refused(read_corridor8_laser, tmp_path)
 
 
-def test_as_recorded():
+def test_the_published_laser_is_read():
     folder = recorded("corridor8")
     laser, sonar = read_corridor8_laser(folder), read_corridor8(folder)
     assert laser.ranges.shape == (413, 361)

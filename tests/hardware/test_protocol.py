@@ -1,4 +1,4 @@
-"""Frames: what goes in comes out, and nothing else ever does."""
+"""Frames: encode and decode are inverse, and damaged data never become a message."""
 
 import re
 import struct
@@ -45,7 +45,7 @@ messages = st.one_of(groups(), poses)
 
 
 def content(message):
-    """Everything in a message, comparable; NaN equals NaN of the same bits."""
+    """All fields of a message, comparable; NaN equals NaN of the same bits."""
     if isinstance(message, Pose):
         return ("pose", *vars(message).values())
     assert message.echoes.dtype == ECHO
@@ -64,18 +64,18 @@ def group(**changes):
 
 
 def record(message):
-    """What is in a message's frame, without CRC."""
+    """The record in the frame of a message, without CRC."""
     return protocol.cobs.decode(encode(message)[:-1])[:-4]
 
 
 @given(st.lists(messages, max_size=5))
-def test_what_goes_in_comes_out(sent):
+def test_encode_and_decode_are_inverse(sent):
     decoder = Decoder(sensors=SENSORS)
     assert contents(decoder.feed(b"".join(map(encode, sent)))) == contents(sent)
     assert asdict(decoder.counts) == asdict(protocol.DecoderCounts(frames=len(sent)))
 
 
-def test_a_pose_may_be_not_known_any_more():
+def test_an_unknown_pose_is_encoded():
     decoder = Decoder()
     (pose,) = decoder.feed(encode(Pose(1, 2, *[float("nan")] * 3)))
     assert isinstance(pose, Pose)
@@ -95,11 +95,11 @@ def test_the_largest_group_fits():
     echoes = np.zeros(protocol.MAX_GROUP_ECHOES, ECHO)
     echoes["time_us"], echoes["tx"] = np.linspace(1, 1e6, len(echoes)), 0x101
     data = encode(group(echoes=echoes))
-    assert len(data) <= MAX_FRAME_BYTES + 1 < 65507  # what a datagram holds
+    assert len(data) <= MAX_FRAME_BYTES + 1 < 65507  # maximum size of a datagram
     assert contents(Decoder().feed(data)) == contents([group(echoes=echoes)])
 
 
-def test_the_examples_of_the_page():
+def test_the_examples_of_the_documentation_hold():
     text = PAGE.read_text(encoding="utf-8")
     blocks = re.findall(r"(?:^    (?:[0-9a-f]{2} ?)+$\n)+", text, re.MULTILINE)
     data = [bytes.fromhex(block) for block in blocks]
@@ -134,7 +134,7 @@ bad_time = np.array([(0, 0, 0, 0, 0.0, 0.0)], ECHO)
     ],
     ids=lambda message: type(message).__name__,
 )
-def test_what_no_frame_holds_is_not_encoded(message):
+def test_values_out_of_range_are_not_encoded(message):
     with pytest.raises(SonarError, match=r"came; allowed") as caught:
         encode(message)
     assert "\n" not in str(caught.value)
@@ -155,7 +155,7 @@ noise = st.one_of(
     st.lists(st.one_of(messages.map(encode), noise, st.just(b"\1" * (MAX_FRAME_BYTES + 2))), max_size=8),
     st.lists(st.integers(0, 2**20), max_size=20),
 )
-def test_how_bytes_are_cut_makes_no_difference(parts, where):
+def test_chunk_sizes_do_not_matter(parts, where):
     data = b"".join(parts)
     whole, pieces = Decoder(sensors=SENSORS), Decoder(sensors=SENSORS)
     together = whole.feed(data)
@@ -170,7 +170,7 @@ def test_how_bytes_are_cut_makes_no_difference(parts, where):
 @settings(max_examples=300)
 @given(st.lists(st.binary(max_size=400), max_size=10))
 def test_arbitrary_bytes_are_no_message(chunks):
-    """Every piece between two zeros is counted once, whatever it is."""
+    """Every piece between two zeros is counted once, whatever its content."""
     decoder = Decoder()
     for chunk in chunks:
         assert decoder.feed(chunk) == []
@@ -180,8 +180,8 @@ def test_arbitrary_bytes_are_no_message(chunks):
 
 @settings(max_examples=300)
 @given(st.binary(max_size=80), st.integers(0, 4), st.integers(0, 4))
-def test_arbitrary_records_with_a_right_checksum(tail, kind, zero):
-    """Whatever a hostile sender puts in a frame gives one message that keeps all bounds, or counts as one frame."""
+def test_arbitrary_records_with_a_valid_checksum_are_valid_or_counted(tail, kind, zero):
+    """Any record with a valid checksum gives one message within all bounds, or counts as one rejected frame."""
     head = struct.pack("<BBBBIQ", 1, 0, kind, zero // 4, 1, 2)
     decoder = Decoder(sensors=SENSORS)
     found = decoder.feed(encode_frame(head + tail))
@@ -201,7 +201,7 @@ def some_messages(rng):
 
 @pytest.mark.slow
 def test_no_false_echo_from_100_000_damaged_frames(rng):
-    """Damage never makes an echo, is counted, and is over with the next 0x00."""
+    """Corruption never gives an echo, is counted, and ends with the next 0x00."""
     sent = list(some_messages(rng))
     true = set(contents(sent))
     frames = [encode(message) for message in sent]
@@ -219,18 +219,18 @@ def test_no_false_echo_from_100_000_damaged_frames(rng):
         before = decoder.counts.rejected
         found = contents(decoder.feed(damaged + after))
         assert true.issuperset(found)
-        assert found[-1] == last  # the next frame; the one before it too, unless the 0x00 between was hit
+        assert found[-1] == last  # the next frame; the previous one too, unless its 0x00 was hit
         whole = len(found) == 3
         survived += whole
         pieces = [piece for piece in damaged.split(b"\0") if piece]
         assert whole or not pieces or decoder.counts.rejected > before
         assert len(found) >= 2 or not damaged.endswith(b"\0")
-    assert survived < 5000  # an inserted 0x00 before or behind the frame does no harm
+    assert survived < 5000  # an inserted 0x00 before or after the frame is harmless
     assert decoder.counts.rejected > 95_000
 
 
-def test_a_stream_without_order(rng):
-    """Frames lost, swapped, repeated: each that is whole comes out as it was, in the order of the bytes."""
+def test_a_shuffled_stream_gives_the_same_messages_and_counts(rng):
+    """Frames are lost, swapped and repeated: each complete one is decoded, in the order of the bytes."""
     sent = list(some_messages(rng))
     order = rng.integers(0, len(sent), 1000).tolist()
     found = Decoder(sensors=SENSORS).feed(b"".join(encode(sent[k]) for k in order))
@@ -238,7 +238,7 @@ def test_a_stream_without_order(rng):
 
 
 def hostile(place, packing, value, **changes):
-    """A group's frame with a right CRC and something else at one place of the record."""
+    """The frame of a group with one changed field and a valid CRC."""
     data = bytearray(record(group(**changes)))
     struct.pack_into(packing, data, place, value)
     return encode_frame(bytes(data))
@@ -278,7 +278,7 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize("data", [pytest.param(data, id=name) for name, data in IMPOSSIBLE.items()])
-def test_hostile_frames_are_counted_and_nothing_else(data):
+def test_invalid_frames_are_only_counted(data):
     decoder = Decoder(sensors=SENSORS)
     found = decoder.feed(data + encode(group()))
     assert contents(found) == contents([group()])
@@ -287,7 +287,7 @@ def test_hostile_frames_are_counted_and_nothing_else(data):
 
 @pytest.mark.parametrize("place", [32, 34, 46, 48])
 @pytest.mark.parametrize("sensor", [24, 25, 65535])
-def test_sensors_out_of_the_ring(place, sensor):
+def test_unknown_sensors_are_counted(place, sensor):
     data = hostile(place, "<H", sensor)
     decoder, any_ring = Decoder(sensors=SENSORS), Decoder()
     assert decoder.feed(data) == []
@@ -295,7 +295,7 @@ def test_sensors_out_of_the_ring(place, sensor):
     assert len(any_ring.feed(data)) == 1
 
 
-def test_the_last_sensor_of_the_ring_is_in_it():
+def test_the_last_sensor_of_the_ring_is_accepted():
     assert len(Decoder(sensors=SENSORS).feed(hostile(32, "<H", SENSORS - 1))) == 1
 
 
@@ -310,8 +310,8 @@ def test_an_endless_frame_takes_no_memory_and_counts_once(step):
     assert decoder.counts == protocol.DecoderCounts(frames=1, oversized=1)
 
 
-def test_a_real_frame_of_a_million_echoes():
-    """Everything about it is right but its size."""
+def test_a_valid_frame_follows_an_oversized_one():
+    """Everything except its size is valid."""
     echoes = np.zeros(1_000_000, ECHO)
     echoes["time_us"] = 1000.0
     decoder = Decoder()
@@ -323,8 +323,8 @@ def test_a_real_frame_of_a_million_echoes():
     ("major", "minor", "kind", "counted"),
     [(1, 0, 9, "unknown"), (1, 0, 0, "unknown"), (1, 1, 1, "newer"), (1, 200, 9, "newer"), (2, 0, 1, "refused")],
 )
-def test_what_comes_later_is_skipped_and_counted(major, minor, kind, counted):
-    """Whatever such a frame holds: nothing of it is looked at."""
+def test_newer_versions_are_skipped_and_counted(major, minor, kind, counted):
+    """The content of such a frame is not evaluated."""
     decoder = Decoder(sensors=SENSORS)
     for body in (record(group())[3:], b"\xff" * 40, bytes(13)):
         later = encode_frame(bytes([major, minor, kind]) + (b"\0" + body[1:] if counted == "unknown" else body))
@@ -333,7 +333,7 @@ def test_what_comes_later_is_skipped_and_counted(major, minor, kind, counted):
     assert decoder.version == max((major, minor), (1, 0))
 
 
-def test_the_end_is_said_and_taken_back():
+def test_a_frame_after_the_end_frame_resets_the_end():
     decoder = Decoder()
     assert not decoder.ended
     assert decoder.feed(encode(group()) + encode_end(8, 9)) != []
@@ -343,7 +343,7 @@ def test_the_end_is_said_and_taken_back():
     assert not decoder.ended
 
 
-def test_the_echoes_of_a_message_stay_as_they_were():
+def test_decoded_echoes_do_not_alias_the_buffer():
     decoder = Decoder()
     (first,) = decoder.feed(encode(group()))
     assert isinstance(first, Group)

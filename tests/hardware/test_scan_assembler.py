@@ -1,4 +1,4 @@
-"""Groups to scans: whatever a link does to messages, what comes out is what was sent, or less, never anything else."""
+"""Groups to scans: whatever a link does to messages, scans contain only data that were sent."""
 
 import threading
 
@@ -16,7 +16,7 @@ GROUPS, PERIOD_US = 8, 11_700
 
 
 def device(scans, *, first=0, sequence=0, time_us=5_000_000, poses=True, groups=GROUPS, temperature=float("nan")):
-    """Messages of a device: a pose before every group, one echo a group that tells its scan and group."""
+    """Messages of a device: a pose before every group, one echo per group that encodes its scan and group."""
     messages = []
     for scan in range(first, first + scans):
         for group in range(groups):
@@ -40,7 +40,7 @@ def assembled(messages, assembler=None, *, flush=True):
 
 
 def assert_true(scan):
-    """Every echo of a scan is of this scan, and stands in the group that it says."""
+    """Every echo belongs to this scan and to its group."""
     assert (scan.echoes["time_us"] == 1000 + scan.scan).all()
     assert (scan.echoes["tx"] == scan.group).all()
     known = np.isfinite(scan.group_pose[:, 0])
@@ -48,7 +48,7 @@ def assert_true(scan):
     assert (scan.group_pose[known, 1] == np.flatnonzero(known)).all()
 
 
-def test_what_is_sent_in_order_comes_out_at_once():
+def test_scans_in_order_are_emitted_at_once():
     assembler = ScanAssembler()
     for k, message in enumerate(device(5)):
         out = assembler.push(message, 0.0)
@@ -59,7 +59,7 @@ def test_what_is_sent_in_order_comes_out_at_once():
             assert scan.missing == 0
             assert len(scan.echoes) == GROUPS
             assert scan.stamp == pytest.approx(5.0 + scan.scan * GROUPS * PERIOD_US * 1e-6, abs=1e-9)
-            assert scan.pose.tolist() == [scan.scan, GROUPS - 1, 0.1]  # that of the last group
+            assert scan.pose.tolist() == [scan.scan, GROUPS - 1, 0.1]  # the pose of the last group
     counts = assembler.counts
     assert (counts.scans, counts.echoes, counts.lost, counts.late, counts.restarts) == (5, 40, 0, 0, 0)
 
@@ -67,12 +67,12 @@ def test_what_is_sent_in_order_comes_out_at_once():
 @pytest.mark.slow
 @pytest.mark.parametrize("groups", [1, 3, 8])
 @given(seed=st.integers(0, 2**32 - 1))
-def test_neighbors_in_any_order_make_no_difference(groups, seed):
-    """A link that mixes up to three neighbors loses nothing, and no group gets the pose of another one."""
+def test_reordered_neighbors_make_no_difference(groups, seed):
+    """Reordering of up to three neighbors loses nothing, and no group gets the pose of another one."""
     rng = np.random.default_rng(seed)
     sent = device(6, groups=groups)
     place = np.arange(len(sent)) + rng.uniform(0, 2.9, len(sent))
-    place[0] = 0  # before the first message that comes there is nothing to miss
+    place[0] = 0  # the first received message has no predecessor
     scans, counts = assembled([sent[k] for k in np.argsort(place, kind="stable")])
     assert sorted(scan.scan for scan in scans) == list(range(6))
     assert counts.restarts == counts.lost == 0
@@ -84,8 +84,8 @@ def test_neighbors_in_any_order_make_no_difference(groups, seed):
 
 @pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), loss=st.floats(0, 0.6), again=st.floats(0, 0.5))
-def test_lost_repeated_and_late_messages(seed, loss, again):
-    """No echo twice, none in a wrong scan, none with another group's pose; what is missing is counted."""
+def test_lost_repeated_and_late_messages_are_counted(seed, loss, again):
+    """No echo is repeated, in a wrong scan, or with another group's pose; missing groups are counted."""
     rng = np.random.default_rng(seed)
     sent = device(12)
     kept = [m for m in sent if rng.random() >= loss]
@@ -105,8 +105,8 @@ def test_lost_repeated_and_late_messages(seed, loss, again):
         assert counts.lost == inside - len(kept)
 
 
-def test_a_lost_pose_leaves_no_stale_one():
-    """Where a pose may have been lost the group has none: a wall would stand in the wrong place."""
+def test_a_lost_pose_is_not_replaced_by_an_old_one():
+    """If a pose may have been lost, the group has none; otherwise a wall would be in the wrong place."""
     sent = device(4)
     gone = sent[5 * 2]  # the pose before group 5 of scan 0
     scans, _ = assembled([m for m in sent if m is not gone])
@@ -117,7 +117,7 @@ def test_a_lost_pose_leaves_no_stale_one():
 
 
 def test_a_lost_group_does_not_cost_a_pose():
-    sent = [m for m in device(3) if isinstance(m, Group) or m.y == 0]  # a pose a scan, before its first group
+    sent = [m for m in device(3) if isinstance(m, Group) or m.y == 0]  # one pose per scan, before its first group
     for k, message in enumerate(sent):
         object.__setattr__(message, "sequence", k)
     gone = next(m for m in sent if isinstance(m, Group) and (m.scan, m.group) == (1, 4))
@@ -126,7 +126,7 @@ def test_a_lost_group_does_not_cost_a_pose():
     assert np.isfinite(np.delete(scans[1].group_pose, 4, axis=0)).all()
 
 
-def test_a_sender_that_says_unknown_things_keeps_its_poses():
+def test_unknown_messages_do_not_invalidate_poses():
     sent = [m for m in device(3) if m.sequence % 5 != 2 or isinstance(m, Group)]
     assembler = ScanAssembler()
     assembler.unknown_messages = True
@@ -137,8 +137,8 @@ def test_a_sender_that_says_unknown_things_keeps_its_poses():
 @pytest.mark.slow
 @pytest.mark.parametrize("run", [0, 1, 3, 10, 100, 500])
 @pytest.mark.parametrize("poses", [True, False])
-def test_a_sender_that_starts_anew_goes_on(run, poses):
-    """However little or much came before: all scans of the new run come out, under numbers and stamps that go on."""
+def test_numbers_and_clock_continue_after_a_restart(run, poses):
+    """Whatever came before: all scans of the new run are emitted, with continued numbers and stamps."""
     before, after = device(run, poses=poses), device(6, poses=poses, time_us=1_000)
     assembler = ScanAssembler()
     first = [s for m in before for s in assembler.push(m, 100.0)]
@@ -155,7 +155,7 @@ def test_a_sender_that_starts_anew_goes_on(run, poses):
         assert 29.5 < stamps[run] - stamps[run - 1] < 30.5, "the gap is in the record"
 
 
-def test_a_counter_of_scans_alone_that_starts_anew():
+def test_scan_numbers_continue_after_a_restart_of_the_scan_counter():
     sent = device(300)
     for message in sent[200 * 16 :]:
         if isinstance(message, Group):
@@ -166,14 +166,14 @@ def test_a_counter_of_scans_alone_that_starts_anew():
     assert counts.restarts == counts.late == 0
 
 
-def test_one_message_from_the_past_is_no_new_start():
+def test_one_old_message_is_not_a_restart():
     sent = device(40)
     scans, counts = assembled([*sent[:600], sent[3], *sent[600:]])
     assert [scan.scan for scan in scans] == list(range(40))
     assert (counts.restarts, counts.late) == (0, 1)
 
 
-def test_sequence_numbers_and_their_overflow():
+def test_sequence_numbers_may_overflow():
     start = 2**32 - 40
     sent = device(6)
     for message in sent:
@@ -183,7 +183,7 @@ def test_sequence_numbers_and_their_overflow():
     assert counts.lost == counts.restarts == 0
 
 
-def test_an_incomplete_scan_is_handed_on_in_time():
+def test_an_incomplete_scan_is_emitted_after_the_timeout():
     sent = device(1)[:-4]
     assembler = ScanAssembler(timeout=0.5)
     for message in sent:
@@ -195,7 +195,7 @@ def test_an_incomplete_scan_is_handed_on_in_time():
 
 
 @pytest.mark.slow
-def test_hostile_groups_need_no_room():
+def test_invalid_groups_take_no_memory():
     assembler = ScanAssembler()
     echoes = np.zeros(1, ECHO)
     for k in range(3000):
@@ -218,7 +218,7 @@ def test_a_scan_of_too_many_echoes_keeps_those_that_came_first():
     assert (scan.missing, assembler.counts.impossible) == (4, 4)
 
 
-def test_scans_without_echoes_temperatures_and_ranges():
+def test_scans_without_echoes_have_temperature_and_ranges():
     sent = device(2, temperature=21.5)
     for message in sent:
         if isinstance(message, Group) and message.scan == 0:
@@ -230,7 +230,7 @@ def test_scans_without_echoes_temperatures_and_ranges():
     assert REFERENCE_SPEED_OF_SOUND == RING_REFERENCE
 
 
-def test_echoes_stand_in_the_order_of_the_paths(faw_ring):
+def test_echoes_are_sorted_by_path(faw_ring):
     rng = np.random.default_rng(0)
     echoes = np.zeros(100, ECHO)
     echoes["tx"], echoes["rx"] = faw_ring.paths[rng.integers(len(faw_ring.paths), size=100)].T
@@ -241,7 +241,7 @@ def test_echoes_stand_in_the_order_of_the_paths(faw_ring):
     assert key == sorted(key)
 
 
-def test_a_pose_that_is_not_known_any_more_ends_the_one_before():
+def test_an_unknown_pose_replaces_the_one_before():
     echoes = np.zeros(1, ECHO)
     nowhere = Pose(2, 2, *[float("nan")] * 3)
     sent = [Pose(0, 0, 1.0, 2.0, 0.1), Group(1, 1, 0, 0, 1, 20.0, echoes), nowhere, Group(3, 3, 1, 0, 1, 20.0, echoes)]
@@ -251,9 +251,9 @@ def test_a_pose_that_is_not_known_any_more_ends_the_one_before():
     assert counts.lost == 0
 
 
-def test_large_items_make_room_as_many_small_ones_do():
+def test_the_queue_limits_the_total_size():
     queue = DropOldestQueue[int](100, size_of=lambda item: item, max_total_size=10)
-    for item in (4, 4, 4, 1, 30, 2, 3):  # one that is too large alone stays until the next one comes
+    for item in (4, 4, 4, 1, 30, 2, 3):  # a single item that is too large stays until the next one arrives
         queue.put(item)
     assert queue.dropped == 5
     assert queue.get(0.0, max_items=9) == [2, 3]
@@ -264,7 +264,7 @@ def test_large_items_make_room_as_many_small_ones_do():
     assert queue.get(0.0, max_items=9) == [9]
 
 
-def test_the_newest_win_and_are_counted():
+def test_the_oldest_items_are_dropped_and_counted():
     queue = DropOldestQueue[int](3)
     for k in range(10):
         queue.put(k)

@@ -1,4 +1,4 @@
-"""Links by URL: bytes arrive as they were sent, breaks and silence are said, ends are explicit, errors are one line."""
+"""Transports by URL: bytes arrive unchanged, breaks and silence are reported, errors are one line."""
 
 import contextlib
 import os
@@ -15,11 +15,11 @@ from jaxsonar.hardware.transport_base import EndOfStream, LinkEvent, Source, ope
 from jaxsonar.hardware.transport_servers import listen
 
 NEVER = threading.Event()
-"""A stop that nobody sets."""
+"""A stop event that is never set."""
 
 
 class Device:
-    """A sink whose messages are sent by a thread of its own."""
+    """A sink with a thread that sends messages."""
 
     def __init__(self, url):
         self.sink = listen(url)
@@ -28,7 +28,7 @@ class Device:
         self.thread = None
 
     def run(self, *steps):
-        """Bytes are sent, seconds and events are waited for, names are methods of the sink."""
+        """Bytes are sent; the thread waits for numbers (seconds) and events; names are methods of the sink to call."""
 
         def work():
             for step in steps:
@@ -71,7 +71,7 @@ def events_of():
 
 
 def read_until(source, enough, *, seconds=10.0, step=0.05):
-    """Bytes until ``enough(bytes)``, an end, or too long."""
+    """Read bytes until ``enough(bytes)``, the end, or a timeout."""
     data, end = b"", time.monotonic() + seconds
     while not enough(data) and time.monotonic() < end:
         with contextlib.suppress(EndOfStream):
@@ -108,7 +108,7 @@ def kinds(events):
         ("can-fd:x?a=1&b=", ("can-fd", "", None, "x", {"a": "1", "b": ""})),
     ],
 )
-def test_parts_of_a_url(text, parts):
+def test_a_url_is_split_into_its_parts(text, parts):
     url = parse_url(text)
     assert (url.scheme, url.host, url.port, url.path, url.options) == parts
     assert url.text == text
@@ -150,7 +150,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("url", WRONG)
-def test_a_wrong_url_is_one_clear_line(url):
+def test_an_invalid_url_is_answered_in_one_line(url):
     if url.startswith("serial:"):
         pytest.importorskip("serialx")
     with pytest.raises(SonarError, match=WRONG[url]) as caught:
@@ -159,13 +159,13 @@ def test_a_wrong_url_is_one_clear_line(url):
 
 
 @pytest.mark.parametrize("url", ["serial:///dev/ttyS0", "file:x.csv", "tcp://h", "tcp://:1?x=1", "pty://host/x", "x"])
-def test_a_device_listens_where_it_can(url):
+def test_a_server_reports_an_address_it_cannot_open(url):
     with pytest.raises(SonarError, match=r"; (allowed|needed) is ") as caught:
         listen(url)
     assert "\n" not in str(caught.value)
 
 
-def test_nobody_there_and_somebody_there_already():
+def test_missing_devices_and_used_addresses_are_reported():
     with Device("tcp://127.0.0.1:0") as device, pytest.raises(SonarError, match="in use; needed is a free address"):
         listen(device.url)
     with pytest.raises(SonarError, match="refused; needed is a device"):
@@ -174,7 +174,7 @@ def test_nobody_there_and_somebody_there_already():
         listen(device.url)
 
 
-def test_a_file_that_was_there_is_not_replaced_by_a_pty(tmp_path):
+def test_a_pty_does_not_replace_an_existing_file(tmp_path):
     (tmp_path / "precious").write_text("!")
     with pytest.raises(SonarError, match="File exists"):
         listen(f"pty:{tmp_path / 'precious'}")
@@ -204,7 +204,7 @@ class Echo(Source):
         pass
 
 
-def test_other_packages_bring_transports(monkeypatch):
+def test_entry_points_add_transports(monkeypatch):
     offered = EntryPoint("echo", f"{__name__}:Echo", transports.ENTRY_POINTS)
     monkeypatch.setattr(transports, "entry_points", lambda group: [offered] if group == "jaxsonar.transports" else [])
     with open_source("echo:x", reconnect=False, silence=7.0) as source:
@@ -217,7 +217,7 @@ def test_other_packages_bring_transports(monkeypatch):
         open_source("ecco:x")
 
 
-def test_a_program_brings_transports(monkeypatch):
+def test_a_program_can_register_transports(monkeypatch):
     monkeypatch.setattr(transports, "_registered", {})
     transports.register_transport("tcp", Echo)
     assert isinstance(open_source("tcp:whatever"), Echo)
@@ -237,20 +237,20 @@ def test_bytes_arrive_as_they_were_sent(scheme, pty_url):
         with open_source(url) as source:
             device.run(*SOME, b"end")
             got = read_until(source, lambda data: b"end" in data)
-            # A datagram is no part of a frame, so that the last one gets the zero that it lacks.
+            # A datagram holds complete frames, so a missing final zero is appended.
             assert got == b"".join([*SOME, b"end"]) + (b"\0" if scheme == "udp" else b"")
             device.finish()
 
 
-def test_all_bytes_are_what_they_are_on_a_pty(pty_url):
-    """Control characters mean nothing: the line is raw before the first byte."""
+def test_a_pty_passes_all_bytes_unchanged(pty_url):
+    """Control characters are passed: the terminal is in raw mode before the first byte."""
     everything = bytes(range(256)) * 8
     with Device(pty_url) as device, open_source(device.url) as source:
         device.run(everything)
         assert read_until(source, lambda data: len(data) >= len(everything)) == everything
 
 
-def test_nothing_yet_is_none_after_the_time():
+def test_read_returns_none_after_the_timeout():
     with Device("tcp://127.0.0.1:0") as device, open_source(device.url) as source:
         begin = time.monotonic()
         assert source.read(0.2) is None
@@ -258,7 +258,7 @@ def test_nothing_yet_is_none_after_the_time():
         assert source.read(0.0) is None
 
 
-def test_waiting_takes_no_processor():
+def test_waiting_uses_no_cpu_time():
     with Device("tcp://127.0.0.1:0") as device, open_source(device.url, silence=0.1) as source:
         begin = time.thread_time()
         assert source.read(1.0) is None
@@ -269,7 +269,7 @@ def test_waiting_takes_no_processor():
 
 
 def test_a_closed_connection_is_the_end():
-    """All that was sent comes first; then the end, again and again."""
+    """All sent bytes arrive first; then every read raises the end."""
     with Device("tcp://127.0.0.1:0") as device:
         events, tell = events_of()
         with open_source(device.url, on_event=tell) as source:
@@ -281,7 +281,7 @@ def test_a_closed_connection_is_the_end():
         assert events == []
 
 
-def test_a_closed_source_says_so():
+def test_a_closed_source_raises_the_end_of_the_stream():
     with Device("tcp://127.0.0.1:0") as device:
         source = open_source(device.url)
         source.close()
@@ -291,7 +291,7 @@ def test_a_closed_source_says_so():
 
 
 @pytest.mark.parametrize("scheme", ["tcp", "pty"])
-def test_a_break_is_the_end_where_it_should_be(scheme, pty_url):
+def test_a_broken_link_without_reconnection_is_the_end(scheme, pty_url):
     with (
         Device("tcp://127.0.0.1:0" if scheme == "tcp" else pty_url) as device,
         open_source(device.url, reconnect=False) as source,
@@ -308,8 +308,8 @@ def test_a_break_is_the_end_where_it_should_be(scheme, pty_url):
 
 
 @pytest.mark.parametrize("scheme", ["tcp", "pty", "serial"])
-def test_unplugged_and_back(scheme, pty_url):
-    """The stream goes on, the gap is told, and a frame from before it never joins one from after it."""
+def test_a_client_reconnects_after_an_unplugged_link(scheme, pty_url):
+    """The stream continues, the gap is reported, and frames before and after it are never joined."""
     if scheme == "serial":
         pytest.importorskip("serialx")
     with Device("tcp://127.0.0.1:0" if scheme == "tcp" else pty_url) as device:
@@ -331,8 +331,8 @@ def test_unplugged_and_back(scheme, pty_url):
         assert 0 <= events[1].time - events[0].time < 10
 
 
-def test_a_device_that_is_away_for_a_while(tmp_path):
-    """Its name is gone and comes back; attempts become rarer, and are not told one by one."""
+def test_a_client_reconnects_to_a_restarted_device(tmp_path):
+    """The device file disappears and returns; attempts become less frequent and are not reported one by one."""
     url = f"pty:{tmp_path / 'ring'}"
     events, tell = events_of()
     with Device(url) as device:
@@ -352,7 +352,7 @@ def test_a_device_that_is_away_for_a_while(tmp_path):
 
 
 def test_back_off_doubles_up_to_a_limit(monkeypatch):
-    """On a clock of our own."""
+    """With a simulated clock."""
     now, attempts = [0.0], []
 
     class Clock:
@@ -385,7 +385,7 @@ def test_back_off_doubles_up_to_a_limit(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["tcp", "udp", "pty"])
-def test_silence_is_told_once_and_its_end_too(scheme, pty_url):
+def test_silence_and_its_end_are_reported_once(scheme, pty_url):
     url = {"pty": pty_url}.get(scheme, f"{scheme}://127.0.0.1:0")
     events, tell = events_of()
     with Device(url) as device, open_source(device.url, on_event=tell, silence=0.4) as source:
@@ -399,7 +399,7 @@ def test_silence_is_told_once_and_its_end_too(scheme, pty_url):
 
 
 def test_one_client_after_the_other_continues():
-    """The second one waits; nothing is sent to nobody."""
+    """The second client waits; without a client nothing is sent."""
     with Device("tcp://127.0.0.1:0") as device:
         left = threading.Event()
         device.run(*(bytes([k]) for k in range(1, 5)), left, *(bytes([k]) for k in range(5, 9)))
@@ -413,8 +413,8 @@ def test_one_client_after_the_other_continues():
         second.close()
 
 
-def test_datagrams_go_to_a_free_port_or_are_asked_for():
-    """udp://HOST:PORT receives where that is free; where a device has it, the device is told."""
+def test_a_udp_client_binds_a_free_port_or_sends_hellos():
+    """udp://HOST:PORT receives if the port is free; if a device has it, the client sends a hello."""
     with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
         with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as probe:
             probe.bind(("127.0.0.1", 0))
@@ -436,7 +436,7 @@ def test_a_udp_device_that_restarts_finds_its_port_free():
         device.finish()
     end = time.monotonic() + 5
     while not events and time.monotonic() < end:
-        source.read(0.2)  # the hello to nobody is answered: refused
+        source.read(0.2)  # a hello to a closed port is refused
     with Device(device.url) as again, source:
         again.run(b"two")
         assert b"two" in read_until(source, lambda data: b"two" in data)
@@ -446,7 +446,7 @@ def test_a_udp_device_that_restarts_finds_its_port_free():
 def test_a_udp_client_that_leaves_gives_way_to_the_next():
     with Device("udp://127.0.0.1:0") as device:
         with open_source(device.url) as first:
-            assert first.read(0.05) is None  # says hello
+            assert first.read(0.05) is None  # sends a hello
             assert device.sink.wait_client(NEVER)
             with open_source(device.url) as second:
                 assert second.read(0.05) is None

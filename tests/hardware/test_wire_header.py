@@ -1,4 +1,4 @@
-"""The C header for firmware writes and reads the very bytes of ``protocol.py`` and ``docs/protocol.md``."""
+"""The C header for firmware encodes and decodes the bytes of ``protocol.py`` and ``docs/protocol.md``."""
 
 import shutil
 import subprocess
@@ -17,7 +17,7 @@ COMPILERS = {
     "c++": ("c++", ["-x", "c++", "-std=c++11"]),
 }
 WARNINGS = ["-O1", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror"]
-# Commands on stdin, a line each: a frame as hex comes back, or what decoding gives.
+# Reads commands from stdin, one per line; answers with a frame in hex, or with the decoded record.
 PROGRAM = r"""
 #include <inttypes.h>
 #include <math.h>
@@ -96,7 +96,7 @@ def device(request, tmp_path_factory):
 
 
 def some_group(rng, count):
-    """Every bit pattern that a field may have, zeros among them."""
+    """Every bit pattern of a field, including zeros."""
     echoes = np.zeros(count, ECHO)
     echoes["tx"], echoes["rx"] = rng.integers(0, 1 << 16, (2, count))
     echoes["echo"], echoes["flags"] = rng.integers(0, 256, (2, count))
@@ -128,7 +128,7 @@ def decode_command(frame):
     return f"d {len(frame)} {frame.hex()}"
 
 
-def test_groups_and_poses_are_the_same_bytes(device, rng):
+def test_c_and_python_encode_the_same_bytes(device, rng):
     counts = [*range(60), 500, 4096]
     groups = [some_group(rng, count) for count in counts]
     poses = [Pose(k, k << 40, *rng.normal(0, 10.0**k, 3).tolist()) for k in range(6)]
@@ -136,13 +136,13 @@ def test_groups_and_poses_are_the_same_bytes(device, rng):
     assert frames == [protocol.encode(message) for message in [*groups, *poses]]
 
 
-def test_what_python_writes_c_reads(device, rng):
+def test_c_decodes_frames_of_python(device, rng):
     records = [bytes(rng.integers(0, top, size, dtype=np.uint8)) for top in (2, 255) for size in range(16, 600, 7)]
     records += [bytes([1]) * size for size in range(245, 260)] + [bytes([1]) * size + b"\0" for size in range(245, 260)]
     assert device([decode_command(protocol.encode_frame(record)[:-1]) for record in records]) == records
 
 
-def test_c_refuses_damaged_frames(device, rng):
+def test_c_rejects_damaged_frames(device, rng):
     whole = protocol.encode(some_group(rng, 30))[:-1]
     bad = []
     for k in range(400):
@@ -152,8 +152,8 @@ def test_c_refuses_damaged_frames(device, rng):
     assert device([decode_command(frame) for frame in [*bad, b"\xff", b"\1", b"\2\0"]]) == [b""] * 403
 
 
-def test_too_small_a_buffer_is_no_frame(device, rng):
-    """Every size up to the needed one; the program ends with 7 if a byte beyond is touched."""
+def test_a_small_buffer_gives_no_frame(device, rng):
+    """Every size up to the needed one; the program exits with 7 if it writes beyond the buffer."""
     group, pose = some_group(rng, 3), Pose(1, 2, 3.0, 4.0, 5.0)
     for message, command in ((group, group_command), (pose, pose_command)):
         frame = protocol.encode(message)
@@ -163,13 +163,13 @@ def test_too_small_a_buffer_is_no_frame(device, rng):
         ]
 
 
-def test_the_stated_size_is_enough(rng):
+def test_the_documented_frame_size_suffices(rng):
     for count in (0, 1, 15, 16, 17, 18, 254, 4096):
         payload = 36 + 14 * count
         worst = len(cobs.encode(bytes([1]) * payload)) + 1
         assert len(protocol.encode(some_group(rng, count))) <= worst <= payload + payload // 254 + 2
 
 
-def test_more_echoes_than_allowed_are_no_frame(device, rng):
+def test_too_many_echoes_give_no_frame(device, rng):
     command = group_command(some_group(rng, 4097))
     assert device([command])[0] == b""

@@ -1,4 +1,4 @@
-"""From a device to lines and a map: over real links the same as from the log, and right for a robot that moves."""
+"""From a device to lines and a map: the same results as from the log, and correct for a moving robot."""
 
 import os
 import re
@@ -109,8 +109,8 @@ def expected(office, log):
 @pytest.mark.parametrize(
     ("link", "record"), [*((link, "rec.csv") for link in LINKS), (LINKS[0], "rec.parquet"), ("file", "rec.parquet")]
 )
-def test_a_stream_is_the_log(link, record, office, log, log_file, expected, tmp_path):
-    """Echoes within 0.1 mm, the same map, and nothing lost, over every link; and the record is the log again."""
+def test_a_stream_records_the_log_and_builds_its_map(link, record, office, log, log_file, expected, tmp_path):
+    """Over every link: echoes within 0.1 mm, the same map, no loss, and the recording is the log."""
     path, map_path = tmp_path / record, tmp_path / "map.geojson"
     choices = {"method": "hough", "record": path, "map_filename": map_path}
     if link == "file":
@@ -133,7 +133,7 @@ def test_method_ml_gives_the_map_of_the_log(office, log, tmp_path):
     path = tmp_path / "map.geojson"
     with Device("tcp://127.0.0.1:0", log_messages(log, office.ring)) as device:
         status = stream(device.sink.url, office.ring, map_filename=path)
-    mapper = Mapper(ring=office.ring)  # which gives the map of build_map, as its own tests have it
+    mapper = Mapper(ring=office.ring)  # gives the map of build_map (tests/graph_slam)
     state = mapper.start()
     for scan in log:
         state, _ = mapper.step(state, scan)
@@ -142,7 +142,7 @@ def test_method_ml_gives_the_map_of_the_log(office, log, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_raw_record_is_the_device_again(office, log, expected, tmp_path):
+def test_a_raw_recording_replays_the_device(office, log, expected, tmp_path):
     raw, path, again = tmp_path / "raw.mcap", tmp_path / "map.geojson", tmp_path / "again.csv"
     stream_of = {"method": "hough", "map_filename": path}
     with Device("tcp://127.0.0.1:0", log_messages(log, office.ring)) as device:
@@ -154,7 +154,7 @@ def test_a_raw_record_is_the_device_again(office, log, expected, tmp_path):
 
 
 @pytest.mark.slow
-def test_scans_without_a_pose_stay_without_one_when_played(office, log, tmp_path):
+def test_a_replay_keeps_missing_poses(office, log, tmp_path):
     pose = log.pose.copy()
     pose[[0, 5, 6, 16]] = np.nan
     part = type(log)(log.scan, log.stamp, pose, log.start, log.tx, log.rx, log.range, log.amplitude)
@@ -165,8 +165,8 @@ def test_scans_without_a_pose_stay_without_one_when_played(office, log, tmp_path
 
 
 @pytest.mark.slow
-def test_a_bad_link_gives_less_and_never_anything_else(office, log, tmp_path):
-    """Every echo of the record was sent; what is damaged is counted."""
+def test_a_faulty_link_loses_echoes_and_invents_none(office, log, tmp_path):
+    """Every recorded echo was sent; damaged frames are counted."""
     faults = FaultSettings(corrupt=0.1, drop=0.05, reorder=0.1, seed=5)
     with Device("tcp://127.0.0.1:0", log_messages(log, office.ring), faults=faults) as device:
         status = stream(device.sink.url, office.ring, method="hough", record=tmp_path / "rec.csv", map_filename=None)
@@ -190,8 +190,8 @@ def test_a_bad_link_gives_less_and_never_anything_else(office, log, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("link", ["tcp", "pty"])
-def test_a_device_that_goes_and_comes_back(link, office, log, tmp_path):
-    """The stream goes on; the time without a device is in the raw record, and told."""
+def test_a_stream_survives_a_reconnection(link, office, log, tmp_path):
+    """The stream continues; the time without a device is recorded and reported."""
     sent = list(log_messages(log, office.ring))
     gone = threading.Event()
     events, path = [], tmp_path / "raw.mcap"
@@ -222,7 +222,7 @@ def test_a_device_that_goes_and_comes_back(link, office, log, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_first_scans_wait_for_the_compiler_and_a_number_of_scans_ends_it(office, log, tmp_path):
+def test_scans_are_queued_during_compilation_and_the_scan_limit_holds(office, log, tmp_path):
     messages = log_messages(log, office.ring)
     seen = []
     with Device("tcp://127.0.0.1:0", messages) as device:
@@ -235,8 +235,8 @@ def test_the_first_scans_wait_for_the_compiler_and_a_number_of_scans_ends_it(off
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mapping", [False, True])
-def test_the_end_waits_for_the_compiler_only_where_a_map_does(mapping, office, log, tmp_path, monkeypatch):
-    """The record is whole at once, either way."""
+def test_stopping_waits_for_the_compiler_only_if_a_map_is_requested(mapping, office, log, tmp_path, monkeypatch):
+    """The recording is complete at once in both cases."""
     compiled, stop, ending = threading.Event(), threading.Event(), []
     monkeypatch.setattr(LiveMap, "warm_up", lambda self: compiled.wait(60))
     record, map_path = tmp_path / "r.csv", tmp_path / "m.geojson"
@@ -269,7 +269,7 @@ def test_the_end_waits_for_the_compiler_only_where_a_map_does(mapping, office, l
 
 
 @pytest.mark.slow
-def test_errors_come_after_everything_was_written(office, log, tmp_path, monkeypatch):
+def test_errors_are_raised_after_everything_is_written(office, log, tmp_path, monkeypatch):
     from jaxsonar.hardware.transport_base import Source
 
     broken = ValueError("the driver broke")
@@ -309,7 +309,7 @@ def moving_scans(sigma, count=12):
 
 
 def wall_errors(models, poses):
-    """How far each line and its direction are from the wall it is of, robot frame; and their covariances."""
+    """Errors of each line against its wall, robot frame, and their covariances."""
     errors, covs = [], []
     for model, pose in zip(models, poses, strict=True):
         for line in model.lines:
@@ -322,8 +322,8 @@ def wall_errors(models, poses):
     return np.array(errors), covs
 
 
-def test_a_moving_robot_is_as_exact_as_one_at_rest():
-    """The groups' own poses give the walls back to the bound; without them they are off many times more."""
+def test_lines_of_a_moving_robot_are_as_accurate_as_at_rest():
+    """With the poses of the groups the walls are accurate to the bound; without them errors are much larger."""
     raws, poses = moving_scans(0.001)
     live = LiveMap(RING, sigma=0.001, mapping=False)
     taken = live.process(raws)
@@ -343,8 +343,8 @@ def test_a_moving_robot_is_as_exact_as_one_at_rest():
     assert np.median(nees) < 4  # 1.4 for Gaussian errors of that covariance
 
 
-def test_moved_paths_are_those_of_moved_sensors():
-    """One pose for all paths: the arcs of a ring mounted there, and so the lines, seen from the origin."""
+def test_moved_paths_match_moved_sensors():
+    """With one pose for all paths, the arcs are those of a ring mounted at this pose."""
     pose = np.array([0.12, -0.07, 0.4])
     settings = hough_settings(RING, None)
     poses = np.broadcast_to(pose, (len(RING.paths), 3)).astype(np.float32)
@@ -359,7 +359,7 @@ def test_moved_paths_are_those_of_moved_sensors():
     other = arc_tables(there, settings).arcs
     for one, two in zip(jax.tree.leaves(moved.paths), jax.tree.leaves(other.paths), strict=True):
         np.testing.assert_allclose(one, two, atol=2e-6)
-    for name in ("along", "across_squared", "half_baseline_squared"):
+    for name in ("midpoint_normal", "baseline_tangent_squared", "half_baseline_squared"):
         np.testing.assert_allclose(getattr(moved.arcs, name), getattr(other.arcs, name), atol=2e-6)
 
 
@@ -374,7 +374,7 @@ def test_a_robot_at_rest_needs_no_moved_paths(office, log):
     assert [line.as_json() for line in one.lines] == [line.as_json() for line in two.lines]
 
 
-def test_moved_scans_compile_nothing_anew():
+def test_moved_scans_do_not_recompile():
     raws, _ = moving_scans(0.001, count=4)
     live = LiveMap(RING, method="hough", mapping=False)
     live.process(raws[:1])
@@ -392,7 +392,7 @@ def raw_scan(temperature):
 
 
 @pytest.mark.parametrize("temperature", [-20.0, 0.0, 35.0])
-def test_a_measured_temperature_changes_the_speed_and_not_the_range(temperature):
+def test_a_measured_temperature_changes_the_speed_of_sound_only(temperature):
     live = LiveMap(RING, method="hough", mapping=False)
     live.process([raw_scan(float("nan"))])
     assert live.ring is RING
@@ -408,7 +408,7 @@ COMMAND = [sys.executable, "-c", "import sys; from jaxsonar.cli import main; sys
 
 @pytest.fixture(scope="module")
 def command():
-    """Starts the command line; compiled programs are kept where all tests keep them."""
+    """Start the command line with the compilation cache of all tests."""
     own = {"PYTHONPATH": str(Path(__file__).parents[2])}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 
@@ -420,7 +420,7 @@ def command():
 
 @pytest.fixture
 def device(log_file, command):
-    """A process that emulates the office; gives its URL."""
+    """A process that emulates the office. Returns its URL."""
     running = []
 
     def start(link, *options):
@@ -438,8 +438,8 @@ def device(log_file, command):
 
 
 @pytest.mark.slow
-def test_emulate_and_stream_are_the_map_command(device, command, log_file, tmp_path):
-    """Processes and a real link from end to end; the first line of the device is where it listens."""
+def test_emulate_and_stream_give_the_map_of_the_map_command(device, command, log_file, tmp_path):
+    """End to end with processes and a real link; the first line of the device is its URL."""
     map_path, record = tmp_path / "map.geojson", tmp_path / "rec.parquet"
     url = device("tcp://127.0.0.1:0", "--speed", "0")
     assert re.fullmatch(r"tcp://127\.0\.0\.1:\d+", url)
@@ -455,9 +455,9 @@ def test_emulate_and_stream_are_the_map_command(device, command, log_file, tmp_p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_with_everything_written(number, device, command, tmp_path):
+def test_a_signal_stops_the_stream_with_everything_written(number, device, command, tmp_path):
     record, map_path = tmp_path / "rec.csv", tmp_path / "map.geojson"
-    url = device("tcp://127.0.0.1:0", "--speed", "8")  # four scans a second
+    url = device("tcp://127.0.0.1:0", "--speed", "8")  # four scans per second
     streaming = command("stream", url, "--ring", "faw", "--method", "hough", "--record", record, "--map", map_path)
     end = time.monotonic() + 100
     while time.monotonic() < end and not (map_path.exists() and record.stat().st_size > 3000):
@@ -474,8 +474,8 @@ def test_a_signal_ends_it_with_everything_written(number, device, command, tmp_p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mapping", [False, True])
-def test_signals_end_it_while_it_compiles(mapping, device, command, tmp_path):
-    """Method ml takes many seconds to compile: one signal is enough for a record, and two for a map."""
+def test_signals_stop_the_stream_during_compilation(mapping, device, command, tmp_path):
+    """Method ml takes many seconds to compile: one signal stops a recording, two stop a map."""
     record = tmp_path / "rec.csv"
     call = ["stream", device("tcp://127.0.0.1:0", "--speed", "20"), "--ring", "faw", "--record", record]
     call += ["--map", tmp_path / "map.geojson"] if mapping else []
@@ -485,7 +485,7 @@ def test_signals_end_it_while_it_compiles(mapping, device, command, tmp_path):
         time.sleep(0.02)
     before = time.monotonic()
     streaming.send_signal(signal.SIGINT)
-    for _ in range(8 * mapping):  # two that come before the first one is seen are one
+    for _ in range(8 * mapping):  # two signals before the first is handled count as one
         time.sleep(1.0)
         if streaming.poll() is None:
             streaming.send_signal(signal.SIGINT)
@@ -523,7 +523,7 @@ def test_signals_end_it_while_it_compiles(mapping, device, command, tmp_path):
         ("emulate", "{log}", "--ring", "faw", "--listen", "tcp://127.0.0.1:0", "--path", "x.csv"),
     ],
 )
-def test_wrong_calls_are_answered_in_one_line(arguments, log_file, capsys):
+def test_invalid_calls_are_answered_in_one_line(arguments, log_file, capsys):
     try:
         code = main([text.format(log=log_file) for text in arguments])
     except SystemExit as end:
@@ -536,7 +536,7 @@ def test_wrong_calls_are_answered_in_one_line(arguments, log_file, capsys):
 
 
 @pytest.mark.slow
-def test_a_view_as_a_file_and_a_clear_word_without_the_extra(office, log, log_file, tmp_path, monkeypatch, capsys):
+def test_the_viewer_writes_a_file_and_names_a_missing_extra(office, log, log_file, tmp_path, monkeypatch, capsys):
     pytest.importorskip("rerun")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     file = tmp_path / "view.rrd"
@@ -549,14 +549,14 @@ def test_a_view_as_a_file_and_a_clear_word_without_the_extra(office, log, log_fi
     assert capsys.readouterr().err == "jaxsonar stream: --view needs the extra viz: pip install 'jaxsonar[viz]'\n"
 
 
-def test_status_lines_are_lines():
+def test_the_status_is_one_line():
     status = Status(scans=3, counts={"rejected": 2, "impossible": 1, "oversized": 1, "gaps": 1}, event="gone\n")
     assert "2 damaged (1 oversized, 1 impossible)" in status.text()
     assert "1 gaps" in status.text()
 
 
 @pytest.mark.slow
-def test_records_need_a_place(tmp_path, office, log_file):
+def test_a_recording_needs_a_writable_file(tmp_path, office, log_file):
     with pytest.raises(SonarError, match="allowed"):
         stream(f"file:{log_file}?speed=0", office.ring, record=tmp_path / "no" / "x.csv")
     assert open_log_recorder(tmp_path / "x.csv").close() is None

@@ -1,4 +1,4 @@
-"""Reports: one page, well formed, needing nothing else; what comes from outside stays text."""
+"""HTML pages are well formed and self-contained, and text is escaped."""
 
 import base64
 import io
@@ -108,19 +108,19 @@ def check_self_contained(page):
 
 
 def decoded(source):
-    """The image behind an address: its kind, and its bytes."""
+    """Format and bytes of an embedded image."""
     head, data = source.split(",", 1)
     return head, base64.b64decode(data, validate=True)
 
 
-def test_the_page_is_well_formed_and_needs_nothing_else(page):
+def test_the_page_is_well_formed_and_self_contained(page):
     check_well_formed(page)
     check_self_contained(page)
     assert "http://" not in page.source
     assert "https://" not in page.source
 
 
-def test_everything_stands_there_once(page):
+def test_every_part_occurs_once(page):
     assert page.texts("title") == page.texts("h1") == ["A title"]
     assert page.texts("h2") == ["Figures", "Numbers"]
     assert page.texts("p") == ["An intro.", "One paragraph.", "Another."]
@@ -128,13 +128,13 @@ def test_everything_stands_there_once(page):
     assert page.texts("a") == page.texts("h2")
 
 
-def test_readers_who_do_not_see_it(page):
+def test_the_page_is_accessible(page):
     assert page.all("html") == [({"lang": "en"}, "\n\n\n")]
     assert [attributes["alt"] for attributes, _ in page.all("img")] == ["a line", "the same line"]
     assert [attributes.get("scope") for attributes, _ in page.all("th")] == ["col"] * 4 + ["row"] * 3
 
 
-def test_numbers_stand_on_the_right_with_units_in_the_header(page):
+def test_numbers_are_right_aligned_with_units_in_the_header(page):
     header = [(text, attributes.get("class")) for attributes, text in page.all("th")[:4]]
     assert header == [("what", None), ("scans", "number"), ("max Δρ ", "number"), ("ratio", "number")]
     assert page.texts("span") == ["(mm)"]
@@ -163,7 +163,7 @@ def test_a_figure_too_large_as_svg_becomes_png(tmp_path, monkeypatch):
     assert imread(io.BytesIO(image)).shape[:2] == (480, 640)
 
 
-def test_what_comes_from_outside_stays_text(tmp_path):
+def test_text_is_escaped(tmp_path):
     table = Table([Column("k", HOSTILE, HOSTILE)], [{"k": HOSTILE}], HOSTILE)
     sections = [Section(HOSTILE, [HOSTILE, table, Picture(a_figure(), HOSTILE, HOSTILE)])] * 2
     page = a_page(tmp_path / "a.html", title=HOSTILE, intro=HOSTILE, sections=sections)
@@ -181,7 +181,7 @@ def test_what_comes_from_outside_stays_text(tmp_path):
     [[], [Section("", [])], [Section("a", [Table([Column("k", "k")], [])])], [Section("a", [Table([], [])])]],
     ids=["no section", "no part", "no row", "no column"],
 )
-def test_little_is_a_page_too(tmp_path, sections):
+def test_an_empty_page_is_valid(tmp_path, sections):
     page = a_page(tmp_path / "a.html", intro="", sections=sections)
     check_well_formed(page)
     assert not page.all("nav")
@@ -193,6 +193,6 @@ def test_the_same_content_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
+def test_a_file_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(SonarError, match=r"no/a\.html.*cannot write"):
         a_page(tmp_path / "no" / "a.html")

@@ -1,4 +1,4 @@
-"""The figure of a run: whatever is given is seen, ellipses hold what they say, narrow plans keep their legend."""
+"""The figure of a SLAM run: all given data are drawn, ellipses have the right size, narrow plans keep their legend."""
 
 from xml.etree import ElementTree
 
@@ -33,7 +33,7 @@ def labels(figure):
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def test_everything_given_is_in_the_legend():
+def test_all_given_data_are_in_the_legend():
     run = out_and_back()
     odometry = run.poses + np.array([0.0, 0.3, 0.0])
     odometry[5] = np.nan
@@ -67,7 +67,7 @@ def test_everything_given_is_in_the_legend():
     assert sorted(len(one.get_segments()) for one in lines) == [1, 2, 3, 3]
 
 
-def test_what_is_not_given_is_not():
+def test_missing_data_are_not_in_the_legend():
     figure = slam_figure(world(), Trajectory(np.arange(2.0), np.zeros((2, 3))))
     assert labels(figure) == ["estimated trajectory", "start", "wall", "corner", "edge"]
     empty = slam_figure(world(WALLS[:0]), Trajectory(np.zeros(0), np.zeros((0, 3))), title="none $of it")
@@ -76,7 +76,7 @@ def test_what_is_not_given_is_not():
 
 
 @pytest.mark.parametrize("sd", [0.0, 1e-4, 0.02, 0.5])
-def test_ellipses_are_as_large_as_they_say(sd):
+def test_ellipses_have_the_stated_size(sd):
     run = out_and_back(sd)
     figure = slam_figure(world(), run)
     drawn = [one for one in figure.axes[0].patches if isinstance(one, Ellipse)]
@@ -88,7 +88,7 @@ def test_ellipses_are_as_large_as_they_say(sd):
     assert times == {0.0: 1, 1e-4: 500, 0.02: 5, 0.5: 1}[sd], "of a path of 7.5 m"
 
 
-def test_so_many_are_within(rng):
+def test_ellipses_contain_the_stated_fraction(rng):
     root = rng.normal(size=(2, 2))
     covariance = root @ root.T
     halves, turn = ellipses(covariance[None])
@@ -100,8 +100,8 @@ def test_so_many_are_within(rng):
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi / 2])
-def test_nothing_leaves_the_paper(turn):
-    """The legend of a narrow plan, too."""
+def test_everything_is_inside_the_figure(turn):
+    """Including the legend of a narrow plan."""
     run = out_and_back(0.002).transform(np.array([0.0, 0.0, turn]))
     c, s = np.cos(turn), np.sin(turn)
     segments = WALLS @ np.array([[c, s], [-s, c]])
@@ -119,7 +119,7 @@ def test_nothing_leaves_the_paper(turn):
     assert legend.y1 <= axes.y0, "outside of the data"
 
 
-def test_files_are_what_their_names_say(tmp_path):
+def test_the_suffix_selects_the_format(tmp_path):
     figure = slam_figure(world(), out_and_back())
     for suffix in ("svg", "png"):
         plot_style.save_figure(figure, tmp_path / f"a.{suffix}")

@@ -1,4 +1,4 @@
-"""Figures: each draws whatever a scan holds, files are what their suffix says, arcs lie where echoes may come from."""
+"""Figures draw any scan, files have the format of their suffix, and arcs are where reflectors can be."""
 
 import itertools
 from functools import partial
@@ -34,7 +34,7 @@ WALL = Room(np.array([[[1.4, -2.0], [1.5, 2.0]]]))
 
 
 class Case(NamedTuple):
-    """Everything that a figure may show."""
+    """All data that a figure can show."""
 
     ring: Ring
     room: Room
@@ -67,7 +67,7 @@ def silence():
 
 
 def beyond():
-    """Echoes beyond the maximum range, and of a pair that the ring does not listen to."""
+    """Echoes beyond the maximum range, and of a sensor pair that is no path."""
     ring = Ring.circular()
     log = Log.from_echoes(
         np.zeros(3, int), np.array([0, 1, 2]), np.array([0, 12, 2]), np.array([2.0, 1.0, 7.0]),
@@ -77,7 +77,7 @@ def beyond():
 
 
 def map_of(segments):
-    """Lines of segments only; what else is known of them is not drawn."""
+    """A map from segments only; their other properties are not drawn."""
     segments = np.asarray(segments, float).reshape(-1, 2, 2)
     unknown = np.full(len(segments), np.nan)
     none = np.zeros(len(segments), int)
@@ -144,7 +144,7 @@ DRAW = {
 
 
 def drawn(figure):
-    """The canvas with everything on it; a figure's own canvas draws nothing."""
+    """A canvas on which the figure is rendered; a figure's own canvas renders nothing."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return canvas
@@ -157,8 +157,8 @@ def case(request):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("draw", DRAW.values(), ids=DRAW)
-def test_every_figure_draws_whatever_there_is(case, draw):
-    """Warnings are errors here, and the canvas draws everything once."""
+def test_every_figure_can_be_drawn(case, draw):
+    """Warnings are errors in tests, and the canvas renders everything once."""
     figure = draw(case)
     assert isinstance(figure, Figure)
     figure.set_dpi(30)
@@ -169,13 +169,13 @@ def test_every_figure_draws_whatever_there_is(case, draw):
         assert np.isfinite([*axes.get_xlim(), *axes.get_ylim()]).all()
 
 
-def test_every_public_function_that_draws_is_in_the_table():
-    modules = (figures, figures_scan, figures_map)
+def test_every_figure_function_is_tested():
+    modules = (plot_style, plot_scan, plot_map)
     drawing = {name for module in modules for name in vars(module) if name.endswith("_figure")}
     assert drawing == {f"{name.split()[0]}_figure" for name in DRAW if name != "last sensor fires"}
 
 
-def test_drawing_leaves_no_trace_in_the_style():
+def test_drawing_does_not_change_the_global_style():
     """A program that draws its own figures keeps its own style."""
     import matplotlib
 
@@ -184,7 +184,7 @@ def test_drawing_leaves_no_trace_in_the_style():
     assert dict(matplotlib.rcParams) == before
 
 
-def test_arcs_of_a_scan_are_all_paths_that_can_hear(faw_ring):
+def test_all_audible_paths_of_a_scan_have_an_arc(faw_ring):
     """As many curves as there are paths with overlapping cones and no echo, plus the echoes."""
     here = office()
     axes = plot_scan.arcs_figure(here.ring, here.scan).axes[0]
@@ -199,7 +199,7 @@ def test_arcs_of_a_scan_are_all_paths_that_can_hear(faw_ring):
 
 
 def test_outermost_reflection_lines_end_where_the_segment_ends():
-    """The kernel found the extent; the lines that are drawn are another way to it (paper, section 5)."""
+    """The reflection lines give the same endpoints as the kernel (paper, section 5)."""
     case = office()
     assert case.model.lines
     for line in case.model.lines:
@@ -217,8 +217,8 @@ def test_outermost_reflection_lines_end_where_the_segment_ends():
 
 
 @pytest.mark.slow
-def test_a_place_leaves_out_what_is_farther_away():
-    """Around one corner of the office: two walls, from three positions."""
+def test_a_detail_excludes_distant_segments():
+    """Two walls at one corner of the office, from three positions."""
     shipped = load_office()
     heard = simulate(shipped.ring, shipped.room, shipped.poses, sigma=0.003, seed=1)
     models = list(local_models(shipped.ring, heard.as_log(shipped.ring, shipped.poses)))
@@ -233,7 +233,7 @@ def test_a_place_leaves_out_what_is_farther_away():
 
 
 @pytest.mark.parametrize(("poses", "numbers"), [(0, 0), (1, 1), (40, 40), (41, 0), (2000, 0)])
-def test_many_positions_are_a_path_without_numbers(poses, numbers):
+def test_many_positions_are_a_trajectory_without_numbers(poses, numbers):
     path = np.stack([np.linspace(0, 25, poses), np.ones(poses), np.zeros(poses)], axis=-1)
     axes = plot_map.map_figure(map_of([[[0, 0], [25, 0]]]), poses=path).axes[0]
     assert len(axes.texts) == numbers
@@ -243,8 +243,8 @@ def test_many_positions_are_a_path_without_numbers(poses, numbers):
 
 
 @pytest.mark.parametrize("size", [(25, 4), (4, 25), (4, 4), (200, 1), (1, 200), (0.3, 0.3)])
-def test_paper_suits_the_place(size):
-    """Corridors along x get wide paper, along y a page's height; a metre is as long in both directions."""
+def test_the_figure_size_fits_the_plan(size):
+    """Corridors along x get wide figures, along y figures of limited height; both axes have the same scale."""
     x, y = size
     walls = [[[0, 0], [x, 0]], [[0, y], [x, y]], [[0, 0], [0, y]]]
     figure = plot_map.map_figure(map_of(walls), poses=np.array([[0.0, 0.0, 0.0]]), room=Room(np.array(walls, float)))
@@ -271,7 +271,7 @@ def test_every_end_of_a_segment_has_a_tick_across():
 
 
 def test_a_thousand_segments_are_few_elements(rng, tmp_path):
-    """What is drawn grows with the number of scans, the number of artists does not."""
+    """The number of artists does not grow with the number of scans."""
     ends = rng.uniform(0, 20, (1000, 2, 2))
     points = rng.uniform(0, 20, (100_000, 2))
     figure = plot_map.map_figure(map_of(ends[:100]), aggregated=ends, reference=ends, laser_points=points)
@@ -280,8 +280,8 @@ def test_a_thousand_segments_are_few_elements(rng, tmp_path):
     assert (tmp_path / "a.svg").stat().st_size < 3e6
 
 
-def test_the_grid_lies_where_the_map_says():
-    """Row 0 is at the top: the cell at the lower left corner is the last row's first."""
+def test_the_grid_is_aligned_with_the_map():
+    """Row 0 is the top row, so the lower left cell is the first one of the last row."""
     image = np.full((3, 5), FREE, np.uint8)
     image[2, 0] = OCCUPIED
     figure = plot_map.grid_figure(image, resolution=0.5, origin=(10.0, -4.0))
@@ -344,18 +344,18 @@ def test_png_and_pdf(figure, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.gif", "a", "svg", "a.svg.txt"])
-def test_another_suffix_is_refused(figure, tmp_path, name):
+def test_another_suffix_is_rejected(figure, tmp_path, name):
     with pytest.raises(SonarError, match=r"allowed are \.svg, \.png, \.pdf"):
         plot_style.save_figure(figure, tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_place_that_cannot_be_written_is_named(figure, tmp_path):
+def test_a_file_that_cannot_be_written_is_named(figure, tmp_path):
     with pytest.raises(SonarError, match=r"no/a\.png.*cannot write"):
         plot_style.save_figure(figure, tmp_path / "no" / "a.png")
 
 
-def test_a_failure_leaves_the_old_figure(tmp_path):
+def test_a_failed_write_keeps_the_old_figure(tmp_path):
     class Broken(Figure):
         def savefig(self, fname, **options):
             fname.write(b"half")
@@ -373,7 +373,7 @@ def test_a_failure_leaves_the_old_figure(tmp_path):
 
 @pytest.mark.parametrize("ring", [Ring.circular(), BUMPER, Ring.circular(count=8, beam=2.0, neighbors=2)])
 def test_arc_points_lie_at_the_path_length(ring, rng):
-    """From transmitter to point to receiver it is twice the range, wherever on the arc."""
+    """The path transmitter - point - receiver has twice the range, for every point of the arc."""
     rows = np.flatnonzero(np.asarray(ring.echo_paths.width) > 0)
     reach = rng.uniform(0.6, ring.max_range, len(rows))
     points = plot_scan.arc_points(ring, rows, reach, points=9)
@@ -385,7 +385,7 @@ def test_arc_points_lie_at_the_path_length(ring, rng):
 
 
 def test_arcs_span_the_detection_range(faw_ring):
-    """A plane square to the arc at its ends is heard from just there: the normal halves the angle at the point."""
+    """The bisector at an endpoint of the arc is the normal of a plane at the edge of the detection range."""
     rows = np.arange(len(faw_ring.paths))
     points = plot_scan.arc_points(faw_ring, rows, np.full(len(rows), 1.3), points=5)
     for row, arc in zip(rows, points, strict=True):
@@ -397,8 +397,8 @@ def test_arcs_span_the_detection_range(faw_ring):
             assert abs((apart + np.pi) % (2 * np.pi) - np.pi) < 1e-4
 
 
-def test_arcs_turn_with_the_ring(faw_ring):
-    """One sensor further along, an arc is the same one turned by 15 degrees."""
+def test_arcs_rotate_with_the_ring(faw_ring):
+    """The arc of the next sensor is the same arc rotated by 15 degrees."""
     rows = faw_ring.path_index[[3, 4, 4, 5], [3, 4, 6, 7]]
     a, b, c, d = plot_scan.arc_points(faw_ring, rows, np.full(4, 1.1))
     cos, sin = np.cos(np.radians(15)), np.sin(np.radians(15))

@@ -1,4 +1,4 @@
-"""recordings."""
+"""Published recordings for tests, if they are on this machine."""
 
 import os
 from pathlib import Path
@@ -11,14 +11,16 @@ DATA = Path(os.environ.get("JAXSONAR_DATA") or Path(__file__).parents[3] / "shar
 
 
 def recorded(name):
+    """The folder of a recording; skips the test if it is missing."""
     if not (DATA / name).is_dir():
-        pytest.skip(f"the recording {name} is not at {DATA}; it is no part of the project")
+        pytest.skip(f"the recording {name} is not in {DATA}; it is not part of the project")
     return DATA / name
 
 
 def refused(call, *args, **kwargs):
+    """Check that a call raises a SonarError with one printable line. Returns the message."""
     with pytest.raises(SonarError) as caught:
         call(*args, **kwargs)
     message = str(caught.value)
-    assert message.isprintable()  # so one line, too
+    assert message.isprintable()  # no line break, too
     return message
