@@ -1,6 +1,6 @@
-"""A loss of one's own on top of a calibration: the air warms up while the robot drives; how warm was it in each scan?
+"""A custom loss on top of a calibration: the temperature of the air in each scan, while it rises during the run.
 
-The echo model is differentiable in everything, so a parameter that the library does not have takes twenty lines.
+The measurement model is differentiable in all its parameters, so a new parameter takes twenty lines.
 """
 
 from dataclasses import replace
@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxsonar.office import load_office
 
 import jaxsonar
 from jaxsonar import kernels
-from jaxsonar.calibration import speed_of_sound
+from jaxsonar.sensors.ring import speed_of_sound
+from jaxsonar.simulation.office import load_office
 
 office = load_office()
 truth = np.linspace(16, 24, len(office.poses))  # deg C
@@ -27,29 +27,30 @@ found = jaxsonar.calibrate(office.ring, jaxsonar.Log.from_scans(scans), free=("s
 
 with jax.enable_x64(True):
     problem, at = found.problem, found.unknowns
-    mean = kernels.moved_sensors(problem.sensors, problem.modes @ at.modes)  # one speed of sound for all scans
+    mean = kernels.apply_parameters(problem.sensors, problem.basis @ at.coordinates)  # one speed of sound
 
-    def misfit(kelvin, heard, pose, scene):
-        """Of ONE scan whose air is so much warmer than the mean."""
+    def scan_cost(kelvin, factors, pose, landmarks):
+        """Cost of ONE scan whose air is warmer than the mean by this many kelvins."""
         sensors = eqx.tree_at(lambda s: s.range_scale, mean, mean.range_scale * jnp.sqrt(1 + kelvin / 293))
-        one = eqx.tree_at(lambda p: (p.sensors, p.modes, p.heard), problem, (sensors, 0 * problem.modes, heard))
-        left = kernels.residuals(one, kernels.Unknowns(at.modes, pose[None], scene))
-        return (heard.weight * left**2).sum() / 2
+        one = eqx.tree_at(lambda p: (p.sensors, p.basis, p.factors), problem, (sensors, 0 * problem.basis, factors))
+        residual = kernels.residuals(one, kernels.Unknowns(at.coordinates, pose[None], landmarks))
+        return (factors.weight * residual**2).sum() / 2
 
     def loss(unknown):
-        """Of all scans; the air does not change by kelvins from one to the next."""
-        kelvin, scene = unknown
-        one_by_one = jax.tree.map(lambda leaf: leaf[:, None], problem.heard)
-        smooth = ((jnp.diff(kelvin) / 0.5) ** 2).sum() / 2 + ((scene - at.scene) ** 2).sum() / 2
-        return jax.vmap(misfit, (0, 0, 0, None))(kelvin, one_by_one, at.poses, scene).sum() + smooth
+        """Cost of all scans and priors: the temperature changes by about 0.5 K between scans."""
+        kelvin, landmarks = unknown
+        scans = jax.tree.map(lambda leaf: leaf[:, None], problem.factors)
+        prior = ((jnp.diff(kelvin) / 0.5) ** 2).sum() / 2 + ((landmarks - at.landmarks) ** 2).sum() / 2
+        return jax.vmap(scan_cost, (0, 0, 0, None))(kelvin, scans, at.poses, landmarks).sum() + prior
 
-    x, unravel = ravel_pytree((jnp.zeros(len(at.poses)), at.scene))  # walls, too: they were fitted to the mean
+    # The walls are estimated as well, because they were fitted with the mean temperature.
+    x, unravel = ravel_pytree((jnp.zeros(len(at.poses)), at.landmarks))
 
     @jax.jit
     def newton(x):
-        """Of the loss, one step."""
-        slope = jax.grad(lambda x: loss(unravel(x)))
-        return x - jnp.linalg.solve(jax.jacfwd(slope)(x), slope(x))
+        """One Newton step."""
+        gradient = jax.grad(lambda x: loss(unravel(x)))
+        return x - jnp.linalg.solve(jax.jacfwd(gradient)(x), gradient(x))
 
     for _ in range(4):
         x = newton(x)
