@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.echo_paths import paths_between
 
 from jaxsonar import kernels
-from jaxsonar.kernels import CORNER, EDGE, PLANE, SECOND_ORDER, EchoPaths, Landmarks, Reflection
+from jaxsonar.kernels import CORNER, EDGE, PLANE, SECOND_ORDER, Landmarks, Reflection
 from jaxsonar.kernels import measurement_model as reflectors
 
 MANY = 200
@@ -65,20 +66,6 @@ def random_reflectors(rng, kind, count=MANY):
     return first, second, tx, rx
 
 
-def paths_between(tx, rx, heading, half_beam=0.5):
-    """Echo paths of sensors with these headings (paths, 2), in the default precision."""
-    arrays = {
-        "midpoint": (tx + rx) / 2,
-        "half_baseline": (rx - tx) / 2,
-        "start": np.zeros(len(tx)),
-        "width": np.zeros(len(tx)),
-        "range_offset": np.zeros(len(tx)),
-        "axes": unit(heading),
-        "cone": np.full((len(tx), 2), 4 * np.sin(half_beam / 2) ** 2),
-    }
-    return EchoPaths(**{name: jnp.asarray(value) for name, value in arrays.items()})
-
-
 def random_landmarks(rng, kind, count=MANY):
     """Landmarks anywhere in the world."""
     line = np.column_stack([rng.uniform(-0.1, 0.1, count), rng.uniform(-np.pi, np.pi, count)])
@@ -119,7 +106,7 @@ def predicted(kind, poses, first, second, tx, rx, heading):
     """Range, visibility and arrival of every path, by ``predict_reflection``."""
     rows = np.arange(len(poses), dtype=np.int32)
     reflection = Reflection(np.full(len(poses), kind, np.int32), rows, rows)
-    path = paths_between(tx, rx, heading, half_beam=1.2)
+    path = paths_between(tx, rx, heading=heading, half_beam=1.2)
     return [np.asarray(x) for x in predict_reflections(*arrays((poses, reflection, first, second)), path)]
 
 
@@ -138,7 +125,7 @@ def test_ranges_are_those_of_image_sources(rng, kind):
 def test_ranges_are_those_of_the_predicted_echoes(rng, kind):
     first, second, tx, rx = random_reflectors(rng, kind)
     kernel = [reflectors.plane_echo, reflectors.corner_echo, reflectors.edge_echo, reflectors.second_order_echo][kind]
-    path = paths_between(tx, rx, np.zeros((MANY, 2)))
+    path = paths_between(tx, rx)
     lines = arrays((first, second))[: 2 if kind == SECOND_ORDER else 1]
     sighting = jax.vmap(kernel)(*lines, path)
     found = expected_ranges(*arrays((np.full(MANY, kind), first, second, tx, rx)))

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.echo_paths import paths_between
 
 from jaxsonar import Room
-from jaxsonar.kernels import EchoPaths, measurement_model
+from jaxsonar.kernels import measurement_model
 from jaxsonar.simulation.echo_tracing import trace_between
 from jaxsonar.simulation.traced_echoes import EchoKind
 
@@ -42,21 +43,6 @@ def direction(offset):
 
 def angle(vector):
     return np.arctan2(vector[..., 1], vector[..., 0])
-
-
-def paths_between(tx, rx, *, heading=None, half_beam=0.5, dtype=jnp.float32):
-    """Echo paths of sensors anywhere, headings of tx and rx (paths, 2); fields of the Hough transform are 0."""
-    heading = np.zeros((len(tx), 2)) if heading is None else heading
-    fields: dict[str, Any] = {
-        "midpoint": (tx + rx) / 2,
-        "half_baseline": (rx - tx) / 2,
-        "start": np.zeros(len(tx)),
-        "width": np.zeros(len(tx)),
-        "range_offset": np.zeros(len(tx)),
-        "axes": unit(heading),
-        "cone": np.full((len(tx), 2), 4 * np.sin(half_beam / 2) ** 2),
-    }
-    return EchoPaths(**{name: jnp.asarray(value, dtype) for name, value in fields.items()})
 
 
 def predicted(model, parameters, tx, rx, **options):
