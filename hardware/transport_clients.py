@@ -143,10 +143,11 @@ class ReconnectingSource(Source):
         if self._broken_since is not None:
             self._on_event(LinkEvent("back", f"{self.url}: back after {now - self._broken_since:.1f} s"))
         elif self._is_silent:
-            self._on_event(LinkEvent("back", f"{self.url}: heard again after {now - self._last_data:.1f} s"))
+            self._on_event(LinkEvent("back", f"{self.url}: data again after {now - self._last_data:.1f} s"))
         self._broken_since, self._is_silent, self._last_data, self._backoff = None, False, now, SETTINGS.initial_backoff
-        if self._after_gap:  # separates the data from a partial frame before the gap
+        if self._after_gap:
             self._after_gap = False
+            # A leading 0x00 separates the data from a partial frame before the gap.
             return b"\0" + data
         return data
 

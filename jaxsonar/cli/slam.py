@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> None:
     ring, log = load_ring(options.ring), load_log(options.log)
     truth = None if options.truth is None else load_trajectory(options.truth)
     if truth is not None:
-        check_truth(truth, log, truth_name=options.truth, log_name=options.log)
+        check_truth(truth, log, truth_name=str(options.truth), log_name=options.log)
     with errors_in(options.log):
         _, left_out = FlatEchoes.from_log(ring, log)
         with stage_status() as progress:
@@ -99,7 +99,7 @@ def run(options: argparse.Namespace) -> None:
             raise SonarError("no scan has a pose; allowed are scans that see walls or corners, or odometry")
 
     # Compute everything before the first file is written.
-    errors = None if truth is None else errors_against_truth(result, truth, truth_name=options.truth)
+    errors = None if truth is None else errors_against_truth(result, truth, truth_name=str(options.truth))
     figure = None
     if options.figure:
         from jaxsonar.reports.plot_slam import slam_figure

@@ -131,9 +131,7 @@ def _draw_covariances(axes: Axes, trajectory: Trajectory, covariance: np.ndarray
         width, height = (2 * factor * half).tolist()
         shape = {"width": width, "height": height, "angle": float(np.degrees(angle))}
         axes.add_patch(Ellipse(tuple(position), **shape, fc=fill, ec=DIRECT_COLOR, lw=0.7, zorder=6))
-    larger = (
-        f", {factor} x enlarged" if factor > 1 else ""
-    )  # a short text, because the columns of the legend are narrow
+    larger = f", {factor} x enlarged" if factor > 1 else ""  # short: the columns of the legend are narrow
     label = f"{ELLIPSE_SIGMAS} sigma ({100 * ELLIPSE_PROBABILITY:.0f} %){larger}"
     return Line2D([], [], ls="", marker="o", ms=9, mfc=fill, mec=DIRECT_COLOR, mew=0.7, label=label)
 

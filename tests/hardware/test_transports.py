@@ -395,7 +395,7 @@ def test_silence_and_its_end_are_reported_once(scheme, pty_url):
     assert kinds(events)[-2:] == ["silent", "back"]
     assert kinds(events[:-2]) in ([], ["silent", "back"])  # a busy machine may be late with the first byte
     assert "nothing for " in events[-2].text
-    assert "heard again after " in events[-1].text
+    assert "data again after " in events[-1].text
 
 
 def test_one_client_after_the_other_continues():

@@ -21,3 +21,12 @@ def wall_and_corner(seen: tuple[int, ...]) -> GlobalMap:
         point_echoes=np.array([20]),
         point_scans=(seen,),
     )
+
+
+def assert_same_map(one, other, *, atol=1e-4):
+    assert len(one) == len(other)
+    for name in ("segments", "rho", "theta"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=atol)
+    assert one.echoes.tolist() == other.echoes.tolist()
+    assert one.scans == other.scans
+    np.testing.assert_allclose(one.points, other.points, atol=atol)
