@@ -40,7 +40,7 @@ class EchoAssignmentSettings:
     min_wall_scans: int = 2
     """Track loss: least number of scans that observed a wall."""
     audible_range: float = 0.85
-    """Track loss: fraction of the maximum range up to which walls are reliably detected."""
+    """Fraction of the maximum range up to which walls are reliably detected; for track loss and loop closure."""
 
 
 SETTINGS = EchoAssignmentSettings()

@@ -21,13 +21,11 @@ from jaxsonar.graph_slam.frontend import (
     update,
     update_pose_only,
 )
+from jaxsonar.graph_slam.scan_echoes import SETTINGS as ECHO_SETTINGS
 from jaxsonar.loop_closure.submap_graph import SubmapGraph
 from jaxsonar.loop_closure.verification import ClosureDecision
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.sensors.ring import Ring
-
-AUDIBLE_RANGE = 0.85
-"""Fraction of the ring's maximum range up to which walls are reliably detected; chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +81,7 @@ class Tracker:
 
     def start(self) -> TrackerState:
         """The state before the first scan."""
-        graph = SubmapGraph(reach=AUDIBLE_RANGE * float(self.ring.max_range))
+        graph = SubmapGraph(reach=ECHO_SETTINGS.audible_range * float(self.ring.max_range))
         return TrackerState(start_submap(), graph, np.zeros(3), 0)
 
     def step(
