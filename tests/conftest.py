@@ -65,6 +65,14 @@ def faw_ring():
 
 
 @pytest.fixture(scope="session")
+def office():
+    """The office that is shipped with the product: ring, room, poses and time stamps."""
+    from jaxsonar.simulation.office import load_office
+
+    return load_office()
+
+
+@pytest.fixture(scope="session")
 def short_demo(tmp_path_factory):
     """A folder in which ``jaxsonar demo -o demo`` has run with two random rooms; its tables, and what it said."""
     from jaxsonar.cli.app import main

@@ -1,7 +1,7 @@
 """Planar line segments, (segments, 2, 2): two end points (x, y) each, metres."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 
 def cross(u: Float[np.ndarray, "*#batch 2"], v: Float[np.ndarray, "*#batch 2"]) -> Float[np.ndarray, "..."]:
@@ -39,3 +39,22 @@ def crossings(
     determinant = cross(u, v)
     determinant = np.where(np.abs(determinant) > 1e-12, determinant, np.nan)
     return cross(offset, v) / determinant, cross(offset, u) / determinant
+
+
+def sample_segments(
+    segments: Float[np.ndarray, "segments 2 2"], samples: Int[np.ndarray, " segments"]
+) -> tuple[Float[np.ndarray, "points 2"], Int[np.ndarray, " points"]]:
+    """Equidistant points on segments, from start to end.
+
+    Args:
+        segments: the segments.
+        samples: number of points of each segment, at least 2.
+
+    Returns:
+        The points, metres, and the row of the segment of each.
+    """
+    row = np.repeat(np.arange(len(segments)), samples)
+    step = np.arange(len(row)) - np.repeat(np.cumsum(samples) - samples, samples)
+    share = step / (samples[row] - 1)
+    start, end = segments[row, 0], segments[row, 1]
+    return start + share[:, None] * (end - start), row

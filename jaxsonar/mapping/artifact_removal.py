@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from jaxsonar.geometry.se2 import perpendicular, wrap_angle
 from jaxsonar.geometry.segments import cross
 from jaxsonar.mapping.free_space import DirectionalFreeSpace
+from jaxsonar.mapping.observations import neighbor_pairs
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_segments import WallSegments
 
@@ -26,9 +27,8 @@ def remove_corner_lines(segments: WallSegments, walls: WallSegments) -> WallSegm
     artifact = np.zeros(len(segments), dtype=bool)
     if not len(vertices) or not len(short):
         return segments
-    near = KDTree(vertices).query_ball_point(segments.centre[short], settings.corner_radius)
-    segment = short[np.repeat(np.arange(len(short)), [len(found) for found in near])]
-    vertex = np.array([k for found in near for k in found], dtype=np.int64)
+    row, vertex = neighbor_pairs(vertices, segments.centre[short], settings.corner_radius)
+    segment = short[row]
     angle = angle_between_lines(segments.theta[segment][:, None], walls.theta[owners[vertex]])
     free_end = owners[vertex, 0] == owners[vertex, 1]
     stands_on_end = free_end & (np.abs(angle[:, 0] - np.pi / 2) < settings.perpendicular)

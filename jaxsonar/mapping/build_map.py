@@ -1,9 +1,9 @@
 """Global maps from logs: local models, evidence, and the assembly of walls and points (paper, section 5)."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from jaxsonar import kernels
 from jaxsonar.detection.extract import local_models
@@ -79,37 +79,30 @@ def assemble_map(
         walls = merge_by_hough(evidence.segments, linkage_distance=evidence.linkage_distance)
         return _as_global_map(walls, evidence.points.take(np.arange(0)))
     min_scans = min(min_scans, max(1, evidence.models - 1))
-    segments, free_space, gap = merge_cells(evidence.segments), evidence.free_space, evidence.gap
+    segments, free_space = merge_cells(evidence.segments), evidence.free_space
 
     # 1. Estimate the systematic error of the poses, and cluster corners and edges.
-    systematic_error = estimate_systematic_error(segments, gap=gap)
+    systematic_error = estimate_systematic_error(segments, gap=evidence.gap)
+    fuse = partial(fuse_segments, gap=evidence.gap, systematic_error=systematic_error)
     points = _confirmed_points(merge_cells(evidence.points), min_scans, systematic_error)
     # 2. Fuse segments into walls, remove what later scans saw through, and fuse again.
-    walls, wall_of = fuse_segments(segments, gap=gap, systematic_error=systematic_error)
+    walls, wall_of = fuse(segments)
     remaining = remove_seen_through(segments, wall_of, free_space)
     if remaining is not segments:
         segments = remaining
-        walls, _ = fuse_segments(segments, gap=gap, systematic_error=systematic_error)
+        walls, _ = fuse(segments)
     # 3. Remove the lines of corners and fuse again; keep confirmed walls that are not lines of poles or points.
     segments = remove_corner_lines(segments, walls)
-    walls, wall_of = fuse_segments(segments, gap=gap, systematic_error=systematic_error)
+    walls, wall_of = fuse(segments)
     artifact = is_pole_line(walls) | spurious_walls(walls, points)
     confirmed = np.flatnonzero(~artifact & (walls.count >= min_scans))
-
-    def is_opening(gaps: Float[np.ndarray, "gaps 2 2"], theta: Float[np.ndarray, " gaps"]) -> Bool[np.ndarray, " gaps"]:
-        return find_openings(gaps, theta, segments, free_space)
-
-    def is_opening_or_ends(
-        gaps: Float[np.ndarray, "gaps 2 2"], theta: Float[np.ndarray, " gaps"]
-    ) -> Bool[np.ndarray, " gaps"]:
-        return is_opening(gaps, theta) | blocks_gap(gaps, points)
-
     # 4. Bridge occluded parts of walls, but not openings, and do not continue a wall beyond an edge.
+    is_opening = partial(find_openings, segments=segments, free_space=free_space)
     walls, bridged_of = fuse_segments(
         walls.take(confirmed),
         gap=SETTINGS.evidence.bridged_gap,
         systematic_error=systematic_error,
-        is_opening=is_opening_or_ends,
+        is_opening=lambda gaps, theta: is_opening(gaps, theta) | blocks_gap(gaps, points),
         near_wall=SETTINGS.fusion.near_wall,
     )
     # 5. Refit the walls with outlying segments down-weighted.

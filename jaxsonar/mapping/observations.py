@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
 Rows = TypeVar("Rows", bound="Observations")
 
@@ -83,6 +84,17 @@ def merge_cells(observations: Rows, *, max_scans: int | None = None) -> Rows:
     _, group = np.unique(observations.grid_cells(), axis=0, return_inverse=True)
     fused = observations.fuse(group.ravel())
     return fused if max_scans is None else replace(fused, scans=_largest_numbers(fused.scans, max_scans))
+
+
+def neighbor_pairs(
+    points: Float[np.ndarray, "points dims"],
+    queries: Float[np.ndarray, "queries dims"],
+    radius: float | Float[np.ndarray, " queries"],
+) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
+    """Pairs (row of a query, row of a point) that are at most ``radius`` apart, sorted by query."""
+    found = KDTree(points).query_ball_point(queries, radius)
+    query = np.repeat(np.arange(len(queries)), [len(near) for near in found])
+    return query, np.array([k for near in found for k in near], dtype=np.int64)
 
 
 def unique_pairs(row: np.ndarray, number: np.ndarray) -> tuple[Int[np.ndarray, " seen"], Int[np.ndarray, " seen"]]:

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
+from jaxsonar.geometry.segments import sample_segments
 from jaxsonar.mapping.observations import unique_pairs
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_segments import WallSegments
@@ -210,10 +211,7 @@ def _candidate_pairs(
     """
     settings = SETTINGS.fusion
     samples = np.maximum(np.ceil(segments.length / gap).astype(np.int64), 1) + 1
-    segment = np.repeat(np.arange(len(segments)), samples)
-    share = (np.arange(len(segment)) - np.repeat(np.cumsum(samples) - samples, samples)) / (samples[segment] - 1)
-    start, end = segments.endpoints[segment, 0], segments.endpoints[segment, 1]
-    position = start + share[:, None] * (end - start)
+    position, segment = sample_segments(segments.endpoints, samples)
     direction = 0.5 * settings.angle_scale * unit(2 * segments.theta[segment])  # both sides of a wall are one direction
     points = np.concatenate([position, direction], axis=-1)
     theta_floor = settings.angle_per_offset**2 * (systematic_error**2 + (segments.count / segments.info_offset).max())

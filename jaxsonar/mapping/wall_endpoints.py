@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 
 from jaxsonar.geometry.segments import cross
 from jaxsonar.mapping.artifact_removal import angle_between_lines
-from jaxsonar.mapping.observations import concatenate
+from jaxsonar.mapping.observations import concatenate, neighbor_pairs
 from jaxsonar.mapping.point_landmarks import PointLandmarks
 from jaxsonar.mapping.segment_fusion import OpeningTest
 from jaxsonar.mapping.settings import SETTINGS
@@ -30,9 +29,8 @@ def snap_endpoints(walls: WallSegments, points: PointLandmarks, is_opening: Open
     if not len(walls) or not len(points):
         return walls
     # Candidates: points near an end, on the line of the wall, and known well enough.
-    near = KDTree(points.position).query_ball_point(walls.endpoints.reshape(-1, 2), SETTINGS.artifacts.max_extension)
-    end = np.repeat(np.arange(2 * len(walls)), [len(found) for found in near])
-    point = np.array([k for found in near for k in found], dtype=np.int64)
+    ends = walls.endpoints.reshape(-1, 2)
+    end, point = neighbor_pairs(points.position, ends, SETTINGS.artifacts.max_extension)
     wall, side = np.divmod(end, 2)
     alignment = SETTINGS.points.gate * SETTINGS.endpoints.alignment_floor
     along, offset = _relative_position(walls, points, wall, point, alignment)
@@ -43,7 +41,7 @@ def snap_endpoints(walls: WallSegments, points: PointLandmarks, is_opening: Open
     candidate &= largest_sd <= SETTINGS.endpoints.max_point_sd
     end, point, beyond = end[candidate], point[candidate], beyond[candidate]
     # The gap between the last footpoint and the point must be closed.
-    gaps = np.stack([walls.endpoints.reshape(-1, 2)[end], points.position[point]], axis=1)
+    gaps = np.stack([ends[end], points.position[point]], axis=1)
     closed = beyond <= 0
     closed[~closed] = ~is_opening(gaps[~closed], walls.theta[end[~closed] // 2])
     # Assign points to ends greedily, nearest first. A point ends one wall per direction.
@@ -141,9 +139,7 @@ def _points_on_faces(
     if not len(walls) or not len(points):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     radius = walls.length / 2 + SETTINGS.endpoints.face_margin
-    near = KDTree(points.position).query_ball_point(walls.endpoints.mean(axis=1), radius)
-    wall = np.repeat(np.arange(len(walls)), [len(found) for found in near])
-    point = np.array([k for found in near for k in found], dtype=np.int64)
+    wall, point = neighbor_pairs(points.position, walls.endpoints.mean(axis=1), radius)
     along, offset = _relative_position(walls, points, wall, point, SETTINGS.endpoints.face_depth)
     start, end = walls.extent[wall].T
     on_face = (offset <= 1) & (along > start + margin[wall]) & (along < end - margin[wall])

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxsonar.geometry.se2 import unit, wrap_angle
-from jaxsonar.geometry.segments import crossings, lengths, point_to_segments
+from jaxsonar.geometry.segments import crossings, lengths, point_to_segments, sample_segments
 from jaxsonar.occupancy.settings import SETTINGS
 
 
@@ -37,11 +37,7 @@ class WallMap(NamedTuple):
         corners = walls[first, 0] + share[np.triu(meet)][:, None] * (walls[first, 1] - walls[first, 0])
         # Cells: samples a quarter of a cell apart miss at most a clipped corner of a cell.
         samples = (4 * length / resolution).astype(int) + 2
-        wall = np.repeat(np.arange(len(walls)), samples)
-        step = np.arange(samples.sum()) - np.repeat(np.cumsum(samples) - samples, samples)
-        along = (step / (samples[wall] - 1))[:, None]
-        positions = walls[wall, 0] + along * (walls[wall, 1] - walls[wall, 0])
-        cells = np.unique(np.floor(positions / resolution).astype(int), axis=0)
+        cells = np.unique(np.floor(sample_segments(walls, samples)[0] / resolution).astype(int), axis=0)
         # Ends that touch another wall cannot extend.
         gap = point_to_segments(walls.reshape(-1, 2), walls)
         gap[np.arange(len(gap)), np.arange(len(gap)) // 2] = np.inf

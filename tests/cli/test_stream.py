@@ -23,12 +23,6 @@ from jaxsonar.cli.app import main
 from jaxsonar.live.status import Status
 from jaxsonar.live.stream import stream
 from jaxsonar.scans.recording_journal import open_log_recorder
-from jaxsonar.simulation.office import load_office
-
-
-@pytest.fixture(scope="module")
-def office():
-    return load_office()
 
 
 @pytest.fixture(scope="module")

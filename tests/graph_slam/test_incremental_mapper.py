@@ -12,14 +12,8 @@ from jaxsonar.graph_slam.incremental_mapper import Mapper, MapState
 from jaxsonar.mapping.build_map import build_map
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.settings import SETTINGS
-from jaxsonar.simulation.office import load_office
 
 RING = Ring.circular()
-
-
-@pytest.fixture(scope="module")
-def office():
-    return load_office()
 
 
 def office_log(office, seed=0):

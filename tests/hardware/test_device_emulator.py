@@ -15,12 +15,6 @@ from jaxsonar.hardware.protocol import encode
 from jaxsonar.hardware.transport_base import open_source
 from jaxsonar.hardware.transport_servers import Sink, listen
 from jaxsonar.simulation.device_messages import log_messages
-from jaxsonar.simulation.office import load_office
-
-
-@pytest.fixture(scope="module")
-def office():
-    return load_office()
 
 
 @pytest.fixture(scope="module")

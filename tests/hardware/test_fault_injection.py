@@ -13,12 +13,6 @@ from jaxsonar.hardware import device_emulator as emulator
 from jaxsonar.hardware.fault_injection import FaultInjector, FaultSettings, corrupt_frame, parse_stall
 from jaxsonar.hardware.protocol import encode
 from jaxsonar.simulation.device_messages import log_messages
-from jaxsonar.simulation.office import load_office
-
-
-@pytest.fixture(scope="module")
-def office():
-    return load_office()
 
 
 @pytest.fixture(scope="module")

@@ -20,14 +20,8 @@ from jaxsonar.hardware.messages import ECHO
 from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler
 from jaxsonar.live.live_map import LiveMap
 from jaxsonar.simulation.device_messages import log_messages, room_messages
-from jaxsonar.simulation.office import load_office
 
 RING = Ring.circular()
-
-
-@pytest.fixture(scope="module")
-def office():
-    return load_office()
 
 
 @pytest.fixture(scope="module")

@@ -23,15 +23,9 @@ from jaxsonar.hardware.transport_servers import listen
 from jaxsonar.live.live_map import LiveMap
 from jaxsonar.live.stream import stream
 from jaxsonar.simulation.device_messages import log_messages
-from jaxsonar.simulation.office import load_office
 
 RING = Ring.circular()
 LINKS = ("tcp://127.0.0.1:0", "udp://127.0.0.1:0", "pty:")
-
-
-@pytest.fixture(scope="module")
-def office():
-    return load_office()
 
 
 @pytest.fixture(scope="module")

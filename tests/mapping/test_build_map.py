@@ -15,7 +15,6 @@ from jaxsonar.mapping.build_map import MERGING_METHODS, assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.mapping.settings import SETTINGS
-from jaxsonar.simulation.office import load_office
 from jaxsonar.simulation.traced_echoes import EchoKind
 
 LEAST_SCANS = SETTINGS.evidence.min_scans
@@ -24,11 +23,6 @@ SEEDS = range(5)
 ON_WALL, ON_ANGLE, BEYOND = 0.06, math.radians(6.0), 0.12
 """Tolerances of a segment on a wall: offset (metres), angle (radians), length beyond its ends (metres)."""
 RING = Ring.circular()
-
-
-@pytest.fixture(scope="module")
-def office():
-    return load_office()
 
 
 @pytest.fixture(scope="module")

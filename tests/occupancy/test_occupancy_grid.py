@@ -18,14 +18,8 @@ from jaxsonar.occupancy.nav2_map import grid_image_filename, save_nav2
 from jaxsonar.occupancy.occupancy_grid import FREE, NO_WALLS, OCCUPIED, UNKNOWN, OccupancyGrid, occupancy
 from jaxsonar.occupancy.settings import SETTINGS
 from jaxsonar.occupancy.wall_visibility import WallMap, estimate_extensions
-from jaxsonar.simulation.office import load_office
 
 QUARTER = np.pi / 2
-
-
-@pytest.fixture(scope="module")
-def office():
-    return load_office()
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,6 @@ from jaxsonar.hardware import SonarError
 from jaxsonar.hardware.messages import Group, Pose
 from jaxsonar.hardware.protocol import Decoder, encode
 from jaxsonar.simulation.device_messages import log_messages, room_messages
-from jaxsonar.simulation.office import load_office
-
-
-@pytest.fixture(scope="module")
-def office():
-    return load_office()
 
 
 @pytest.fixture(scope="module")

@@ -29,11 +29,6 @@ PAPER_RHO, PAPER_THETA = 0.0323, math.radians(7.41)
 
 
 @pytest.fixture(scope="module")
-def office():
-    return load_office()
-
-
-@pytest.fixture(scope="module")
 def noisy(office):
     """The office simulated with several seeds: (simulation, models) of each."""
     found = []
