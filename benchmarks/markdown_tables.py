@@ -1,6 +1,6 @@
-"""Tables of results in Markdown, and pages that hold them between two marks, so that nobody types a number.
+"""Markdown tables of results, written into pages between two HTML comments.
 
-A page says where a table goes: between ``<!-- benchmarks: targets -->`` and ``<!-- /benchmarks -->``.
+The table ``targets`` replaces the text between ``<!-- benchmarks: targets -->`` and ``<!-- /benchmarks -->``.
 """
 
 import re
@@ -11,7 +11,7 @@ from benchmarks.metrics import RATIO, Metric, Results
 from jaxsonar.fileio.atomic_files import atomic_write
 from jaxsonar.hardware.errors import SonarError
 
-NOTHING = "not measured here"
+NOT_MEASURED = "not measured here"
 BLOCK = re.compile(r"<!-- benchmarks: (?P<name>[\w-]+) -->\n(?P<held>.*?)<!-- /benchmarks -->", re.DOTALL)
 TARGETS = {
     "throughput.hough:numba": "hough, batch, one core : fused Numba loop with components and centres",
@@ -45,88 +45,90 @@ GROWTH = {
 }
 
 
-def said(metric: Metric | None) -> str:
-    """Value and unit."""
+def value_text(metric: Metric | None) -> str:
+    """Text of a value with its unit."""
     if metric is None or metric.value != metric.value:
-        return NOTHING
+        return NOT_MEASURED
     value = metric.value
     digits = f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     return f"{digits} {metric.unit}".strip()
 
 
 def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """Markdown; the first column is text."""
+    """A Markdown table; the first column is text, the others are numbers."""
     if not rows:
-        return f"{NOTHING[0].upper()}{NOTHING[1:]}.\n"
+        return f"{NOT_MEASURED[0].upper()}{NOT_MEASURED[1:]}.\n"
     lines = [header, ("---", *["---:"] * (len(header) - 1)), *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def wanted(metric: Metric) -> str:
-    """The target with its sign."""
+def target_text(metric: Metric) -> str:
+    """Text of a target: at least or at most."""
     sign = "at least" if metric.direction == "higher" else "at most"
     return "" if metric.target is None else f"{sign} {metric.target:g} {metric.unit}"
 
 
 def targets(results: Results) -> str:
-    """What is aimed at, ratios first."""
+    """Targets and whether they are met."""
     rows = []
     for key, what in TARGETS.items():
         metric = results.metrics.get(key)
         if metric is not None:
             met = {None: "", True: "yes", False: "no"}[metric.met]
-            rows.append((what, said(metric), wanted(metric), met))
+            rows.append((what, value_text(metric), target_text(metric), met))
     return table(("", "measured", "target", "met"), rows)
 
 
 def peers(results: Results) -> str:
-    """The batched hough against what one would use instead."""
+    """Rates of all implementations on one core."""
     rows = []
     for name, what in {"hough": "**hough, batch**", **PEERS, "ml": "**ml, batch**"}.items():
         rate = results.metrics.get(f"throughput.{name}.rate")
         against = results.metrics.get(f"throughput.hough:{name}")
         if rate is not None:
             inverse = results.value("throughput.ml:hough") if name == "ml" else float("nan")
-            ratio = "1" if name == "hough" else said(against) if against else said(Metric("", inverse, RATIO))
-            rows.append((what, ratio, said(rate)))
+            ratio = (
+                "1" if name == "hough" else value_text(against) if against else value_text(Metric("", inverse, RATIO))
+            )
+            rows.append((what, ratio, value_text(rate)))
     return table(("on one core", "hough is faster by", "rate"), rows)
 
 
 def stages(results: Results) -> str:
-    """Where the time goes."""
+    """Time of each stage and its share of the whole."""
     rows = []
     for key, metric in results.metrics.items():
         head, _, rest = key.partition(".")
         if head == "stages" and rest.endswith(".share"):
             name, stage = rest.removesuffix(".share").split(".", 1)
             time = results.metrics[f"stages.{name}.{stage}"]
-            rows.append((f"{name}: {stage}", said(metric), said(time)))
+            rows.append((f"{name}: {stage}", value_text(metric), value_text(time)))
     return table(("stage, alone", "share of the whole", "time"), rows)
 
 
 def growth(results: Results) -> str:
-    """Exponents."""
+    """Exponents of the time."""
     rows = []
     for axis, what in GROWTH.items():
         each = [results.metrics.get(f"growth.{axis}.{method}.exponent") for method in ("hough", "ml")]
         if any(each):
-            rows.append((what, *(said(one) for one in each)))
+            rows.append((what, *(value_text(one) for one in each)))
     return table(("time grows with n to the, n being", "hough", "ml"), rows)
 
 
 def listed(names: tuple[str, ...]) -> Callable[[Results], str]:
-    """All figures of some workloads, ratios first."""
+    """A function that lists all metrics of some workloads, ratios first."""
 
-    def of(results: Results) -> str:
-        own = [one for key, one in results.metrics.items() if key.partition(".")[0] in names and "@" not in key]
-        own.sort(key=lambda one: one.unit != RATIO)
-        return table(("", "measured"), [(f"`{one.key}`", said(one)) for one in own])
+    def listing(results: Results) -> str:
+        selected = [one for key, one in results.metrics.items() if key.partition(".")[0] in names and "@" not in key]
+        selected.sort(key=lambda one: one.unit != RATIO)
+        return table(("", "measured"), [(f"`{one.key}`", value_text(one)) for one in selected])
 
-    return of
+    return listing
 
 
 def conditions(results: Results) -> str:
-    """Where and when, a sentence."""
+    """Machine, versions, commit and date in one sentence."""
     e = results.environment
     versions = ", ".join(f"{name} {e[name]}" for name in ("jax", "jaxlib", "numpy", "numba") if e.get(name))
     commit = (e["commit"] or "no commit")[:10] + ("+" if (e["commit"] or "").endswith("+") else "")
@@ -150,26 +152,30 @@ BLOCKS: dict[str, Callable[[Results], str]] = {
 }
 
 
-def filled(text: str, results: Results) -> str:
-    """A page with its tables made anew; those of workloads that were not measured stay as they are.
+def updated(text: str, results: Results) -> str:
+    """A page with updated tables. Tables of workloads that were not measured stay unchanged.
 
     Raises:
-        SonarError: a table that there is not.
+        SonarError: unknown name of a table.
     """
 
     def block(found: re.Match[str]) -> str:
         name = found["name"]
         if name not in BLOCKS:
             raise SonarError(f"benchmarks: {name!r}; allowed are {', '.join(BLOCKS)}")
-        made = BLOCKS[name](results)
-        held = found["held"] if NOTHING in made.lower() and made.count("\n") == 1 and found["held"].strip() else made
-        return f"<!-- benchmarks: {name} -->\n{held}<!-- /benchmarks -->"
+        table_text = BLOCKS[name](results)
+        content = (
+            found["held"]
+            if NOT_MEASURED in table_text.lower() and table_text.count("\n") == 1 and found["held"].strip()
+            else table_text
+        )
+        return f"<!-- benchmarks: {name} -->\n{content}<!-- /benchmarks -->"
 
     return BLOCK.sub(block, text)
 
 
 def write(path: Path, results: Results) -> None:
-    """Make the tables of a page anew."""
-    text = filled(path.read_text(encoding="utf-8"), results)
+    """Update the tables of a page."""
+    text = updated(path.read_text(encoding="utf-8"), results)
     with atomic_write(path) as file:
         file.write(text)

@@ -1,7 +1,7 @@
-"""What the suite measures, where, and whether it got worse: Metric, the JSON file, the baseline and its gate.
+"""Metrics of the suite, their JSON file, the baseline and the gate.
 
-A ratio holds a time of jaxsonar against one that was taken in the same run, so that it means something on another
-machine. Only ratios have a tolerance, and only they are in the baseline.
+A ratio compares a time of jaxsonar with another time of the same run, so it is comparable between machines. Only
+ratios have a tolerance and are in the baseline.
 """
 
 import importlib.metadata
@@ -22,7 +22,7 @@ BASELINE = Path(__file__).with_name("baseline.json")
 RATIO = "x"
 """The unit of ratios."""
 SIZES = ("gate", "quick", "full")
-"""How much is measured: what CI holds against the baseline, a minute, everything."""
+"""Sizes of a run: the ratios for CI, one minute, everything."""
 
 
 @dataclass(frozen=True)
@@ -30,21 +30,21 @@ class Metric:
     """One figure."""
 
     key: str
-    """Workload, what, and against what: ``throughput.hough:numpy``."""
+    """Workload, quantity, and the other side of a ratio: ``throughput.hough:numpy``."""
     value: float
-    """NaN: not measured here."""
+    """NaN if not measured."""
     unit: str
     """``x`` for a ratio."""
     direction: Literal["higher", "lower"] = "lower"
-    """Which is better."""
+    """Whether higher or lower values are better."""
     tolerance: float | None = None
-    """Factor by which it may be worse than the baseline; None: no part of the gate."""
+    """Allowed factor by which it may be worse than the baseline; None: not part of the gate."""
     target: float | None = None
-    """Wanted at least (higher) or at most (lower)."""
+    """Target: minimum (higher) or maximum (lower)."""
 
     @property
     def met(self) -> bool | None:
-        """Whether the target is met; None without one, or without a value."""
+        """Whether the target is met; None without a target or a value."""
         if self.target is None or self.value != self.value:
             return None
         return self.value >= self.target if self.direction == "higher" else self.value <= self.target
@@ -62,26 +62,26 @@ class Metric:
 
 @dataclass(frozen=True)
 class Options:
-    """What was asked for."""
+    """Options of a run."""
 
     size: str = "full"
-    """Which of SIZES."""
+    """One of SIZES."""
     seed: int = 0
-    """Of rooms, poses and noise."""
+    """Seed of rooms, poses and noise."""
 
     def pick(self, *, gate: int, quick: int, full: int) -> int:
-        """A number by size."""
+        """The number for the size of the run."""
         return {"gate": gate, "quick": quick, "full": full}[self.size]
 
 
 @dataclass(frozen=True)
 class Results:
-    """What one run measured, and where."""
+    """Results of one run and its environment."""
 
     environment: dict[str, Any]
     options: dict[str, Any]
     metrics: dict[str, Metric]
-    """By key."""
+    """Metrics by key."""
 
     @classmethod
     def of(cls, metrics: Iterable[Metric], options: Mapping[str, Any]) -> "Results":
@@ -89,39 +89,39 @@ class Results:
         return cls(environment(), dict(options), {metric.key: metric for metric in metrics})
 
     def value(self, key: str) -> float:
-        """NaN for what was not measured."""
+        """Value of a metric; NaN if it was not measured."""
         return self.metrics[key].value if key in self.metrics else float("nan")
 
     def save(self, path: Path) -> None:
-        """As JSON; NaN as null."""
-        told: dict[str, Any] = {"environment": self.environment, "options": self.options}
-        told["metrics"] = [
+        """Write as JSON; NaN becomes null."""
+        content: dict[str, Any] = {"environment": self.environment, "options": self.options}
+        content["metrics"] = [
             asdict(metric) | {"value": None if metric.value != metric.value else metric.value}
             for metric in self.metrics.values()
         ]
         with atomic_write(path) as file:
-            json.dump(told, file, indent=1, allow_nan=False)
+            json.dump(content, file, indent=1, allow_nan=False)
             file.write("\n")
 
     @classmethod
     def load(cls, path: Path) -> "Results":
-        """What ``save`` wrote.
+        """Read a file that ``save`` wrote.
 
         Raises:
-            SonarError: this is something else.
+            SonarError: the file is not a result of this suite.
         """
-        told = _read(path, "metrics", "environment", "options")
+        content = _read(path, "metrics", "environment", "options")
         names = {one.name for one in fields(Metric)}
         metrics = []
-        for told_of in told["metrics"]:
-            row: dict[str, Any] = {key: told_of[key] for key in names}
+        for entry in content["metrics"]:
+            row: dict[str, Any] = {key: entry[key] for key in names}
             row["value"] = float("nan") if row["value"] is None else row["value"]
             metrics.append(Metric(**row))
-        return cls(told["environment"], told["options"], {one.key: one for one in metrics})
+        return cls(content["environment"], content["options"], {one.key: one for one in metrics})
 
 
 def environment() -> dict[str, Any]:
-    """What the numbers hang on."""
+    """Hardware, versions, commit and time."""
     import jax
 
     names = ("jaxsonar", "jax", "jaxlib", "numpy", "scipy", "opencv-python-headless", "numba", "scikit-image")
@@ -160,7 +160,7 @@ def _processor() -> str:
 
 
 def _commit() -> str | None:
-    """The commit, with ``+`` if files differ from it; None where there is no git, or no repository."""
+    """The commit, with ``+`` if files differ from it; None without git or a repository."""
     root = Path(__file__).parent
 
     def git(*call: str) -> str:
@@ -173,12 +173,12 @@ def _commit() -> str | None:
 
 
 def ratios(metrics: Iterable[Metric]) -> dict[str, Metric]:
-    """Those that the gate looks at."""
+    """The ratios that the gate compares."""
     return {one.key: one for one in metrics if one.unit == RATIO and one.tolerance is not None}
 
 
 def save_baseline(results: Results, path: Path = BASELINE) -> None:
-    """Keep the ratios of a gate run."""
+    """Write the ratios of a gate run."""
     rows = {
         key: {"value": round(one.value, 4), "direction": one.direction, "tolerance": one.tolerance}
         for key, one in ratios(results.metrics.values()).items()
@@ -189,32 +189,32 @@ def save_baseline(results: Results, path: Path = BASELINE) -> None:
 
 
 def load_baseline(path: Path = BASELINE) -> dict[str, Any]:
-    """What ``save_baseline`` wrote.
+    """Read a file that ``save_baseline`` wrote.
 
     Raises:
-        SonarError: this is something else.
+        SonarError: the file is not a baseline.
     """
     return _read(path, "ratios")
 
 
 def _read(path: Path, *keys: str) -> dict[str, Any]:
-    """A JSON object that has these keys."""
+    """Read a JSON object with these keys."""
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as failure:
-        raise SonarError(f"{path}: {reason(failure)}; needed is a file that this suite wrote") from None
-    if not isinstance(told, dict) or not set(keys) <= set(told):
-        raise SonarError(f"{path}: no {', '.join(keys)} in it; needed is a file that this suite wrote")
-    return told
+        raise SonarError(f"{path}: {reason(failure)}; needed is a file written by this suite") from None
+    if not isinstance(content, dict) or not set(keys) <= set(content):
+        raise SonarError(f"{path}: no {', '.join(keys)} in it; needed is a file written by this suite")
+    return content
 
 
 def failures(metrics: Mapping[str, Metric], baseline: Mapping[str, Any], only: Iterable[str] = ()) -> dict[str, str]:
-    """Ratios that are worse than the baseline by more than its tolerance, or missing: key, and what is wrong.
+    """Ratios that are missing or worse than the baseline by more than the tolerance: message by key.
 
     Args:
-        metrics: what was measured.
-        baseline: what is held against it.
-        only: workloads that were measured; all if left out.
+        metrics: the measured metrics.
+        baseline: the reference.
+        only: the measured workloads; all if empty.
     """
     only, wrong = set(only), {}
     for key, was in baseline["ratios"].items():

@@ -1,4 +1,4 @@
-"""Figures of the suite, from its metrics: one function, one figure."""
+"""Figures of the suite."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,42 +19,42 @@ BARS = {
     "throughput.hough:pointset_fine": "cv2.HoughLinesPointSet, 10 mm x 2 deg",
     "throughput.hough:raster": "skimage hough_line, accumulator only",
 }
-BACKED = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
-"""So that no line runs through a text."""
-WHOLES = {"hough": "hough, batch", "ml": "ml, batch", "single": "hough, one scan"}
+TEXT_BOX = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+"""Background of text, so that no line crosses it."""
+STAGE_GROUPS = {"hough": "hough, batch", "ml": "ml, batch", "single": "hough, one scan"}
 LINES = {"hough": plot_style.PALETTE[0], "ml": plot_style.PALETTE[1]}
 
 
 def peers_figure(results: Results) -> Figure:
-    """How many times as fast as each peer the batched hough is, and the targets."""
+    """Speed of the batched hough relative to each peer, and the targets."""
     rows = [results.metrics[key] for key in BARS if key in results.metrics]
     with plot_style.figure_style():
         figure = Figure(figsize=(7.6, 0.5 * len(rows) + 1.3), layout="constrained")
         axes = figure.subplots()
-        place = np.arange(len(rows))[::-1]
+        position = np.arange(len(rows))[::-1]
         values = np.array([one.value for one in rows])
-        goals = np.array([np.nan if one.target is None else one.target for one in rows])
-        axes.barh(place, values, left=0, height=0.55, color=plot_style.PALETTE[0])
+        targets = np.array([np.nan if one.target is None else one.target for one in rows])
+        axes.barh(position, values, left=0, height=0.55, color=plot_style.PALETTE[0])
         axes.set_xscale("log")
         axes.axvline(1, color=plot_style.WALL_COLOR, lw=1, ls="--")
-        axes.plot(goals, place, ls="", marker="|", ms=16, mew=2.5, color=plot_style.PALETTE[5], label="target")
-        both = np.append(values, goals[np.isfinite(goals)])
+        axes.plot(targets, position, ls="", marker="|", ms=16, mew=2.5, color=plot_style.PALETTE[5], label="target")
+        both = np.append(values, targets[np.isfinite(targets)])
         axes.set_xlim(min(0.5, float(np.nanmin(both)) / 2), float(np.nanmax(both)) * 3)
-        beyond = np.fmax(values, np.where(goals > values, np.where(goals < 2.5 * values, goals, 0), 0))
-        for y, value, x in zip(place, values, beyond, strict=True):
-            axes.annotate(f"{value:.3g} x", (x, y), (6, 0), textcoords="offset points", va="center", bbox=BACKED)
-        axes.set_yticks(place, [BARS[one.key] for one in rows])
+        label_position = np.fmax(values, np.where(targets > values, np.where(targets < 2.5 * values, targets, 0), 0))
+        for y, value, x in zip(position, values, label_position, strict=True):
+            axes.annotate(f"{value:.3g} x", (x, y), (6, 0), textcoords="offset points", va="center", bbox=TEXT_BOX)
+        axes.set_yticks(position, [BARS[one.key] for one in rows])
         axes.tick_params(axis="y", length=0)
         _plain(axes.xaxis)
-        axes.set_xlabel("hough, batch, one core: times as fast")
-        if np.isfinite(goals).any():
+        axes.set_xlabel("hough, batch, one core: speed relative to the peer")
+        if np.isfinite(targets).any():
             axes.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
         return figure
 
 
 def stages_figure(results: Results) -> Figure:
-    """Shares of the stages of a batch and of one scan; what is left over is what happens between them."""
-    rows = {name: dict(_shares(results, name)) for name in WHOLES}
+    """Shares of the stages of a batch and of one scan."""
+    rows = {name: dict(_shares(results, name)) for name in STAGE_GROUPS}
     rows = {name: shares for name, shares in rows.items() if shares}
     with plot_style.figure_style():
         figure = Figure(figsize=(7.6, 0.95 * len(rows) + 1.0), layout="constrained")
@@ -73,16 +73,16 @@ def stages_figure(results: Results) -> Figure:
                     above += 1
                 left += share
         axes.axvline(100, color=plot_style.WALL_COLOR, lw=1, ls="--")
-        names = [f"{WHOLES[name]}\n{results.value(f'stages.{name}.whole'):,.0f} us a scan" for name in rows]
+        names = [f"{STAGE_GROUPS[name]}\n{results.value(f'stages.{name}.whole'):,.0f} us per scan" for name in rows]
         axes.set_yticks(range(len(rows)), names[::-1])
         axes.tick_params(axis="y", length=0)
         axes.set_ylim(-0.6, len(rows) - 0.4)
-        axes.set_xlabel("stages, each alone (% of the whole)")
+        axes.set_xlabel("stages, each measured alone (% of the whole)")
         return figure
 
 
 def growth_figure(results: Results) -> Figure:
-    """Times over what grows, log-log, with the exponents."""
+    """Times over the varied size, log-log, with the exponents."""
     curves = {axis: {m: p for m in LINES if (p := _points(results, axis, m))} for axis in GROWTH}
     curves = {axis: lines for axis, lines in curves.items() if lines}
     across = min(3, max(1, len(curves)))
@@ -110,7 +110,7 @@ def growth_figure(results: Results) -> Figure:
             axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             _plain(axes.yaxis)
             axes.set_title({"grid": "cells along each side", "scans": "scans"}.get(axis, GROWTH[axis]))
-            axes.set_ylabel("s a batch" if whole else "us a scan")
+            axes.set_ylabel("s a batch" if whole else "us per scan")
             axes.legend(loc="upper left")
         return figure
 
@@ -119,7 +119,7 @@ def _shares(results: Results, name: str) -> Iterator[tuple[str, float]]:
     for key, metric in results.metrics.items():
         if key.startswith(f"stages.{name}.") and key.endswith(".share"):
             stage = key.removeprefix(f"stages.{name}.").removesuffix(".share")
-            if " and " not in stage:  # which would hold another one, too
+            if " and " not in stage:  # a sum that contains another stage
                 yield stage, metric.value
 
 
@@ -136,24 +136,24 @@ def _plain(axis) -> None:
 
 
 def all_of(results: Results) -> dict[str, Figure]:
-    """Figures that there is something for, by name."""
-    made = {}
+    """Figures of the measured workloads, by name."""
+    figures = {}
     if any(key in results.metrics for key in BARS):
-        made["peers"] = peers_figure(results)
+        figures["peers"] = peers_figure(results)
     if any(key.startswith("stages.hough.") for key in results.metrics):
-        made["stages"] = stages_figure(results)
+        figures["stages"] = stages_figure(results)
     if any(key.startswith("growth.") for key in results.metrics):
-        made["growth"] = growth_figure(results)
-    return made
+        figures["growth"] = growth_figure(results)
+    return figures
 
 
 def write(
     results: Results, folder: Path, *, prefix: str = "", suffixes: tuple[str, ...] = (".svg", ".png")
 ) -> list[Path]:
-    """All figures as files."""
-    paths = []
+    """Write all figures."""
+    filenames = []
     for name, figure in all_of(results).items():
         for suffix in suffixes:
-            paths.append(folder / f"{prefix}{name}{suffix}")
-            plot_style.save_figure(figure, paths[-1])
-    return paths
+            filenames.append(folder / f"{prefix}{name}{suffix}")
+            plot_style.save_figure(figure, filenames[-1])
+    return filenames

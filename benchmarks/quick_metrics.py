@@ -1,4 +1,4 @@
-"""A few figures of the workloads that have commands of their own, from their shortest useful form."""
+"""Some figures of benchmarks that have commands of their own, from short runs."""
 
 import time
 
@@ -20,7 +20,7 @@ from benchmarks.speed.timing import Contestant
 
 
 def of_merging(options: Options) -> list[Metric]:
-    """``benchmarks.mapping.segment_merging``: walls from segments, against single linkage by SciPy, which only makes the clusters."""
+    """Fusion of segments to walls, compared with single linkage (jaxsonar and SciPy), which only makes the clusters."""
     from jaxsonar.mapping.hough_merging import single_linkage
     from jaxsonar.mapping.observations import merge_cells
     from jaxsonar.mapping.segment_fusion import fuse_segments
@@ -28,15 +28,15 @@ def of_merging(options: Options) -> list[Metric]:
     size = options.pick(gate=2_000, quick=3_000, full=10_000)
     pieces, _ = merging.building(size)
     middle = pieces.endpoints.mean(axis=1)
-    entered = {
+    contestants = {
         "fuse": Contestant(lambda: fuse_segments(merge_cells(pieces), gap=merging.GAP), size),
         "linkage": Contestant(lambda: single_linkage(middle, merging.CUT), size),
         "scipy": Contestant(lambda: fcluster(linkage(middle, "single"), merging.CUT, "distance"), size),
     }
-    taken = timing.round_robin(entered, rounds=options.pick(gate=3, quick=3, full=5), clock=time.process_time)
+    seconds_of = timing.round_robin(contestants, rounds=options.pick(gate=3, quick=3, full=5), clock=time.process_time)
     metrics = [
-        Metric("merging.linkage:scipy", timing.ratio(taken["scipy"], taken["linkage"]), RATIO, "higher", 2.0),
-        Metric("merging.fuse:linkage", timing.ratio(taken["fuse"], taken["linkage"]), RATIO, "lower", 2.0),
+        Metric("merging.linkage:scipy", timing.ratio(seconds_of["scipy"], seconds_of["linkage"]), RATIO, "higher", 2.0),
+        Metric("merging.fuse:linkage", timing.ratio(seconds_of["fuse"], seconds_of["linkage"]), RATIO, "lower", 2.0),
     ]
     if options.size == "full":
         sizes = 1_000, 10_000, 100_000
@@ -49,12 +49,12 @@ def of_merging(options: Options) -> list[Metric]:
         metrics.append(Metric("merging.fuse.exponent", exponent(curve), ""))
         metrics += [Metric(f"merging.fuse@{count}", seconds, "s") for count, seconds in curve]
     return metrics + [
-        Metric(f"merging.{name}", 1e6 * float(seconds.min()), "us/segment") for name, seconds in taken.items()
+        Metric(f"merging.{name}", 1e6 * float(seconds.min()), "us/segment") for name, seconds in seconds_of.items()
     ]
 
 
 def of_calibration(options: Options) -> list[Metric]:
-    """``benchmarks.calibration.accuracy``: time of 25 scans, in the full run of 100, and deviations over the bound."""
+    """Time of a calibration of 25 scans, in the full run of 100, and errors over the Cramer-Rao bound."""
     known = CONDITIONS[0]
     rows = [timed(scans, known) for scans in ((25,) if options.size != "full" else (25, 100))]
     metrics = [Metric("calibration.first:again", rows[0]["first"] / rows[0]["again"], RATIO)]
@@ -67,30 +67,30 @@ def of_calibration(options: Options) -> list[Metric]:
 
 
 def of_streaming(options: Options) -> list[Metric]:
-    """``benchmarks.speed.streaming``: what a device on a TCP link gets through, by the paper's method, without a map."""
+    """Rate and latency of a device on a TCP link, by the paper's method, without a map."""
     from benchmarks.speed import streaming
 
     rows = streaming.run(
         speed=50.0, seconds=options.pick(gate=3, quick=4, full=20), method="hough", mapping=False, record=None
     )
-    told = {name: value for name, value, _ in rows}
+    values = {name: value for name, value, _ in rows}
     return [
-        Metric("streaming.real_time", float(told["times real time"]), RATIO, "higher"),
-        Metric("streaming.rate", float(told["scans a second"]), "scans/s", "higher"),
-        Metric("streaming.p50", float(told["latency, median"]), "ms"),
-        Metric("streaming.p99", float(told["latency, 99th percentile"]), "ms"),
-        Metric("streaming.dropped", float(told["dropped"]), "scans"),
+        Metric("streaming.real_time", float(values["times real time"]), RATIO, "higher"),
+        Metric("streaming.rate", float(values["scans a second"]), "scans/s", "higher"),
+        Metric("streaming.p50", float(values["latency, median"]), "ms"),
+        Metric("streaming.p99", float(values["latency, 99th percentile"]), "ms"),
+        Metric("streaming.dropped", float(values["dropped"]), "scans"),
     ]
 
 
 def of_accuracy(options: Options) -> list[Metric]:
-    """``benchmarks.detection.accuracy``: that what is fast is right; recall, false lines, and deviations over the bound."""
+    """Recall, false lines, and errors over the Cramer-Rao bound of both methods."""
     rooms = options.pick(gate=2, quick=8, full=64)
     scans = random_scans(BASE, rooms, POSES, seed=options.seed)
     metrics = []
     for method, name in {"hough": "hough (paper)", "ml": "ml"}.items():
-        said = list(METHODS[name](scans.ring, scans.log, BASE.sigma))
-        found = score(scans.truth, said).measures()
+        reported = list(METHODS[name](scans.ring, scans.log, BASE.sigma))
+        found = score(scans.truth, reported).measures()
         for what in ("rho_mm", "theta_deg"):
             key = f"accuracy.{method}.{what.partition('_')[0]}:bound"
             metrics.append(Metric(key, found[f"rmse_{what}_per_crb"], RATIO))

@@ -1,4 +1,4 @@
-"""result_files."""
+"""Helpers of the accuracy benchmarks for their JSON files."""
 
 import importlib.metadata
 import os
@@ -13,7 +13,7 @@ import numpy as np
 
 
 def versions() -> dict[str, Any]:
-    """What the numbers hang on."""
+    """Versions, device and commit."""
     names = ("jaxsonar", "jax", "jaxlib", "numpy", "scipy")
     root = Path(__file__).parent
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=False)
@@ -27,7 +27,7 @@ def versions() -> dict[str, Any]:
 
 
 def without_nan(value: Any) -> Any:
-    """NaN as null, which JSON has."""
+    """Replace NaN by None, because JSON has no NaN."""
     if isinstance(value, dict):
         return {key: without_nan(one) for key, one in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""conditions."""
+"""Simulated conditions of the detection benchmark."""
 
 from dataclasses import dataclass
 
@@ -9,23 +9,25 @@ from jaxsonar import Ring
 
 @dataclass(frozen=True)
 class Condition:
-    """What is simulated; the defaults are the base that one thing at a time is varied from."""
+    """Parameters of a simulation. The defaults are the base condition, of which one parameter at a time is varied."""
 
     name: str
     sigma: float = 0.003
     """Range noise, metres."""
     lost: float = 0.1
-    """Share of the echoes that are lost."""
+    """Probability that an echo is lost."""
     false: float = 0.02
-    """False echoes for each true one."""
+    """False echoes per true echo."""
     cone_deg: float = 60.0
+    """Full width of the detection cones, degrees."""
     sensors: int = 24
+    """Number of sensors of the ring."""
     quick: bool = False
-    """Part of the quick run."""
+    """Whether the condition is part of the quick run."""
 
     @property
     def ring(self) -> Ring:
-        """Listens as far around as the cones overlap well: 45 deg, with cones of 120 deg 105 deg."""
+        """The ring. Cross echoes reach as far around as the cones overlap well: 45 deg, or 105 deg for wide cones."""
         around = 105 if self.cone_deg > 90 else 45
         neighbors = around * self.sensors // 360
         return Ring.circular(count=self.sensors, beam=np.radians(self.cone_deg), neighbors=neighbors)
@@ -60,5 +62,6 @@ ISOLATED = (
     Condition("one reflector, 1 mm, cones of 60 deg", sigma=0.001, lost=0.0, false=0.0, quick=True),
     Condition("one reflector, 5 mm, cones of 120 deg", sigma=0.005, lost=0.0, false=0.0, cone_deg=120.0),
 )
+"""Conditions of scans with one reflector each."""
 
 THREE_WALLS = Condition("three walls, 1 mm", sigma=0.001, lost=0.0, false=0.0)

@@ -1,4 +1,4 @@
-"""methods."""
+"""The methods of the detection benchmark, all with the same interface."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -13,26 +13,26 @@ from jaxsonar import LocalModel, Log, Ring, local_models
 
 
 @dataclass(frozen=True)
-class Reported:
-    """What a method says of one scan, robot frame."""
+class DetectionResult:
+    """Result of a method for one scan, robot frame."""
 
     lines: Float[np.ndarray, "lines 2"]
     """(rho, theta), metres and radians."""
     cov: Float[np.ndarray, "lines 2 2"]
-    """Of those; NaN where the method gives none."""
+    """Covariances of the lines; NaN if the method gives none."""
     others: Float[np.ndarray, "others 2"]
-    """Distance and direction of what is no line, or not decided."""
+    """Distance (metres) and direction (radians) of points and undecided reflectors."""
     answers: Int[np.ndarray, " others"]
-    """Which of ANSWERS each of them is."""
+    """Class of each of them, an index into ANSWERS."""
 
     @classmethod
-    def of_lines(cls, lines: Float[np.ndarray, "lines 2"]) -> "Reported":
-        """Nothing but lines."""
+    def of_lines(cls, lines: Float[np.ndarray, "lines 2"]) -> "DetectionResult":
+        """A result with lines only."""
         return cls(lines, np.full((len(lines), 2, 2), np.nan), np.zeros((0, 2)), np.zeros(0, dtype=int))
 
     @classmethod
-    def of_model(cls, model: LocalModel) -> "Reported":
-        """Lines, points and undecided reflectors of a local model."""
+    def of_model(cls, model: LocalModel) -> "DetectionResult":
+        """The lines, points and undecided reflectors of a local map."""
         others = [(np.hypot(point.x, point.y), np.arctan2(point.y, point.x)) for point in model.points]
         others += [(one.rho, one.theta) for one in model.undecided]
         answers = [ANSWERS.index(point.kind) for point in model.points]
@@ -46,34 +46,39 @@ class Reported:
         )
 
 
-Method = Callable[[Ring, Log, float], Iterator[Reported]]
+Method = Callable[[Ring, Log, float], Iterator[DetectionResult]]
+"""Takes a ring, a log and the true range noise (metres); gives a result per scan."""
 
 
-def by_hough(ring: Ring, log: Log, sigma: float) -> Iterator[Reported]:
-    """The paper's way; it does not use the noise."""
-    return (Reported.of_model(model) for model in local_models(ring, log, method="hough"))
+def hough_method(ring: Ring, log: Log, sigma: float) -> Iterator[DetectionResult]:
+    """The paper's method. It does not use the noise."""
+    return (DetectionResult.of_model(model) for model in local_models(ring, log, method="hough"))
 
 
-def by_ml(ring: Ring, log: Log, sigma: float, *, known: bool = True, direct: bool = False) -> Iterator[Reported]:
-    """Most likely reflectors, with the noise or without it, from all echoes or from direct ones."""
+def ml_method(
+    ring: Ring, log: Log, sigma: float, *, known: bool = True, direct: bool = False
+) -> Iterator[DetectionResult]:
+    """The maximum-likelihood method, with known or estimated noise, from all or only from direct echoes."""
     ring = replace(ring, neighbors=0) if direct else ring
     models = local_models(ring, log, method="ml", sigma=sigma if known else None)
-    return (Reported.of_model(model) for model in models)
+    return (DetectionResult.of_model(model) for model in models)
 
 
-def by_peer(ring: Ring, log: Log, sigma: float, *, peer: PointHough | PairConsensus) -> Iterator[Reported]:
-    """Lines of a peer, scan by scan."""
-    return (Reported.of_lines(peer(arcs, sigma)) for arcs in arcs_of_scans(ring, log))
+def baseline_method(
+    ring: Ring, log: Log, sigma: float, *, baseline: PointHough | PairConsensus
+) -> Iterator[DetectionResult]:
+    """A baseline, scan by scan."""
+    return (DetectionResult.of_lines(baseline(arcs, sigma)) for arcs in arcs_of_scans(ring, log))
 
 
 METHODS: dict[str, Method] = {
-    "hough (paper)": by_hough,
-    "ml": by_ml,
-    "ml, sigma estimated": partial(by_ml, known=False),
-    "ml, direct echoes only": partial(by_ml, direct=True),
-    "cv2.HoughLinesPointSet": partial(by_peer, peer=PointHough()),
-    "consensus of pairs": partial(by_peer, peer=PairConsensus()),
+    "hough (paper)": hough_method,
+    "ml": ml_method,
+    "ml, sigma estimated": partial(ml_method, known=False),
+    "ml, direct echoes only": partial(ml_method, direct=True),
+    "cv2.HoughLinesPointSet": partial(baseline_method, baseline=PointHough()),
+    "consensus of pairs": partial(baseline_method, baseline=PairConsensus()),
 }
 
-METHODS_THAT_TELL_KINDS = ("hough (paper)", "ml", "ml, sigma estimated")
-"""Methods that single reflectors are shown to."""
+CLASSIFYING_METHODS = ("hough (paper)", "ml", "ml, sigma estimated")
+"""Methods that classify reflectors; they run on the scans with one reflector."""

@@ -13,7 +13,7 @@ from rich.table import Table
 from jaxsonar.reports import plot_style
 
 KINDS = ("plane", "corner", "edge")
-"""Kinds of reflectors; poles are content like edges."""
+"""Kinds of reflectors. Poles count as edges."""
 ANSWERS = (*KINDS, "undecided", "nothing")
 """Classes that a method can report for a reflector."""
 Series = dict[float, dict[str, dict[str, float]]]
@@ -62,7 +62,7 @@ def robustness_figure(columns: dict[str, Series]) -> Figure:
 
 
 def confusion_figure(tables: dict[str, Int[np.ndarray, "4 5"]]) -> Figure:
-    """Shares of each kind's reflectors by what was content of them, and how many reports are of nothing."""
+    """Confusion matrices of the methods, with the number of reports without a reflector."""
     across = 3
     down = -(-len(tables) // across)
     with plot_style.figure_style():
@@ -146,10 +146,11 @@ def tables(content: dict[str, Any]) -> Iterator[Table]:
             )
     yield table
     table = Table(
-        title=f"Classification of reflectors with {s['clear_reflector']} or more echoes: % of each kind; {_condition_text(base)}",
+        title=f"Classification of reflectors with {s['clear_reflector']} or more echoes: % of each kind; "
+        f"{_condition_text(base)}",
         caption="nothing there: reports per scan without a reflector, from second-order and false echoes",
     )
-    for column in ("", "is", "reflectors", *(f"content {answer}" for answer in ANSWERS)):
+    for column in ("", "true", "reflectors", *(f"as {answer}" for answer in ANSWERS)):
         table.add_column(column, justify="left" if column in ("", "true") else "right")
     for name, got in base["methods"].items():
         table.add_section()

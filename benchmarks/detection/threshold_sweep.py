@@ -1,6 +1,7 @@
-"""Where the default threshold comes from: recall, false lines and deviations over its value, in random rooms.
+"""Sweep of the detection threshold: recall, false lines and deviations in random rooms; origin of the default.
 
-Run ``python -m benchmarks.detection.threshold_sweep``. The rooms are not those of the demo (other seeds). Range noise 3 mm.
+Run ``python -m benchmarks.detection.threshold_sweep``. The rooms are not those of the demo (other seeds). Range noise
+3 mm.
 """
 
 import argparse
@@ -15,6 +16,7 @@ from jaxsonar.detection.settings import hough_settings
 from jaxsonar.evaluation.line_accuracy import line_accuracy, pool
 
 SIGMA = 0.003
+"""Range noise, metres."""
 
 
 def main() -> None:
@@ -38,13 +40,13 @@ def main() -> None:
             [
                 line_accuracy(
                     ring,
-                    list(local_models(ring, heard.as_log(ring, poses), method="hough", settings=settings)),
-                    heard,
+                    list(local_models(ring, simulation.as_log(ring, poses), method="hough", settings=settings)),
+                    simulation,
                     room,
                     poses,
                     sigma=SIGMA,
                 )
-                for room, poses, heard in scenes
+                for room, poses, simulation in scenes
             ]
         )
         table.add_row(

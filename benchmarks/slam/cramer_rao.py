@@ -1,9 +1,10 @@
-"""What no unbiased estimate of poses and walls goes below: the Cramer-Rao bound of a simulated run.
+"""Cramer-Rao bound of a simulated run: lower bound of the covariances of poses and walls.
 
-The association is known from the simulator, its noise is white, and odometry is as wrong as ``simulate_odometry`` makes it. The
-formulas are those of ``benchmarks.calibration.accuracy``, their slopes central differences: nothing is shared with the kernels.
-Echoes of second order are no part of it, nor is that corners lie where walls meet or that walls go on behind a door, so
-that it is a little too large where the library uses that. The first pose is known; it is the frame.
+The association is known from the simulator, the noise is white, the odometry noise is that of ``simulate_odometry``.
+The range formulas are those of ``benchmarks.calibration.cramer_rao`` and the Jacobians are central differences, so
+nothing is shared with the kernels. Second-order echoes and the priors that corners lie where walls meet and that walls
+continue behind a door are not included, so the bound is slightly too large where the library uses them. The first pose
+is known; it is the frame.
 """
 
 from dataclasses import dataclass
@@ -12,148 +13,152 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import solveh_banded
 
-from benchmarks.calibration.cramer_rao import LOOSE, NUDGE, reports
-from benchmarks.calibration.cramer_rao import scene as reflectors_of
+from benchmarks.calibration.cramer_rao import LANDMARK_SD, NUDGE, expected_ranges, first_order_echoes
 from benchmarks.slam.scenarios import DISTANCE, TURN, Scene
 from jaxsonar.geometry.se2 import relative, wrap_angle
 from jaxsonar.simulation.traced_echoes import EchoKind
 from jaxsonar.simulation.wheel_odometry import odometry_step_sd
 
 EXACT = 1e-5
-"""Metres and radians: what is exact in odometry (a robot that turns on the spot stays there) is known so well."""
+"""Standard deviation of exact components of the odometry, such as the translation of a turn in place, m and rad."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """Least covariances; world frame, metres and radians."""
+    """Lower bounds of covariances; world frame, metres and radians."""
 
     poses: Float[np.ndarray, "scans 3 3"]
-    """Of every pose, the first one known."""
+    """Covariance of each pose; the first one is known."""
     wall: Int[np.ndarray, " walls"]
-    """Walls of the room that were heard."""
+    """Walls of the room with echoes."""
     distance: Float[np.ndarray, " walls"]
-    """Variance of their distance from where they are, square metres: in the middle of each."""
+    """Variance of the distance of each wall at its midpoint, square metres."""
     turn: Float[np.ndarray, " walls"]
-    """Variance of their direction, square radians."""
+    """Variance of the direction of each wall, square radians."""
 
     @property
     def ate(self) -> float:
-        """Root mean square of the positions' errors, metres."""
+        """Root mean square position error, metres."""
         return float(np.sqrt(np.mean(self.poses[:, 0, 0] + self.poses[:, 1, 1])))
 
     @property
     def ate_heading(self) -> float:
-        """The same of the headings, radians."""
+        """Root mean square heading error, radians."""
         return float(np.sqrt(np.mean(self.poses[:, 2, 2])))
 
 
 def bound(scene: Scene, *, distance: float = DISTANCE, turn: float = TURN) -> Bound:
-    """Of a run through a place that is unknown at first.
+    """Bound of a run in an unknown environment.
 
     Args:
-        scene: the truth and what was heard.
-        distance: what odometry is wrong by, as ``simulate_odometry`` takes it.
-        turn: likewise.
+        scene: the truth and the simulated echoes.
+        distance: position noise of the odometry, as in ``simulate_odometry``.
+        turn: heading noise of the odometry, as in ``simulate_odometry``.
     """
-    slopes = _Slopes.of(scene)
-    count, scans = len(slopes.places), len(scene.poses)
-    pose, both, place = slopes.information(scans)
-    place[:, np.arange(2), np.arange(2)] += 1 / LOOSE**2
-    on_first, on_second, between = _links(scene.poses, distance, turn)
+    jacobians = _RangeJacobians.of(scene)
+    count, scans = len(jacobians.parameters), len(scene.poses)
+    pose, cross, reflectors = jacobians.information(scans)
+    reflectors[:, np.arange(2), np.arange(2)] += 1 / LANDMARK_SD**2
+    on_first, on_second, between = _odometry_information(scene.poses, distance, turn)
     pose[:-1] += on_first
     pose[1:] += on_second
-    free = slice(1, None)  # the first pose is known
-    chain = _Chain(pose[free], between[1:])
-    border = both[free].reshape(3 * (scans - 1), 2 * count)
-    solved = chain.solve(border) if scans > 1 else border
+    unknown = slice(1, None)  # the first pose is known
+    odometry_chain = _BlockTridiagonal(pose[unknown], between[1:])
+    border = cross[unknown].reshape(3 * (scans - 1), 2 * count)
+    solved = odometry_chain.solve(border) if scans > 1 else border
     whole = np.zeros((2 * count, 2 * count))
     for k in range(count):
-        whole[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = place[k]
-    places = np.linalg.inv(whole - border.T @ solved)
+        whole[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = reflectors[k]
+    covariance = np.linalg.inv(whole - border.T @ solved)
     rows = solved.reshape(scans - 1, 3, 2 * count)
     poses = np.zeros((scans, 3, 3))
     for begin in range(0, scans - 1, 512):
         some = rows[begin : begin + 512]
-        poses[1 + begin : 1 + begin + len(some)] = (some @ places) @ some.transpose(0, 2, 1)
-    poses[free] += chain.blocks()
-    return Bound(poses, *_walls(scene, slopes, places))
+        poses[1 + begin : 1 + begin + len(some)] = (some @ covariance) @ some.transpose(0, 2, 1)
+    poses[unknown] += odometry_chain.blocks()
+    return Bound(poses, *_walls(scene, jacobians, covariance))
 
 
 def pose_bound(scene: Scene) -> Float[np.ndarray, "scans 3 3"]:
-    """Covariance of every pose by itself, from its own scan, in a room that is known."""
-    pose, _, _ = _Slopes.of(scene).information(len(scene.poses))
+    """Covariance of each pose from its own scan alone, in a known room."""
+    pose, _, _ = _RangeJacobians.of(scene).information(len(scene.poses))
     return np.linalg.inv(pose)
 
 
 @dataclass(frozen=True, eq=False)
-class _Slopes:
-    """How the reports of all first-order echoes change, in units of the noise."""
+class _RangeJacobians:
+    """Jacobians of the ranges of all first-order echoes, in units of the noise."""
 
     scan: np.ndarray  # (echoes,)
-    own: np.ndarray  # (echoes,) its reflector
+    reflector: np.ndarray  # (echoes,) row of the reflector
     kinds: np.ndarray  # (reflectors, 2) kind and number
-    places: np.ndarray  # (reflectors, 2)
-    by_pose: np.ndarray  # (echoes, 3)
-    by_place: np.ndarray  # (echoes, 2)
+    parameters: np.ndarray  # (reflectors, 2)
+    d_range_d_pose: np.ndarray  # (echoes, 3)
+    d_range_d_reflector: np.ndarray  # (echoes, 2)
 
     @classmethod
-    def of(cls, scene: Scene) -> "_Slopes":
-        heard = scene.heard
-        first, own, places = reflectors_of(scene.room, heard)
-        kind, scan = heard.kind[first], heard.scan[first]
-        ends = np.asarray(scene.ring.position)[scene.ring.paths[heard.path[first]]]
+    def of(cls, scene: Scene) -> "_RangeJacobians":
+        simulation = scene.simulation
+        first, reflector, parameters = first_order_echoes(scene.room, simulation)
+        kind, scan = simulation.kind[first], simulation.scan[first]
+        ends = np.asarray(scene.ring.position)[scene.ring.paths[simulation.path[first]]]
         scale = np.full(len(first), 343.2 / float(scene.ring.speed_of_sound))
 
-        def slope(place: np.ndarray, pose: np.ndarray) -> np.ndarray:
-            at = [(places[own] + way * place, scene.poses[scan] + way * pose) for way in (NUDGE, -NUDGE)]
-            up, down = (reports(kind, *one, ends, scale) for one in at)
+        def derivative(reflector_step: np.ndarray, pose: np.ndarray) -> np.ndarray:
+            at = [
+                (parameters[reflector] + sign * reflector_step, scene.poses[scan] + sign * pose)
+                for sign in (NUDGE, -NUDGE)
+            ]
+            up, down = (expected_ranges(kind, *one, ends, scale) for one in at)
             return (up - down) / (2 * NUDGE * scene.sigma)
 
-        by_pose = np.stack([slope(np.zeros(2), one) for one in np.eye(3)], axis=-1)
-        by_place = np.stack([slope(one, np.zeros(3)) for one in np.eye(2)], axis=-1)
-        kinds = np.unique(np.stack([heard.kind, heard.reflector])[:, first], axis=1).T  # in the order of places
-        return cls(scan, own, kinds, places, by_pose, by_place)
+        d_range_d_pose = np.stack([derivative(np.zeros(2), one) for one in np.eye(3)], axis=-1)
+        d_range_d_reflector = np.stack([derivative(one, np.zeros(3)) for one in np.eye(2)], axis=-1)
+        kinds = np.unique(
+            np.stack([simulation.kind, simulation.reflector])[:, first], axis=1
+        ).T  # in the order of the parameters
+        return cls(scan, reflector, kinds, parameters, d_range_d_pose, d_range_d_reflector)
 
     def information(self, scans: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of poses (scans, 3, 3), of poses with reflectors (scans, 3, reflectors, 2), of these (reflectors, 2, 2)."""
-        count = len(self.places)
-        pose, both = np.zeros((scans, 3, 3)), np.zeros((scans, 3, count, 2))
-        place = np.zeros((count, 2, 2))
-        np.add.at(pose, self.scan, self.by_pose[:, :, None] * self.by_pose[:, None])
-        np.add.at(place, self.own, self.by_place[:, :, None] * self.by_place[:, None])
-        cross = self.by_pose[:, :, None] * self.by_place[:, None]
-        np.add.at(both.transpose(0, 2, 1, 3), (self.scan, self.own), cross)
-        return pose, both, place
+        """Information: poses (scans, 3, 3), cross terms (scans, 3, reflectors, 2), reflectors (reflectors, 2, 2)."""
+        count = len(self.parameters)
+        pose, cross = np.zeros((scans, 3, 3)), np.zeros((scans, 3, count, 2))
+        reflectors = np.zeros((count, 2, 2))
+        np.add.at(pose, self.scan, self.d_range_d_pose[:, :, None] * self.d_range_d_pose[:, None])
+        np.add.at(reflectors, self.reflector, self.d_range_d_reflector[:, :, None] * self.d_range_d_reflector[:, None])
+        products = self.d_range_d_pose[:, :, None] * self.d_range_d_reflector[:, None]
+        np.add.at(cross.transpose(0, 2, 1, 3), (self.scan, self.reflector), products)
+        return pose, cross, reflectors
 
 
-def _links(poses: np.ndarray, distance: float, turn: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Information of every step: on the pose before it, on the one after it, and between these, (steps, 3, 3) each."""
+def _odometry_information(poses: np.ndarray, distance: float, turn: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Information of each odometry step: first pose, second pose and cross term, (steps, 3, 3) each."""
     sd = np.maximum(odometry_step_sd(poses, distance=distance, turn=turn), EXACT)
     step = relative(poses[:-1], poses[1:])
-    ahead = np.arctan2(step[:, 1], step[:, 0])
-    c, s = np.cos(ahead), np.sin(ahead)
+    direction = np.arctan2(step[:, 1], step[:, 0])
+    c, s = np.cos(direction), np.sin(direction)
 
-    def slope(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        up, down = (relative(poses[:-1] + way * a, poses[1:] + way * b) for way in (NUDGE, -NUDGE))
-        off = up - down
-        off[:, 2] = wrap_angle(off[:, 2])
-        along, across = c * off[:, 0] + s * off[:, 1], c * off[:, 1] - s * off[:, 0]
-        return np.stack([along, across, off[:, 2]], axis=-1) / (2 * NUDGE * sd)
+    def derivative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        up, down = (relative(poses[:-1] + sign * a, poses[1:] + sign * b) for sign in (NUDGE, -NUDGE))
+        difference = up - down
+        difference[:, 2] = wrap_angle(difference[:, 2])
+        along, across = c * difference[:, 0] + s * difference[:, 1], c * difference[:, 1] - s * difference[:, 0]
+        return np.stack([along, across, difference[:, 2]], axis=-1) / (2 * NUDGE * sd)
 
-    first = np.stack([slope(one, np.zeros(3)) for one in np.eye(3)], axis=-1)
-    second = np.stack([slope(np.zeros(3), one) for one in np.eye(3)], axis=-1)
-    turned = first.transpose(0, 2, 1)
-    return turned @ first, second.transpose(0, 2, 1) @ second, turned @ second
+    first = np.stack([derivative(one, np.zeros(3)) for one in np.eye(3)], axis=-1)
+    second = np.stack([derivative(np.zeros(3), one) for one in np.eye(3)], axis=-1)
+    first_transposed = first.transpose(0, 2, 1)
+    return first_transposed @ first, second.transpose(0, 2, 1) @ second, first_transposed @ second
 
 
-class _Chain:
-    """A matrix of 3 x 3 blocks along the diagonal and next to it."""
+class _BlockTridiagonal:
+    """A symmetric block tridiagonal matrix with 3 x 3 blocks."""
 
     def __init__(self, diagonal: np.ndarray, upper: np.ndarray):
         self.diagonal, self.upper = diagonal, upper
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """The inverse times a matrix."""
+        """The inverse times ``right``."""
         size = 3 * len(self.diagonal)
         banded = np.zeros((6, size))
         for i in range(3):
@@ -165,7 +170,7 @@ class _Chain:
         return solveh_banded(banded, right, lower=True)
 
     def blocks(self) -> np.ndarray:
-        """The blocks along the diagonal of the inverse."""
+        """The diagonal blocks of the inverse."""
         count = len(self.diagonal)
         before, after = self.diagonal.copy(), self.diagonal.copy()
         for k in range(1, count):
@@ -175,13 +180,15 @@ class _Chain:
         return np.linalg.inv(before + after - self.diagonal)
 
 
-def _walls(scene: Scene, slopes: _Slopes, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Number, variance of the distance in the middle, and of the direction, of every wall that was heard."""
-    row = np.flatnonzero(slopes.kinds[:, 0] == EchoKind.PLANE)
-    number = slopes.kinds[row, 1]
+def _walls(
+    scene: Scene, jacobians: _RangeJacobians, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Index, variance of the distance at the midpoint, and variance of the direction of each wall with echoes."""
+    row = np.flatnonzero(jacobians.kinds[:, 0] == EchoKind.PLANE)
+    number = jacobians.kinds[row, 1]
     middle = scene.room.walls[number].mean(axis=1)
-    theta = slopes.places[row, 1]
+    theta = jacobians.parameters[row, 1]
     along = (np.stack([-np.sin(theta), np.cos(theta)], axis=-1) * middle).sum(-1)
-    own = covariance.reshape(len(slopes.places), 2, len(slopes.places), 2)[row, :, row]
+    reflector = covariance.reshape(len(jacobians.parameters), 2, len(jacobians.parameters), 2)[row, :, row]
     to_middle = np.stack([-np.ones(len(row)), along], axis=-1)
-    return number, np.einsum("ki,kij,kj->k", to_middle, own, to_middle), own[:, 1, 1].copy()
+    return number, np.einsum("ki,kij,kj->k", to_middle, reflector, to_middle), reflector[:, 1, 1].copy()

@@ -1,9 +1,10 @@
-"""SLAM on a recorded run with a laser: how thick the laser draws the walls, and how far the map is from them.
+"""SLAM on a recorded run with a laser: thickness of the walls in the laser points, and errors of the sonar map.
 
-Run ``python -m benchmarks.slam.laser_reference FOLDER``; FOLDER holds a recording as corridor8 is: ``measurement.txt``,
-``laser.txt``, ``poses.txt``. Nobody surveyed the place, so the laser is the judge: drawn at good poses, what it saw of
-one wall from everywhere is thin. Told are the two lines with the most returns, and how far the sonar map is from the
-walls that the laser has (``reference_map``), at the poses of the odometry and at those of ``slam``.
+Run ``python -m benchmarks.slam.laser_reference FOLDER``; FOLDER holds a recording in the format of corridor8:
+``measurement.txt``, ``laser.txt``, ``poses.txt``. The true poses are unknown. The laser serves as reference: with good
+poses, the laser points of a wall seen from everywhere form a thin line. The table shows the two lines with the most
+points, and the errors of the sonar map against the walls of the laser (``reference_map``), at the poses of the odometry
+and at those of ``slam``.
 """
 
 import argparse
@@ -21,95 +22,102 @@ from jaxsonar.hardware.laser_datasets import LaserRecording, read_corridor8_lase
 from jaxsonar.scans.convert import read_scans
 
 NEAR = 0.15
-"""Metres from a wall's line up to which a return is of it."""
+"""Maximum distance of a laser point from its line, metres."""
 WALLS = 2
-"""Lines with the most returns that are judged: the sides of a corridor."""
-_APART, _TURN, _CELL, _EVERY = 0.3, np.radians(0.25), 0.02, 7  # m between lines; rad, m of the votes; returns, one in
+"""Number of lines, those with the most points: the two sides of a corridor."""
+_LINE_DISTANCE, _THETA_STEP, _RHO_STEP, _SUBSAMPLE = (
+    0.3,
+    np.radians(0.25),
+    0.02,
+    7,
+)  # m between lines; rad, m of the votes; returns, one in
 WINDOW = 1.5
-"""Metres of path of a local model, for so few sonars."""
+"""Length of the trajectory in one local map, metres; one scan has too few echoes."""
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One set of poses."""
+class PoseMeasures:
+    """Measures of one set of poses."""
 
     thickness: Float[np.ndarray, " walls"]
-    """RMS distance of the returns from the line through them, metres."""
-    returns: tuple[int, ...]
-    """How many there are near each."""
+    """RMS distance of the laser points from their line, metres."""
+    points: tuple[int, ...]
+    """Number of laser points near each line."""
     distance: float
-    """RMS distance of the sonar map's walls from the laser's, metres."""
+    """RMS distance of the walls of the sonar map from those of the laser, metres."""
     angle: float
-    """The same in direction, radians."""
+    """RMS difference of their directions, radians."""
     recall: float
-    """Share of the laser's walls (by length) that the map has."""
+    """Share of the length of the laser's walls that the map has."""
 
 
-def judged(ring: Ring, log: Log, laser: LaserRecording, poses: Float[np.ndarray, "scans 3"]) -> Judged:
-    """Laser and sonar at these poses of the log's scans."""
+def measures_at(ring: Ring, log: Log, laser: LaserRecording, poses: Float[np.ndarray, "scans 3"]) -> PoseMeasures:
+    """Measures of laser and sonar at these poses of the scans."""
     row = np.clip(np.searchsorted(log.stamp, laser.stamp), 0, len(log) - 1)
-    known = (log.stamp[row] == laser.stamp) & np.isfinite(poses[row]).all(axis=1)
-    drawn = replace(laser, stamp=laser.stamp[known], pose=poses[row][known], ranges=laser.ranges[known])
-    walls = reference_map(drawn)
-    thick = thicknesses(laser_points(drawn))
+    with_pose = (log.stamp[row] == laser.stamp) & np.isfinite(poses[row]).all(axis=1)
+    laser_at_poses = replace(
+        laser, stamp=laser.stamp[with_pose], pose=poses[row][with_pose], ranges=laser.ranges[with_pose]
+    )
+    walls = reference_map(laser_at_poses)
+    thickness = thicknesses(laser_points(laser_at_poses))
     at = replace(log, pose=poses)
-    found = evaluate(np.array(build_map(ring, at, window=WINDOW).segments), walls)
-    return Judged(
-        thickness=np.array([rms for rms, _ in thick]),
-        returns=tuple(count for _, count in thick),
-        distance=float(np.sqrt(np.mean(found.distance**2))),
-        angle=float(np.sqrt(np.mean(found.angle**2))),
-        recall=found.recall_length,
+    result = evaluate(np.array(build_map(ring, at, window=WINDOW).segments), walls)
+    return PoseMeasures(
+        thickness=np.array([rms for rms, _ in thickness]),
+        points=tuple(count for _, count in thickness),
+        distance=float(np.sqrt(np.mean(result.distance**2))),
+        angle=float(np.sqrt(np.mean(result.angle**2))),
+        recall=result.recall_length,
     )
 
 
 def thicknesses(points: Float[np.ndarray, "points 2"]) -> list[tuple[float, int]]:
-    """RMS distance of returns from the lines with the most of them, metres, and how many are near each."""
-    centre, out = points.mean(axis=0), []
+    """RMS distance (metres) and number of the points near each of the lines with the most points."""
+    centre, thickness_and_count = points.mean(axis=0), []
     points = points - centre
-    theta = np.arange(0.0, np.pi, _TURN)
+    theta = np.arange(0.0, np.pi, _THETA_STEP)
     for _ in range(WALLS):
-        some = points[::_EVERY]
-        cells = np.round(some @ np.stack([np.cos(theta), np.sin(theta)]) / _CELL).astype(np.int64)
+        sample = points[::_SUBSAMPLE]
+        cells = np.round(sample @ np.stack([np.cos(theta), np.sin(theta)]) / _RHO_STEP).astype(np.int64)
         cells -= cells.min()
         votes = np.bincount((cells + np.arange(len(theta)) * (cells.max() + 1)).ravel())
         best, cell = divmod(int(votes.argmax()), int(cells.max()) + 1)
-        near = some[cells[:, best] == cell]
-        for within in (2 * NEAR, NEAR, NEAR, NEAR):
+        near = sample[cells[:, best] == cell]
+        for gate in (2 * NEAR, NEAR, NEAR, NEAR):
             middle = near.mean(axis=0)
             normal = np.linalg.svd(near - middle, full_matrices=False)[2][1]
-            off = (points - middle) @ normal
-            near = points[np.abs(off) < within]
-        out.append((float(np.sqrt(np.mean(off[np.abs(off) < NEAR] ** 2))), len(near)))
-        points = points[np.abs(off) > _APART]
-    return sorted(out, key=lambda one: -one[1])
+            distance = (points - middle) @ normal
+            near = points[np.abs(distance) < gate]
+        thickness_and_count.append((float(np.sqrt(np.mean(distance[np.abs(distance) < NEAR] ** 2))), len(near)))
+        points = points[np.abs(distance) > _LINE_DISTANCE]
+    return sorted(thickness_and_count, key=lambda row_values: -row_values[1])
 
 
 def main() -> None:
-    """Measure, print."""
+    """Measure and print."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("folder", type=Path, help="a recording as corridor8 is")
-    options.add_argument("--ring", default="corridor8", help="its ring; corridor8 if left out")
+    options.add_argument("folder", type=Path, help="a recording in the format of corridor8")
+    options.add_argument("--ring", default="corridor8", help="its ring (default: corridor8)")
     options = options.parse_args()
     ring, log = load_ring(options.ring), read_scans(options.folder, from_="corridor8")
     laser = read_corridor8_laser(options.folder)
     stderr = Console(stderr=True)
     stderr.print(f"{len(log)} scans; slam takes minutes", highlight=False)
-    found = slam(ring, log, window=WINDOW)
-    caption = f"thickness: RMS of the laser's returns within {NEAR:g} m about the {WALLS} lines with the most of them; "
-    caption += "map: RMS distance and direction from the laser's walls, and share of these that it has"
+    result = slam(ring, log, window=WINDOW)
+    caption = f"thickness: RMS of the laser points within {NEAR:g} m of the {WALLS} lines with the most points; "
+    caption += "map: RMS distance and direction from the walls of the laser; recall: share of these that the map has"
     shown = Table(caption=caption)
-    for heading in ("poses", "thickness mm", "returns", "map mm", "deg", "recall"):
+    for heading in ("poses", "thickness (mm)", "points", "map (mm)", "(deg)", "recall"):
         shown.add_column(heading, justify="left" if heading == "poses" else "right")
-    for name, poses in (("odometry", np.asarray(log.pose)), ("slam", found.poses)):
-        one = judged(ring, log, laser, poses)
+    for name, poses in (("odometry", np.asarray(log.pose)), ("slam", result.poses)):
+        row_values = measures_at(ring, log, laser, poses)
         shown.add_row(
             name,
-            " ".join(f"{1e3 * value:.1f}" for value in one.thickness),
-            " ".join(map(str, one.returns)),
-            f"{1e3 * one.distance:.1f}",
-            f"{np.degrees(one.angle):.2f}",
-            f"{one.recall:.2f}",
+            " ".join(f"{1e3 * value:.1f}" for value in row_values.thickness),
+            " ".join(map(str, row_values.points)),
+            f"{1e3 * row_values.distance:.1f}",
+            f"{np.degrees(row_values.angle):.2f}",
+            f"{row_values.recall:.2f}",
         )
     Console().print(shown)
 

@@ -1,7 +1,7 @@
-"""Places for the SLAM benchmark: floor plans like those of buildings, ways through them, and what a ring hears there.
+"""Scenes of the SLAM benchmark: floor plans like those of buildings, trajectories through them, simulated echoes.
 
-A floor plan is a polygon of free space (shapely): corridors, rooms behind doors, recesses, less pillars and cupboards.
-Its border is the walls. Corridors are 1.5 to 2.2 m wide, so that a ring of 2 m range reaches the walls.
+A floor plan is a polygon of free space (shapely): corridors, rooms behind doors and recesses, minus pillars and
+cupboards. Its border is the walls. Corridors are 1.5 to 2.2 m wide, so that a ring with 2 m range reaches the walls.
 """
 
 from collections.abc import Sequence
@@ -25,73 +25,73 @@ from jaxsonar.simulation.traced_echoes import EchoKind
 from jaxsonar.simulation.wheel_odometry import simulate_odometry
 
 SIGMA = 0.001
-"""Metres; noise of the ranges."""
+"""Range noise, metres."""
 DISTANCE, TURN = 0.02, float(np.radians(1.0))
-"""Odometry: m and rad (standard deviations) after one metre, as ``simulate_odometry`` takes them."""
-STEP = 0.1, 0.2
-"""Metres between scans."""
-TURNING = float(np.radians(15.0))
-"""Radians between scans where the robot turns on the spot."""
-BEND = 0.8
-"""Metres; radius of its curves."""
+"""Odometry noise after one metre (standard deviations), metres and radians; arguments of ``simulate_odometry``."""
+SCAN_DISTANCE = 0.1, 0.2
+"""Minimum and maximum distance between scans, metres."""
+SCAN_ROTATION = float(np.radians(15.0))
+"""Rotation between scans while the robot turns in place, radians."""
+CURVE_RADIUS = 0.8
+"""Radius of curves, metres."""
 CLEARANCE = 0.35
-"""Metres from the robot's centre to anything: its ring has a radius of 0.28 m."""
-DOOR, THICK = (1.0, 1.2), 0.15
-"""Metres: widths of doors, and how thick the walls between corridors and rooms are."""
+"""Minimum distance from the centre of the robot to walls, metres; the ring has a radius of 0.28 m."""
+DOOR_WIDTH, WALL_THICKNESS = (1.0, 1.2), 0.15
+"""Widths of doors, and thickness of the walls between corridors and rooms, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A place, a way through it, and what was heard."""
+    """A floor plan, a trajectory through it, and the simulated echoes."""
 
     name: str
     room: Room
     poses: Float[np.ndarray, "scans 3"]
-    """The truth, world_from_robot: x, y (m), theta (rad)."""
+    """True poses world_from_robot: x, y (m), theta (rad)."""
     ring: Ring = field(default_factory=Ring.circular)
     sigma: float = SIGMA
     """Range noise, metres."""
     clutter: float = 0.0
-    """False echoes for each true one."""
+    """False echoes per true echo."""
     dropout: float = 0.0
-    """Share of the echoes that are lost."""
+    """Probability that an echo is lost."""
     seed: int = 0
-    """Of the noise."""
-    wheels: bool = True
+    """Seed of the noise."""
+    has_odometry: bool = True
     """Whether there is odometry."""
 
     @cached_property
-    def heard(self) -> Simulation:
-        """The echoes, and what each came from."""
+    def simulation(self) -> Simulation:
+        """The echoes and the reflector of each."""
         errors = {"sigma": self.sigma, "clutter": self.clutter, "dropout": self.dropout, "seed": self.seed}
         return simulate(self.ring, self.room, self.poses, **errors)
 
     @property
-    def way(self) -> float:
-        """Length of the path, metres."""
+    def distance_traveled(self) -> float:
+        """Length of the trajectory, metres."""
         return float(np.linalg.norm(np.diff(self.poses[:, :2], axis=0), axis=-1).sum())
 
     def odometry(self, seed: int = 0) -> Float[np.ndarray, "scans 3"]:
-        """The poses as the wheels tell them."""
+        """Poses by odometry."""
         return simulate_odometry(self.poses, distance=DISTANCE, turn=TURN, seed=seed)
 
     def log(self, seed: int = 0) -> Log:
-        """What the robot has: echoes, and odometry of this seed."""
-        told = self.odometry(seed)
-        return self.heard.as_log(self.ring, told if self.wheels else np.full_like(told, np.nan))
+        """Log of the echoes with odometry of this seed."""
+        odometry = self.odometry(seed)
+        return self.simulation.as_log(self.ring, odometry if self.has_odometry else np.full_like(odometry, np.nan))
 
 
 # Scenes
 
 
 def one_scan(seed: int = 0, **errors: Any) -> Scene:
-    """(a) One scan in a random room that is known, with at least two walls heard that are not parallel."""
+    """(a) One scan in a random known room, with echoes of at least two walls that are not parallel."""
     rng = np.random.default_rng([seed, 1])
     while True:
         room = random_room(rng)
         scene = Scene(f"one scan {seed}", room, random_pose(rng, room, clearance=0.45)[None], seed=seed, **errors)
-        heard = scene.heard
-        wall, echoes = np.unique(heard.reflector[heard.kind == EchoKind.PLANE], return_counts=True)
+        simulation = scene.simulation
+        wall, echoes = np.unique(simulation.reflector[simulation.kind == EchoKind.PLANE], return_counts=True)
         along = (room.walls[:, 1] - room.walls[:, 0])[wall[echoes >= 6]]
         direction = along / np.linalg.norm(along, axis=-1, keepdims=True)
         if np.abs(direction[:, :1] * direction[:, 1] - direction[:, 1:] * direction[:, 0]).max(initial=0) > 0.3:
@@ -100,39 +100,43 @@ def one_scan(seed: int = 0, **errors: Any) -> Scene:
 
 def office(seed: int = 0, **errors: Any) -> Scene:
     """(b) The embedded office and its 17 poses."""
-    place = load_office()
-    return Scene("office", place.room, place.poses, ring=place.ring, seed=seed, **errors)
+    position = load_office()
+    return Scene("office", position.room, position.poses, ring=position.ring, seed=seed, **errors)
 
 
 def echoes_alone(seed: int = 0, **errors: Any) -> Scene:
-    """(b) The office again, at a noise of 5 mm, without any odometry."""
-    return replace(office(seed, **({"sigma": 0.005} | errors)), name=f"office, echoes alone {seed}", wheels=False)
+    """(b) The office without odometry, at a noise of 5 mm."""
+    return replace(office(seed, **({"sigma": 0.005} | errors)), name=f"office, echoes alone {seed}", has_odometry=False)
 
 
 def loop(seed: int = 0, **errors: Any) -> Scene:
-    """(c) Once around a building and some metres more; the corridor is a ring of 30 to 100 m, rooms are entered."""
+    """(c) One lap around a building and 4 m more; the ring corridor is 30 to 100 m long, two rooms are entered."""
     rng = np.random.default_rng([seed, 3])
     plan = _ring_plan(rng, length=rng.uniform(30.0, 100.0))
-    way = _around(plan, rng, laps=1, visited=2, beyond=4.0)
-    return _scene(f"loop {seed}", plan.floor, [way], rng, seed, errors)
+    route = _around(plan, rng, laps=1, visited=2, beyond=4.0)
+    return _scene(f"loop {seed}", plan.floor, [route], rng, seed, errors)
 
 
 def twins(seed: int = 0, **errors: Any) -> Scene:
-    """(d) Two rooms that look alike on one corridor: into both, back into the first, and back to the start."""
+    """(d) Two rooms that look alike on one corridor: enter both, the first again, and return to the start."""
     rng = np.random.default_rng([seed, 4])
     length, width, deep, door, wide = 14.0, rng.uniform(1.6, 2.0), 3.0, 1.1, 3.4
     side = width / 2
     rooms, at = [], (4.0, 10.0)
-    cupboard = shapely.box(-wide / 2, side + THICK + deep - 0.5, -wide / 2 + 0.9, side + THICK + deep)
-    box = shapely.box(wide / 2 - 0.4, side + THICK, wide / 2, side + THICK + 0.6)
+    cupboard = shapely.box(-wide / 2, side + WALL_THICKNESS + deep - 0.5, -wide / 2 + 0.9, side + WALL_THICKNESS + deep)
+    box = shapely.box(wide / 2 - 0.4, side + WALL_THICKNESS, wide / 2, side + WALL_THICKNESS + 0.6)
     for x in at:
-        inside = shapely.box(-wide / 2, side + THICK, wide / 2, side + THICK + deep)
-        free = inside.difference(cupboard).difference(box).union(shapely.box(-door / 2, 0, door / 2, side + 2 * THICK))
+        inside = shapely.box(-wide / 2, side + WALL_THICKNESS, wide / 2, side + WALL_THICKNESS + deep)
+        free = (
+            inside.difference(cupboard)
+            .difference(box)
+            .union(shapely.box(-door / 2, 0, door / 2, side + 2 * WALL_THICKNESS))
+        )
         rooms.append(translate(free, x, 0))
-    # Something else opposite: the corridor is not the same there.
+    # Different recesses opposite, so that the corridor itself is not symmetric.
     niches = [shapely.box(5.2, -side - 0.3, 6.6, 0), shapely.box(11.5, -side - 0.12, 12.5, 0)]
-    floor = _joined([shapely.box(0, -side, length, side), *rooms, *niches])
-    inside = side + THICK + deep / 2
+    floor = _union([shapely.box(0, -side, length, side), *rooms, *niches])
+    inside = side + WALL_THICKNESS + deep / 2
     a, b = ([np.array([x, 0.0]), np.array([x, inside])] for x in at)
     begin = np.array([1.3, 0.0])
     legs = [[begin, *a], [*a[::-1], *b], [*b[::-1], *a], [*a[::-1], begin]]
@@ -140,7 +144,7 @@ def twins(seed: int = 0, **errors: Any) -> Scene:
 
 
 def corridor(seed: int = 0, *, length: float = 30.0, **errors: Any) -> Scene:
-    """(e) A straight corridor with nothing in it, to its end and back."""
+    """(e) An empty straight corridor, to its end and back."""
     rng = np.random.default_rng([seed, 5])
     half = rng.uniform(0.75, 1.0)
     ends = np.array([[1.2, 0.0], [length - 1.2, 0.0]])
@@ -148,13 +152,13 @@ def corridor(seed: int = 0, *, length: float = 30.0, **errors: Any) -> Scene:
 
 
 def long_run(seed: int = 0, *, scans: int = 10_000, length: float = 60.0, **errors: Any) -> Scene:
-    """(f) Lap after lap around a building, into a room now and then, until there are so many scans."""
+    """(f) Laps around a building, sometimes into a room, up to this number of scans."""
     rng = np.random.default_rng([seed, 6])
     plan = _ring_plan(rng, length=length)
-    legs, way = [], 0.0
-    while way < scans * STEP[1]:
+    legs, route = [], 0.0
+    while route < scans * SCAN_DISTANCE[1]:
         legs.append(_around(plan, rng, laps=1, visited=int(rng.integers(3)), beyond=0.0))
-        way += LineString(legs[-1]).length
+        route += LineString(legs[-1]).length
     scene = _scene(f"long run {seed}", plan.floor, legs, rng, seed, errors)
     return Scene(scene.name, scene.room, scene.poses[:scans], seed=seed, **errors)
 
@@ -164,11 +168,13 @@ def long_run(seed: int = 0, *, scans: int = 10_000, length: float = 60.0, **erro
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """A building whose corridor is a ring."""
+    """A building with a ring corridor."""
 
     floor: Polygon
-    centre: np.ndarray  # (corners, 2) of the corridor's middle, in order
-    rooms: tuple[tuple[int, float, float], ...]  # side of the ring, metres along it, metres to its left of the middle
+    centre: np.ndarray  # (corners, 2) of the centre line of the corridor, in order
+    rooms: tuple[
+        tuple[int, float, float], ...
+    ]  # side of the ring, metres along it, metres to the left of the centre line
 
 
 def _ring_plan(rng: np.random.Generator, *, length: float) -> _Plan:
@@ -176,7 +182,7 @@ def _ring_plan(rng: np.random.Generator, *, length: float) -> _Plan:
     short = rng.uniform(6.5, max(7.0, min(length / 4, 18.0)))
     size = np.array([length / 2 - short, short])
     corners = np.array([[0, 0], [size[0], 0], size, [0, size[1]]], dtype=float)
-    if size.min() > 11.0 and rng.random() < 0.6:  # a notch leaves the length as it is
+    if size.min() > 11.0 and rng.random() < 0.6:  # a notch does not change the length
         cut = rng.uniform(5.0, size - 5.5)
         corners = np.array([[0, 0], [size[0], 0], [size[0], size[1] - cut[1]], size - cut, [size[0] - cut[0], size[1]],
                             [0, size[1]]])  # fmt: skip
@@ -185,21 +191,25 @@ def _ring_plan(rng: np.random.Generator, *, length: float) -> _Plan:
     rooms = []
     for k, (start, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
         for left in (1.0, -1.0):
-            floor, found = _furnished(rng, floor, start, end, side, left)
+            floor, found = _furnish(rng, floor, start, end, side, left)
             rooms += [(k, along, across) for along, across in found]
     return _Plan(floor, corners, tuple(rooms))
 
 
-def _furnished(
+def _furnish(
     rng: np.random.Generator, floor: Polygon, start: np.ndarray, end: np.ndarray, side: float, left: float
 ) -> tuple[Polygon, list[tuple[float, float]]]:
-    """One wall of a corridor with what a building has there; the floor, and (along, across) of rooms to enter."""
+    """Add doors, bays, pilasters and rooms along one wall of a corridor.
+
+    Returns:
+        The floor, and (along, across) of the centres of rooms, metres.
+    """
     length, rooms = float(np.linalg.norm(end - start)), []
     tangent = (end - start) / length
     corridor = floor
 
     def box(low: float, high: float, near: float, far: float) -> Polygon:
-        """A rectangle by metres along the corridor and away from its middle."""
+        """A rectangle, in metres along the corridor and away from its centre line."""
         normal = left * np.array([-tangent[1], tangent[0]])
         return Polygon(
             [start + a * tangent + b * normal for a, b in ((low, near), (high, near), (high, far), (low, far))]
@@ -209,7 +219,7 @@ def _furnished(
     while at < length - side - 1.6:
         kind = rng.choice(["door", "bay", "pilaster", "room"], p=[0.35, 0.15, 0.15, 0.35])
         wide = {"door": rng.uniform(0.85, 1.05), "bay": rng.uniform(0.8, 2.0), "pilaster": rng.uniform(0.2, 0.4),
-                "room": rng.uniform(*DOOR)}[kind]  # fmt: skip
+                "room": rng.uniform(*DOOR_WIDTH)}[kind]  # fmt: skip
         if at + wide > length - side - 0.4:
             break
         if kind == "pilaster":
@@ -217,57 +227,62 @@ def _furnished(
         elif kind == "room":
             size = rng.uniform(2.4, 4.2, 2)
             low = at - rng.uniform(0.2, size[0] - wide - 0.2)
-            inside = box(low, low + size[0], side + THICK, side + THICK + size[1])
-            free = inside.buffer(THICK - 0.01, join_style="mitre").disjoint(floor)
+            inside = box(low, low + size[0], side + WALL_THICKNESS, side + WALL_THICKNESS + size[1])
+            free = inside.buffer(WALL_THICKNESS - 0.01, join_style="mitre").disjoint(floor)
             deep = rng.uniform(0.4, 0.6)
-            cupboard = box(low, low + rng.uniform(0.6, 1.2), side + THICK + size[1] - deep, side + THICK + size[1])
+            cupboard = box(
+                low,
+                low + rng.uniform(0.6, 1.2),
+                side + WALL_THICKNESS + size[1] - deep,
+                side + WALL_THICKNESS + size[1],
+            )
             if free:
-                door = box(at, at + wide, side - 0.01, side + THICK + 0.01)
-                floor = _joined([floor, inside.difference(cupboard), door])
-                rooms.append((at + wide / 2, left * (side + THICK + size[1] / 2 - 0.2)))
+                door = box(at, at + wide, side - 0.01, side + WALL_THICKNESS + 0.01)
+                floor = _union([floor, inside.difference(cupboard), door])
+                rooms.append((at + wide / 2, left * (side + WALL_THICKNESS + size[1] / 2 - 0.2)))
         else:
             deep = rng.uniform(0.06, 0.2) if kind == "door" else rng.uniform(0.3, 0.6)
             recess = box(at, at + wide, side - 0.01, side + deep)
-            apart = recess.buffer(THICK - 0.01, join_style="mitre").difference(corridor)
+            apart = recess.buffer(WALL_THICKNESS - 0.01, join_style="mitre").difference(corridor)
             if apart.intersection(floor.difference(corridor)).area < 1e-6:
-                floor = _joined([floor, recess])
+                floor = _union([floor, recess])
         at += wide + rng.uniform(0.8, 3.5)
     return floor, rooms
 
 
-def _joined(parts: Sequence[BaseGeometry]) -> Polygon:
+def _union(parts: Sequence[BaseGeometry]) -> Polygon:
     return _polygon(unary_union(parts))
 
 
 def _polygon(one: BaseGeometry) -> Polygon:
-    assert isinstance(one, Polygon), "a floor in pieces"
+    assert isinstance(one, Polygon), "the floor is not connected"
     return one
 
 
 def _room_of(floor: Polygon) -> Room:
-    """The border of a floor as walls."""
+    """The room whose walls are the border of a floor."""
     whole = _polygon(shapely.set_precision(floor, 1e-4).simplify(1e-4))
     rings = [np.array(ring.coords)[:-1] for ring in (whole.exterior, *whole.interiors)]
-    rings = [_without_straight(ring) for ring in rings]
+    rings = [_without_collinear(ring) for ring in rings]
     return Room(np.concatenate([np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings]))
 
 
-def _without_straight(ring: np.ndarray) -> np.ndarray:
-    """A closed ring of corners without those where it goes straight on."""
+def _without_collinear(ring: np.ndarray) -> np.ndarray:
+    """A closed polygon without collinear corners."""
     before, after = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
     return ring[np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]) > 1e-6]
 
 
-# Ways
+# Trajectories
 
 
 def _around(plan: _Plan, rng: np.random.Generator, *, laps: int, visited: int, beyond: float) -> np.ndarray:
-    """Corners of a way around the ring, from the middle of its first side; into some rooms, out of them again."""
+    """Corners of a route around the ring from the middle of its first side, with detours into some rooms."""
     count = len(plan.centre)
     begin = (plan.centre[0] + plan.centre[1]) / 2
     tangent = (plan.centre[1] - plan.centre[0]) / np.linalg.norm(plan.centre[1] - plan.centre[0])
     chosen = rng.permutation(len(plan.rooms))[:visited]
-    way = [begin]
+    route = [begin]
     first = float(np.linalg.norm(begin - plan.centre[0]))
     for k in range(laps * count + 1):
         side, last = k % count, k == laps * count
@@ -279,28 +294,32 @@ def _around(plan: _Plan, rng: np.random.Generator, *, laps: int, visited: int, b
                 continue
             door = start + at * along
             inside = door + across * np.array([-along[1], along[0]])
-            way += [door, inside, door]
+            route += [door, inside, door]
         if not last:
-            way.append(end)
-    return np.array([*way, begin + beyond * tangent])
+            route.append(end)
+    return np.array([*route, begin + beyond * tangent])
 
 
 def _scene(
     name: str, floor: Polygon, legs: Sequence[np.ndarray], rng: np.random.Generator, seed: int, errors: dict[str, Any]
 ) -> Scene:
-    """A floor plan and corners of ways, turned and shifted at random, with poses on the way."""
+    """A scene from a floor plan and the corners of routes, in a random frame."""
     turn, shift = float(rng.uniform(-np.pi, np.pi)), rng.uniform(-2.0, 2.0, 2)
-    poses = driven(np.concatenate(legs), rng)
+    poses = poses_along(np.concatenate(legs), rng)
     c, s = np.cos(turn), np.sin(turn)
-    place = poses[:, :2] @ np.array([[c, s], [-s, c]]) + shift
+    position = poses[:, :2] @ np.array([[c, s], [-s, c]]) + shift
     moved = translate(rotate(floor, turn, origin=(0, 0), use_radians=True), *shift)
     return Scene(
-        name, _room_of(_polygon(moved)), np.column_stack([place, wrap_angle(poses[:, 2] + turn)]), seed=seed, **errors
+        name,
+        _room_of(_polygon(moved)),
+        np.column_stack([position, wrap_angle(poses[:, 2] + turn)]),
+        seed=seed,
+        **errors,
     )
 
 
-def driven(corners: Float[np.ndarray, "corners 2"], rng: np.random.Generator) -> Float[np.ndarray, "scans 3"]:
-    """Poses along a way with rounded corners, some centimetres beside it; to go back the robot turns on the spot."""
+def poses_along(corners: Float[np.ndarray, "corners 2"], rng: np.random.Generator) -> Float[np.ndarray, "scans 3"]:
+    """Poses along a route with rounded corners and lateral deviations of centimetres; reversals are turns in place."""
     corners = corners[np.append(True, np.linalg.norm(np.diff(corners, axis=0), axis=-1) > 1e-9)]
     heading = np.arctan2(*np.diff(corners, axis=0).T[::-1])
     back = np.flatnonzero(np.abs(wrap_angle(np.diff(heading))) > np.radians(150)) + 1
@@ -310,10 +329,10 @@ def driven(corners: Float[np.ndarray, "corners 2"], rng: np.random.Generator) ->
         if poses:
             turned = float(wrap_angle(leg[0, 2] - poses[-1][-1, 2]))
             turned = abs(turned) if rng.random() < 0.5 and abs(turned) > 3 else turned
-            steps = int(np.ceil(abs(turned) / TURNING))
-            spot = np.repeat(poses[-1][-1:], steps, axis=0)
-            spot[:, 2] += turned * np.arange(1, steps + 1) / steps
-            poses.append(spot)
+            steps = int(np.ceil(abs(turned) / SCAN_ROTATION))
+            rotation = np.repeat(poses[-1][-1:], steps, axis=0)
+            rotation[:, 2] += turned * np.arange(1, steps + 1) / steps
+            poses.append(rotation)
             leg = leg[1:]
         poses.append(leg)
     whole = np.concatenate(poses)
@@ -321,8 +340,8 @@ def driven(corners: Float[np.ndarray, "corners 2"], rng: np.random.Generator) ->
 
 
 def _leg(corners: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Poses along a way without turns on the spot."""
-    line = LineString(_rounded(corners, BEND))
+    """Poses along a route without reversals."""
+    line = LineString(_rounded(corners, CURVE_RADIUS))
     at = np.arange(0.0, line.length, 0.02)
     dense = shapely.get_coordinates(shapely.line_interpolate_point(line, np.append(at, line.length)))
     along = np.gradient(dense, axis=0)
@@ -332,17 +351,19 @@ def _leg(corners: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     sway = 0.025 * np.sin(s[:, None] * waves[0] + waves[1]).sum(axis=1) * np.clip(np.minimum(s, s[-1] - s) / 1.0, 0, 1)
     dense = dense + sway[:, None] * np.stack([-along[:, 1], along[:, 0]], axis=-1)
     swayed = LineString(dense)
-    steps = rng.uniform(*STEP, int(swayed.length / STEP[0]) + 1)
+    steps = rng.uniform(*SCAN_DISTANCE, int(swayed.length / SCAN_DISTANCE[0]) + 1)
     marks = np.append(0.0, np.cumsum(steps))
     marks = marks[: np.searchsorted(marks, swayed.length) + 1]
-    marks *= swayed.length / marks[-1]  # a little shorter, so that the last one ends the way
+    marks *= swayed.length / marks[-1]  # slightly shorter steps, so that the last one ends at the end of the route
     ahead, behind = np.minimum(marks + 0.03, swayed.length), np.maximum(marks - 0.03, 0.0)
-    place, to, of = (shapely.get_coordinates(shapely.line_interpolate_point(swayed, m)) for m in (marks, ahead, behind))
-    return np.column_stack([place, np.arctan2(*(to - of).T[::-1])])
+    position, ahead_point, behind_point = (
+        shapely.get_coordinates(shapely.line_interpolate_point(swayed, m)) for m in (marks, ahead, behind)
+    )
+    return np.column_stack([position, np.arctan2(*(ahead_point - behind_point).T[::-1])])
 
 
 def _rounded(corners: np.ndarray, radius: float) -> np.ndarray:
-    """A way of straight lines and arcs."""
+    """A route of straight lines and arcs."""
     if len(corners) < 3:
         return corners
     steps = np.diff(corners, axis=0)
@@ -364,6 +385,6 @@ def _rounded(corners: np.ndarray, radius: float) -> np.ndarray:
 
 
 def clearance(scene: Scene) -> float:
-    """Least distance of the robot's way from any wall, metres; 0 where it crosses one."""
-    way = LineString(scene.poses[:, :2]) if len(scene.poses) > 1 else shapely.Point(scene.poses[0, :2])
-    return float(shapely.MultiLineString(list(scene.room.walls)).distance(way))
+    """Minimum distance of the trajectory from the walls, metres; 0 if it crosses one."""
+    route = LineString(scene.poses[:, :2]) if len(scene.poses) > 1 else shapely.Point(scene.poses[0, :2])
+    return float(shapely.MultiLineString(list(scene.room.walls)).distance(route))

@@ -1,4 +1,4 @@
-"""summary."""
+"""Results of SLAM runs compared with the truth: measures over the runs, and the table."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -8,96 +8,106 @@ import numpy as np
 from rich.table import Table
 
 LOST = 1.0
-"""Metres; a run that is worse than this found itself in another place."""
+"""A run with a larger error (ATE, metres) counts as lost."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One run against the truth: metres, radians, milliseconds."""
+    """One run compared with the truth: metres, radians, milliseconds."""
 
     scenario: str
-    way: str
+    variant: str
+    """Name in ``VARIANTS``, or ``localized``."""
     failed: str = ""
-    """Why there is no result."""
+    """Error message if there is no result."""
     scans: int = 0
     metres: float = np.nan
+    """Length of the trajectory."""
     odometry: float = np.nan
-    """Absolute trajectory errors (RMS, first poses in one place)."""
+    """Absolute trajectory error of the odometry (RMS), first poses aligned."""
     odometry_heading: float = np.nan
     odometry_aligned: float = np.nan
+    """Absolute trajectory error of the odometry after the best alignment."""
     placed: float = np.nan
-    """Share of the scans that got a pose."""
+    """Share of the scans with a pose."""
     ate: float = np.nan
+    """Absolute trajectory error (RMS), first poses aligned."""
     ate_heading: float = np.nan
     aligned: float = np.nan
-    """The same of the best alignment, as evo has it."""
+    """Absolute trajectory error after the best alignment, as in evo."""
     relative: float = np.nan
-    """Per metre of way."""
+    """Relative pose error per metre."""
     bound: float = np.nan
-    """Of the ATE, by Cramer and Rao."""
+    """Cramer-Rao bound of ``ate``."""
     bound_heading: float = np.nan
     nees: float = np.nan
+    """Normalized estimation error squared per degree of freedom; 1 is consistent."""
     made: int = 0
+    """Accepted loop closures."""
     wrong: int = 0
+    """Accepted loop closures that contradict the truth."""
     withdrawn: int = 0
+    """Withdrawn loop closures."""
     missed: float = np.nan
-    """Share of the walls that were heard that the map does not have."""
+    """Share of the walls with echoes that are missing in the map."""
     false: float = np.nan
-    """Share of the map's length that is no wall."""
+    """Share of the length of the map without a true wall."""
     walls: float = np.nan
-    """Distance of the map's walls from the true ones (RMS of those within 0.15 m, 10 deg)."""
+    """Distance of the walls of the map from the true ones (RMS of those within 0.15 m, 10 deg)."""
     walls_bound: float = np.nan
     p50: float = np.nan
+    """Median of the durations of the steps, milliseconds."""
     p99: float = np.nan
+    """99th percentile of the durations of the steps, milliseconds."""
     first: float = np.nan
-    """Milliseconds of the first step, compilation and all."""
+    """Milliseconds of the first step, with compilation."""
     growth: float = np.nan
-    """Median time of the last tenth of the steps over that of the second tenth."""
+    """Median duration of the last tenth of the steps divided by that of the second tenth."""
     seconds: float = np.nan
 
 
-def measures(some: Sequence[Outcome]) -> dict[str, Any]:
-    """Over the runs of one scenario and way; errors are root mean squares, counts sums."""
-    good = [one for one in some if not one.failed]
-    mean = lambda name: _mean([getattr(one, name) for one in good])  # noqa: E731
-    squared = lambda name, of: _rms([getattr(one, name) for one in of])  # noqa: E731
-    against = [one.ate / one.bound for one in good]
+def measures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Measures over the runs of one scenario and variant; errors are root mean squares, counts are sums."""
+    successful = [one for one in outcomes if not one.failed]
+    mean = lambda name: _mean([getattr(one, name) for one in successful])  # noqa: E731
+    rms_of = lambda name, of: _rms([getattr(one, name) for one in of])  # noqa: E731
+    ratios = [one.ate / one.bound for one in successful]
     return {
-        "scenario": some[0].scenario,
-        "way": some[0].way,
-        "runs": len(some),
-        "failed": len(some) - len(good),
-        "scans": sum(one.scans for one in some),
-        "metres": _mean([one.metres for one in some]),
-        "odometry_mm": 1e3 * squared("odometry", some),
-        "odometry_deg": float(np.degrees(squared("odometry_heading", some))),
+        "scenario": outcomes[0].scenario,
+        "way": outcomes[0].variant,
+        "runs": len(outcomes),
+        "failed": len(outcomes) - len(successful),
+        "scans": sum(one.scans for one in outcomes),
+        "metres": _mean([one.metres for one in outcomes]),
+        "odometry_mm": 1e3 * rms_of("odometry", outcomes),
+        "odometry_deg": float(np.degrees(rms_of("odometry_heading", outcomes))),
         "placed": mean("placed"),
-        "ate_mm": 1e3 * squared("ate", good),
-        "ate_deg": float(np.degrees(squared("ate_heading", good))),
-        "worst_mm": 1e3 * max((one.ate for one in good), default=np.nan),
-        "lost": sum(bool(one.ate > LOST) for one in good),
-        "tenth": sum(bool(one.ate <= one.odometry / 10) for one in good),
-        "aligned_mm": 1e3 * squared("aligned", good),
-        "tenth_aligned": sum(bool(one.aligned <= one.odometry_aligned / 10) for one in good),
-        "ratio": squared("odometry", good) / squared("ate", good) if good else np.nan,
-        "bound_mm": 1e3 * squared("bound", some),
-        "bound_deg": float(np.degrees(squared("bound_heading", some))),
-        "per_bound": _median(against),
+        "ate_mm": 1e3 * rms_of("ate", successful),
+        "ate_deg": float(np.degrees(rms_of("ate_heading", successful))),
+        "worst_mm": 1e3 * max((one.ate for one in successful), default=np.nan),
+        "lost": sum(bool(one.ate > LOST) for one in successful),
+        "tenth": sum(bool(one.ate <= one.odometry / 10) for one in successful),
+        "aligned_mm": 1e3 * rms_of("aligned", successful),
+        "tenth_aligned": sum(bool(one.aligned <= one.odometry_aligned / 10) for one in successful),
+        "ratio": rms_of("odometry", successful) / rms_of("ate", successful) if successful else np.nan,
+        "bound_mm": 1e3 * rms_of("bound", outcomes),
+        "bound_deg": float(np.degrees(rms_of("bound_heading", outcomes))),
+        "per_bound": _median(ratios),
         "nees": mean("nees"),
-        "nees_median": _median([one.nees for one in good]),
-        "made": sum(one.made for one in good),
-        "wrong": sum(one.wrong for one in good),
-        "withdrawn": sum(one.withdrawn for one in good),
-        "walls_mm": 1e3 * squared("walls", good),
-        "walls_bound_mm": 1e3 * squared("walls_bound", some),
+        "nees_median": _median([one.nees for one in successful]),
+        "made": sum(one.made for one in successful),
+        "wrong": sum(one.wrong for one in successful),
+        "withdrawn": sum(one.withdrawn for one in successful),
+        "walls_mm": 1e3 * rms_of("walls", successful),
+        "walls_bound_mm": 1e3 * rms_of("walls_bound", outcomes),
         "missed": mean("missed"),
         "false": mean("false"),
-        "p50": _median([one.p50 for one in good]),
-        "p99": max((one.p99 for one in good), default=np.nan),
+        "p50": _median([one.p50 for one in successful]),
+        "p99": max((one.p99 for one in successful), default=np.nan),
         "growth": mean("growth"),
-        "seconds": sum(one.seconds for one in good),
-        "why": next((one.failed for one in some if one.failed), ""),
-        "each": [asdict(one) for one in some],
+        "seconds": sum(one.seconds for one in successful),
+        "why": next((one.failed for one in outcomes if one.failed), ""),
+        "each": [asdict(one) for one in outcomes],
     }
 
 
@@ -149,27 +159,27 @@ COLUMNS = {
     "grows": ("growth", 2),
     "s": ("seconds", 0),
 }
-"""Heading, name in ``measures``, digits."""
+"""Heading: name in ``measures``, digits."""
 
 
-def table(told: dict[str, Any]) -> Table:
-    """What is printed, from what the JSON file holds."""
-    v, s = told["versions"], told["settings"]
+def table(content: dict[str, Any]) -> Table:
+    """Table to print, from the content of the JSON file."""
+    v, s = content["versions"], content["settings"]
     shown = Table(
         title=f"SLAM, paper's ring, sigma {1e3 * s['sigma']:g} mm, odometry {100 * s['distance']:g} % and "
         f"{np.degrees(s['turn']):g} deg after 1 m",
-        caption="ATE: RMS over scans and runs, first poses in one place; worst, lost: of the runs, lost beyond 1 m; "
-        "better: odometry over ATE; tenth: runs whose ATE is at most a tenth of odometry's; best: ATE of the best "
-        "alignment, and the tenth of that; CRB: what is possible; /CRB: median over the runs; NEES: over degrees of "
-        "freedom, mean and median of the runs, 1 is right; closures made, wrong of these, withdrawn; walls: distance "
-        "of the map's from the true ones; missed: of the walls that were heard; false: of the map's length; p99: "
-        "of the slowest run; grows: last tenth of the steps over the second. Echoes alone: sigma 5 mm, no odometry, "
-        "walls after the best alignment. "
+        caption="ATE: RMS over scans and runs, first poses aligned; worst: of the runs; lost: runs beyond 1 m; better: "
+        "odometry divided by ATE; tenth: runs whose ATE is at most a tenth of the odometry's; best: ATE after the best "
+        "alignment, and its tenth; CRB: Cramer-Rao bound; /CRB: median over the runs; NEES: per degree of freedom, "
+        "mean and median of the runs, 1 is consistent; closures made, wrong, withdrawn; walls: distance of the map's walls "
+        "from the true ones; missed: of the walls with echoes; false: of the map's length; p99: of the slowest run; "
+        "grows: last tenth of the steps divided by the second. Echoes alone: sigma 5 mm, no odometry, walls after the "
+        "best alignment. "
         f"jax {v['jax']} on {v['device']}, {v['commit'][:10]}",
     )
     for column in ["", *COLUMNS]:
         shown.add_column(column.rstrip(), justify="right" if column else "left", no_wrap=True)
-    for row in told["scenarios"]:
+    for row in content["scenarios"]:
         cells = []
         for heading, (name, digits) in COLUMNS.items():
             value = row[name]

@@ -1,7 +1,6 @@
-"""One scan, warm: from a Scan to its LocalModel, components included, by both methods and by plain NumPy + OpenCV.
+"""Latency: one Scan to its LocalModel after warm-up, by both methods and by plain NumPy + OpenCV.
 
-Quantiles are of the time on the clock, ratios of the processor's time: a call that hands work to other threads waits
-for them the longer, the more others use the machine.
+Quantiles are of wall-clock times, ratios of CPU times: a call that uses other threads waits longer under other load.
 """
 
 import itertools
@@ -21,39 +20,39 @@ TARGETS_MS = {"p50": 1.0, "p99": 3.0}
 def calls(
     runs: dict[str, Callable[[int], object]], count: int, scans: int
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Seconds of each call on the clock, and of the processor; every scan goes to all in turn, after a warm-up."""
+    """Wall-clock and CPU seconds of each call, after a warm-up; every scan is processed by all in turn."""
     for run, scan in itertools.product(runs.values(), range(scans)):
         run(scan)
-    taken, busy = ({name: np.zeros(count) for name in runs} for _ in range(2))
+    wall_seconds, cpu_seconds = ({name: np.zeros(count) for name in runs} for _ in range(2))
     for k in range(count):
         for name, run in runs.items():
-            start, began = time.perf_counter(), time.process_time()
+            start, cpu_start = time.perf_counter(), time.process_time()
             run(k % scans)
-            taken[name][k] = time.perf_counter() - start
-            busy[name][k] = time.process_time() - began
-    return taken, busy
+            wall_seconds[name][k] = time.perf_counter() - start
+            cpu_seconds[name][k] = time.process_time() - cpu_start
+    return wall_seconds, cpu_seconds
 
 
 def measure(options: Options) -> list[Metric]:
     """Metrics of this workload."""
-    some = batch(64, seed=options.seed)
-    ring, scans = some.ring, single_scans(some.ring, some.dense)
-    plain = NumpyPeer(ring, HoughSettings())
+    scans_batch = batch(64, seed=options.seed)
+    ring, scans = scans_batch.ring, single_scans(scans_batch.ring, scans_batch.dense)
+    numpy_peer = NumpyPeer(ring, HoughSettings())
     runs: dict[str, Callable[[int], object]] = {
         "hough": lambda k: local_model(ring, scans[k], method="hough"),
-        "numpy": lambda k: plain.lines(some.dense[k]),
+        "numpy": lambda k: numpy_peer.lines(scans_batch.dense[k]),
     }
     if options.size != "gate":
         runs["ml"] = lambda k: local_model(ring, scans[k], method="ml")
-    taken, busy = calls(runs, options.pick(gate=300, quick=400, full=4000), len(scans))
+    wall_seconds, cpu_seconds = calls(runs, options.pick(gate=300, quick=400, full=4000), len(scans))
     metrics = []
     for name in ("hough", "ml"):
-        if name in taken:
-            value = float(np.median(busy["numpy"] / busy[name]))
+        if name in wall_seconds:
+            value = float(np.median(cpu_seconds["numpy"] / cpu_seconds[name]))
             metrics.append(Metric(f"latency.{name}:numpy", value, RATIO, "higher", 2.0))
-    for name, seconds in taken.items():
+    for name, seconds in wall_seconds.items():
         for share, target in TARGETS_MS.items():
             value = 1e3 * float(np.quantile(seconds, int(share[1:]) / 100))
-            wanted = target if name != "numpy" else None
-            metrics.append(Metric(f"latency.{name}.{share}", value, "ms", target=wanted))
+            target_ms = target if name != "numpy" else None
+            metrics.append(Metric(f"latency.{name}.{share}", value, "ms", target=target_ms))
     return metrics

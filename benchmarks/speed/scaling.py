@@ -1,9 +1,9 @@
-"""How the time grows with the number of scans, echoes, sensors, cells and points of an arc: times, and exponents.
+"""Scaling of the time with the number of scans, echoes, sensors, cells and points of an arc: times and exponents.
 
-Everything else is held: 256 scans of the paper's ring with about 64 echoes. With the sensors grow the paths, seven
-each, and the echoes. The exponent is the slope of log time over log size by least squares, of the larger half of the
-sizes; with the scans it is that of the whole batch, otherwise that of one scan. Times are those of the
-processor, all threads together.
+Everything else is constant: 256 scans of the paper's ring with about 64 echoes. The paths, seven per sensor, and the
+echoes grow with the sensors. The exponent is the least-squares slope of log time over log size for the larger half of
+the sizes; for the number of scans it is that of the batch, otherwise that of one scan. Times are CPU times of all
+threads.
 """
 
 import time
@@ -24,21 +24,22 @@ SIZES: dict[str, dict[str, tuple[int, ...]]] = {
     "grid": {"gate": (), "quick": (50, 200), "full": (50, 100, 200, 400)},
     "points": {"gate": (), "quick": (30, 120), "full": (15, 30, 60, 120, 240)},
 }
-"""By what grows: scans, echoes a scan, sensors, cells along either side, points of the widest arc."""
+"""Sizes by quantity: scans, echoes per scan, sensors, cells along each side, points of the widest arc."""
 ML = {"scans": 1024, "echoes": 128}
-"""Where ml is measured too, in the full run, and up to which size: a program takes long to compile."""
+"""Maximum sizes for ml, in the full run; its programs take long to compile."""
 SCANS = 256
+"""Number of scans where it is constant."""
 
 
 def with_echoes(dense: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """The same scans with exactly so many echoes: some left out at random, or false ones added."""
+    """The same scans with exactly ``count`` echoes: removed at random, or with false echoes added."""
     flat = dense.reshape(len(dense), -1)
     order = np.argsort(np.isnan(flat) + 0.9 * rng.random(flat.shape), axis=1)[:, :count]
     taken = np.take_along_axis(flat, order, axis=1)
     taken = np.where(np.isnan(taken), rng.uniform(0.5, 1.9, taken.shape), taken)
-    made = np.full_like(flat, np.nan)
-    np.put_along_axis(made, order, taken.astype(np.float32), axis=1)
-    return made.reshape(dense.shape)
+    out = np.full_like(flat, np.nan)
+    np.put_along_axis(out, order, taken.astype(np.float32), axis=1)
+    return out.reshape(dense.shape)
 
 
 def cases(axis: str, sizes: tuple[int, ...], seed: int) -> Iterator[tuple[int, Ring, np.ndarray, HoughSettings]]:
@@ -60,7 +61,7 @@ def cases(axis: str, sizes: tuple[int, ...], seed: int) -> Iterator[tuple[int, R
 
 
 def exponent(points: list[tuple[int, float]]) -> float:
-    """Slope of log value over log size, of the larger half of the sizes, two at least."""
+    """Slope of log value over log size for the larger half of the sizes, at least two."""
     if len(points) < 2:
         return float("nan")
     x, y = np.log(points[-max(2, (len(points) + 1) // 2) :]).T
@@ -73,23 +74,23 @@ def measure(options: Options) -> list[Metric]:
     metrics, points = [], []
     for axis, of_size in SIZES.items():
         for method in ("hough", "ml"):
-            most = ML.get(axis, 0) if options.size == "full" else 0
-            sizes = tuple(size for size in of_size[options.size] if method == "hough" or size <= most)
+            max_ml_size = ML.get(axis, 0) if options.size == "full" else 0
+            sizes = tuple(size for size in of_size[options.size] if method == "hough" or size <= max_ml_size)
             if not sizes:
                 continue
-            entered = {
+            contestants = {
                 str(size): Contestant(
                     lambda r=ring, x=ranges, s=settings, m=method: extract_lines(r, x, method=m, settings=s),
                     len(ranges),
                 )
                 for size, ring, ranges, settings in cases(axis, sizes, options.seed)
             }
-            taken = timing.round_robin(entered, rounds=rounds, clock=time.process_time)
+            taken = timing.round_robin(contestants, rounds=rounds, clock=time.process_time)
             curve = [(size, float(taken[str(size)].min())) for size in sizes]
-            points += [Metric(f"growth.{axis}.{method}@{size}", 1e6 * each, "us/scan") for size, each in curve]
-            whole = [(size, each * (size if axis == "scans" else 1)) for size, each in curve]
+            points += [Metric(f"growth.{axis}.{method}@{size}", 1e6 * seconds, "us/scan") for size, seconds in curve]
+            totals = [(size, seconds * (size if axis == "scans" else 1)) for size, seconds in curve]
             if options.size != "gate":
-                metrics.append(Metric(f"growth.{axis}.{method}.exponent", exponent(whole), ""))
+                metrics.append(Metric(f"growth.{axis}.{method}.exponent", exponent(totals), ""))
             if axis == "scans" and method == "hough":
                 value = timing.ratio(taken["1024"], taken["256"])
                 metrics.append(Metric("growth.scan_of_1024:scan_of_256", value, RATIO, "lower", 2.0))

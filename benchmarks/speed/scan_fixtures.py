@@ -1,4 +1,4 @@
-"""What is measured on: simulated scans in random rooms, as many echoes as the rooms give, or about 64 a scan."""
+"""Scans for the measurements: simulated in random rooms, with the echoes that the rooms give or with about 64."""
 
 from typing import NamedTuple
 
@@ -8,22 +8,23 @@ from jaxtyping import Float
 from jaxsonar import Log, Ring, Scan, random_pose, random_room, simulate
 
 SLOTS = 2
-"""Echoes that an array has room for on each path."""
+"""Maximum number of echoes on each path."""
 ROOMS = 20
+"""Number of random rooms."""
 SIGMA = 0.003
-"""Metres; noise of the ranges."""
+"""Range noise, metres."""
 DENSE = 1 / 3
-"""Share of the scans with the most echoes, about 64 each."""
+"""Share of the scans in ``Batch.dense``: those with the most echoes, about 64 each."""
 
 
 class Batch(NamedTuple):
-    """One ring's scans, twice."""
+    """Two sets of scans of one ring."""
 
     ring: Ring
     mixed: Float[np.ndarray, "scans paths slots"]
-    """As they come, about 45 echoes a scan; half path lengths, metres, NaN = no echo."""
+    """All scans, about 45 echoes each; half path lengths, metres, NaN = no echo."""
     dense: Float[np.ndarray, "scans paths slots"]
-    """As many again of the third with the most echoes, about 64 a scan, each three times."""
+    """The third with the most echoes, about 64 each, repeated to the same number of scans."""
 
 
 def scans_of_random_rooms(ring: Ring, count: int, *, seed: int = 0) -> Float[np.ndarray, "scans paths slots"]:
@@ -44,18 +45,18 @@ def echoes_of(ranges: Float[np.ndarray, "scans paths slots"]) -> Float[np.ndarra
 
 
 def batch(count: int, *, seed: int = 0, ring: Ring | None = None) -> Batch:
-    """So many scans of the paper's ring, or of another one."""
+    """Scans of the paper's ring or of another one."""
     ring = Ring.circular() if ring is None else ring
     mixed = scans_of_random_rooms(ring, count, seed=seed)
-    most = np.argsort(-echoes_of(mixed), kind="stable")[: max(1, round(DENSE * count))]
-    return Batch(ring, mixed, mixed[np.resize(np.sort(most), count)])
+    dense_rows = np.argsort(-echoes_of(mixed), kind="stable")[: max(1, round(DENSE * count))]
+    return Batch(ring, mixed, mixed[np.resize(np.sort(dense_rows), count)])
 
 
 def single_scans(ring: Ring, ranges: Float[np.ndarray, "scans paths slots"]) -> list[Scan]:
-    """The same as scans of a log."""
+    """The same scans as ``Scan`` objects."""
     scan, path, slot = np.nonzero(np.isfinite(ranges))
     tx, rx = ring.paths[path].T
     count = len(ranges)
-    reach = ranges[scan, path, slot].astype(np.float64)
-    log = Log.from_echoes(scan, tx, rx, reach, stamp=0.1 * np.arange(count), pose=np.full((count, 3), np.nan))
+    range_ = ranges[scan, path, slot].astype(np.float64)
+    log = Log.from_echoes(scan, tx, rx, range_, stamp=0.1 * np.arange(count), pose=np.full((count, 3), np.nan))
     return list(log)

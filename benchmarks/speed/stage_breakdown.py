@@ -1,7 +1,7 @@
-"""Where the time of a batch and of one scan goes, stage by stage: the one file of the suite that knows internals.
+"""Time of each stage of a batch and of one scan. Only this file of the suite uses internals of the product.
 
-Each stage is timed alone, on what the stage before it made; what they take together differs from the whole by what
-happens between them. Times are those of the processor, all threads together.
+Each stage is timed alone, on the result of the previous stage; their sum differs from the whole by the work between
+them. Times are CPU times of all threads.
 """
 
 import time
@@ -39,37 +39,43 @@ def _batches(
 
 
 def hough_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = None) -> Stages:
-    """A batch by the paper's method; ``votes`` is the jitted step up to the threshold."""
+    """Stages of a batch by the paper's method; ``votes`` is the jitted step up to the threshold."""
     settings = settings or HoughSettings()
     tables = arc_tables(ring, settings)
     arcs = tables.arcs
     echoes = FlatEchoes.from_dense(ring, ranges)
-    steps = _batches(ring, echoes, settings)
-    voted = [kernels.vote(arcs, step.packed, settings=settings) for step in steps]
-    masks = [np.asarray(one.occupied) for one in voted]
-    labelled = [label_components(mask) for mask in masks]
+    batches = _batches(ring, echoes, settings)
+    votes = [kernels.vote(arcs, echo_batch.packed, settings=settings) for echo_batch in batches]
+    masks = [np.asarray(one.occupied) for one in votes]
+    labels = [label_components(mask) for mask in masks]
     return {
         WHOLE: lambda: extract_lines(ring, ranges, method="hough", settings=settings),
         "pack": lambda: _batches(ring, FlatEchoes.from_dense(ring, ranges), settings),
-        "votes": lambda: jax.block_until_ready([kernels.vote(arcs, step.packed, settings=settings) for step in steps]),
+        "votes": lambda: jax.block_until_ready(
+            [kernels.vote(arcs, echo_batch.packed, settings=settings) for echo_batch in batches]
+        ),
         "components": lambda: [label_components(mask) for mask in masks],
         "centres": lambda: [
-            component_centroids(tables, step, one, *found)
-            for step, one, found in zip(steps, voted, labelled, strict=True)
+            component_centroids(tables, echo_batch, one, *found)
+            for echo_batch, one, found in zip(batches, votes, labels, strict=True)
         ],
     }
 
 
 def ml_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = None) -> Stages:
-    """A batch by maximum likelihood."""
+    """Stages of a batch by maximum likelihood."""
     settings = settings or HoughSettings()
-    arcs, expected = arc_tables(ring, settings).arcs, kernels.DetectionSettings()
-    packed = [step.packed for step in _batches(ring, FlatEchoes.from_dense(ring, ranges), settings, SLOW_SCANS)]
+    arcs, detection_settings = arc_tables(ring, settings).arcs, kernels.DetectionSettings()
+    packed = [
+        echo_batch.packed for echo_batch in _batches(ring, FlatEchoes.from_dense(ring, ranges), settings, SLOW_SCANS)
+    ]
     noise = jnp.asarray(np.nan, jnp.float32)
     found = list(ml_detections(ring, FlatEchoes.from_dense(ring, ranges), settings, None))
 
     def explain() -> Any:
-        return [kernels.detect_ml(arcs, one, noise, hough_settings=settings, settings=expected) for one in packed]
+        return [
+            kernels.detect_ml(arcs, one, noise, hough_settings=settings, settings=detection_settings) for one in packed
+        ]
 
     return {
         WHOLE: lambda: extract_lines(ring, ranges, method="ml", settings=settings),
@@ -80,7 +86,7 @@ def ml_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = N
 
 
 def single_stages(ring: Ring, ranges: np.ndarray) -> Stages:
-    """One scan after the other from Scan to LocalModel, by the paper's method."""
+    """Stages of single scans from Scan to LocalModel, by the paper's method."""
     settings = HoughSettings()
     logs = [scan.as_log() for scan in single_scans(ring, ranges)]
     scans = single_scans(ring, ranges)
@@ -98,20 +104,20 @@ def single_stages(ring: Ring, ranges: np.ndarray) -> Stages:
 
 
 def timed(stages: Stages, scans: int, rounds: int) -> dict[str, np.ndarray]:
-    """Seconds a scan of every stage, round by round."""
-    entered = {name: Contestant(run, scans) for name, run in stages.items()}
-    return timing.round_robin(entered, rounds=rounds, clock=time.process_time)
+    """Seconds per scan of each stage in each round."""
+    contestants = {name: Contestant(run, scans) for name, run in stages.items()}
+    return timing.round_robin(contestants, rounds=rounds, clock=time.process_time)
 
 
-def told(name: str, taken: dict[str, np.ndarray]) -> list[Metric]:
-    """Shares of the whole first, then times."""
+def stage_metrics(name: str, seconds_of: dict[str, np.ndarray]) -> list[Metric]:
+    """Metrics of the stages: shares of the whole, then times."""
     shares = [
-        Metric(f"stages.{name}.{stage}.share", 100 * timing.ratio(seconds, taken[WHOLE]), "%")
-        for stage, seconds in taken.items()
+        Metric(f"stages.{name}.{stage}.share", 100 * timing.ratio(seconds, seconds_of[WHOLE]), "%")
+        for stage, seconds in seconds_of.items()
         if stage != WHOLE
     ]
     return shares + [
-        Metric(f"stages.{name}.{stage}", 1e6 * float(seconds.min()), "us/scan") for stage, seconds in taken.items()
+        Metric(f"stages.{name}.{stage}", 1e6 * float(seconds.min()), "us/scan") for stage, seconds in seconds_of.items()
     ]
 
 
@@ -120,16 +126,16 @@ def measure(options: Options) -> list[Metric]:
     rounds = options.pick(gate=5, quick=3, full=15)
     scans = batch(options.pick(gate=256, quick=512, full=2048), seed=options.seed)
     ring, dense = scans.ring, scans.dense
-    fused = FusedPeer(ring, HoughSettings())
-    votes = hough_stages(ring, dense) | {"numba": lambda: fused.occupied(dense)}
-    taken = timed(votes, len(dense), rounds)
-    value = timing.ratio(taken["numba"], taken["votes"])
+    numba_peer = FusedPeer(ring, HoughSettings())
+    votes = hough_stages(ring, dense) | {"numba": lambda: numba_peer.occupied(dense)}
+    seconds_of = timed(votes, len(dense), rounds)
+    value = timing.ratio(seconds_of["numba"], seconds_of["votes"])
     metrics = [Metric("stages.votes:numba_votes", value, RATIO, "higher", 2.0, 1.0)]
-    del taken["numba"]
-    metrics += told("hough", taken)
+    del seconds_of["numba"]
+    metrics += stage_metrics("hough", seconds_of)
     if options.size == "gate":
         return metrics
-    few = dense[: options.pick(gate=0, quick=64, full=512)]
-    metrics += told("ml", timed(ml_stages(ring, few), len(few), rounds))
-    few = dense[:64]
-    return metrics + told("single", timed(single_stages(ring, few), len(few), rounds))
+    subset = dense[: options.pick(gate=0, quick=64, full=512)]
+    metrics += stage_metrics("ml", timed(ml_stages(ring, subset), len(subset), rounds))
+    subset = dense[:64]
+    return metrics + stage_metrics("single", timed(single_stages(ring, subset), len(subset), rounds))

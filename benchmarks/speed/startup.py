@@ -1,4 +1,4 @@
-"""A command in a new process: ``jaxsonar lines`` on one scan, with nothing compiled before, and with what that left.
+"""Start-up: ``jaxsonar lines`` on one scan in a new process, with an empty and with a filled compilation cache.
 
 The peer is a process that imports JAX, NumPy, SciPy and OpenCV and adds two numbers.
 """
@@ -17,15 +17,15 @@ from benchmarks.speed.scan_fixtures import batch, single_scans
 from jaxsonar import Log, save_log
 
 TARGET = 1.5
-"""Seconds to the first line of the result, with everything compiled before."""
+"""Target for the first line of the result with compiled programs in the cache, seconds."""
 BARE = "import cv2, jax, jax.numpy as jnp, numpy, scipy.sparse; print(jnp.ones(1) + 1)"
 COMMAND = "import sys; from jaxsonar.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
 def seconds(call: list[str], cache: Path) -> tuple[float, float]:
-    """From the start of a process to its first line, and to its end; compiled programs are kept in a folder."""
-    told = {"JAX_COMPILATION_CACHE_DIR": str(cache), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    environment = {key: value for key, value in os.environ.items() if key != "JAXSONAR_CACHE"} | told
+    """Seconds from the start of a process to its first line of output and to its end, with this compilation cache."""
+    cache_variables = {"JAX_COMPILATION_CACHE_DIR": str(cache), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    environment = {key: value for key, value in os.environ.items() if key != "JAXSONAR_CACHE"} | cache_variables
     start = time.perf_counter()
     with subprocess.Popen(call, stdout=subprocess.PIPE, env=environment) as process:
         assert process.stdout is not None
@@ -38,13 +38,13 @@ def seconds(call: list[str], cache: Path) -> tuple[float, float]:
 
 
 def measure(options: Options) -> list[Metric]:
-    """Metrics of this workload; ml compiles for long, so it is part of the full run only."""
+    """Metrics of this workload. ml compiles for long, so only the full run includes it."""
     repeats = options.pick(gate=1, quick=1, full=7)
-    some = batch(60, seed=options.seed)
+    scans = batch(60, seed=options.seed)
     metrics, times = [], []
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "one.csv"
-        save_log(Log.from_scans(single_scans(some.ring, some.dense)[:1]), log)
+        save_log(Log.from_scans(single_scans(scans.ring, scans.dense)[:1]), log)
         for method in ("hough", "ml") if options.size == "full" else ("hough",):
             cache = Path(folder) / method
             call = [sys.executable, "-c", COMMAND, "lines", str(log), "--ring", "faw", "--method", method, "-o", "-"]

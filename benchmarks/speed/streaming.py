@@ -1,11 +1,11 @@
-"""A ring of 24 sensors on a TCP link, many times as fast as sound allows: rate, drops, latency, and memory.
+"""Streaming from an emulated ring on a TCP link, faster than real time: rate, drops, latency and memory.
 
-    python -m benchmarks.speed.streaming            ten minutes at 50 times real time, lines by method hough
+    python -m benchmarks.speed.streaming            ten minutes at 50 times real time, method hough
     python -m benchmarks.speed.streaming --quick    the same for 20 s
-    python -m benchmarks.speed.streaming --speed 1 --method ml --map    what a robot sees
+    python -m benchmarks.speed.streaming --speed 1 --method ml --map    as on a robot
 
-The device is a process of its own (``--device``). A device that is played back too fast is waited for, not dropped
-from; so the row "times real time" says what rate was reached, and "latest" by how much the device fell behind.
+The device is another process (``--device``). If it sends too fast, the receiver applies backpressure instead of
+dropping scans; the row "times real time" is the rate that was reached, "latest of the device" its largest delay.
 """
 
 import argparse
@@ -34,45 +34,45 @@ from jaxsonar.simulation.device_messages import log_messages
 from jaxsonar.simulation.office import load_office
 
 SCAN = 8 * 2 * 2.0 / 343.2
-"""Seconds that 8 firing groups take for 2 m."""
+"""Duration of a scan: 8 firing groups with 2 m range each, seconds."""
 SETTLED = 0.2
-"""Share of the time after which memory should no longer grow."""
+"""Share of the time after which memory should be constant."""
 
 
 def endless(scans: float) -> Iterator[Message]:
-    """The office again and again, as one device that never starts anew."""
+    """Messages of the office, repeated with continuing sequence numbers and times."""
     office = load_office()
     stamps = SCAN * np.arange(len(office.poses))
-    heard = simulate(office.ring, office.room, office.poses, sigma=0.002, seed=0, stamps=stamps)
-    sent = list(log_messages(heard.as_log(office.ring, office.poses), office.ring))
-    turn = round(1e6 * SCAN * len(stamps))
+    simulation = simulate(office.ring, office.room, office.poses, sigma=0.002, seed=0, stamps=stamps)
+    messages = list(log_messages(simulation.as_log(office.ring, office.poses), office.ring))
+    lap_us = round(1e6 * SCAN * len(stamps))
     for k in itertools.count():
-        for message in sent:
+        for message in messages:
             if isinstance(message, Group) and message.scan + k * len(stamps) >= scans:
                 return
-            shifted = {"sequence": message.sequence + k * len(sent), "time_us": message.time_us + k * turn}
+            shifted = {"sequence": message.sequence + k * len(messages), "time_us": message.time_us + k * lap_us}
             if isinstance(message, Group):
                 shifted["scan"] = message.scan + k * len(stamps)
             yield replace(message, **shifted)
 
 
 def device(speed: float, seconds: float) -> None:
-    """Be the device, as ``jaxsonar emulate`` is."""
+    """Run the device, like ``jaxsonar emulate``."""
     with listen("tcp://127.0.0.1:0") as sink:
         print(f"listening on {sink.url}", flush=True)
-        done = emulate(endless(seconds * speed / SCAN), sink, speed=speed)
-        print(f"latest {done.max_delay:.3f}", flush=True)
+        report = emulate(endless(seconds * speed / SCAN), sink, speed=speed)
+        print(f"latest {report.max_delay:.3f}", flush=True)
 
 
 def memory() -> float:
-    """What this process holds now, MB."""
+    """Resident memory of this process, MB."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
 
 
 def run(
     *, speed: float, seconds: float, method: str, mapping: bool, record: str | None
 ) -> list[tuple[str, float, str]]:
-    """One stream; rows of name, value and unit."""
+    """Run one stream; returns rows of name, value and unit."""
     call = [
         sys.executable,
         "-m",
@@ -109,38 +109,38 @@ def run(
             on_status=sample,
             stop=threading.Event(),
         )
-    said = re.search(r"latest ([\d.]+)", process.communicate(timeout=60)[0])
-    times, held, scans = (np.array(column) for column in zip(*samples, strict=True))
+    delay = re.search(r"latest ([\d.]+)", process.communicate(timeout=60)[0])
+    times, megabytes, scans = (np.array(column) for column in zip(*samples, strict=True))
     settled = times > times[0] + SETTLED * (times[-1] - times[0])
-    slope = np.polyfit((times[settled] - times[0]) / 60, held[settled], 1)[0] if settled.sum() > 2 else np.nan
+    growth = np.polyfit((times[settled] - times[0]) / 60, megabytes[settled], 1)[0] if settled.sum() > 2 else np.nan
     rate = (scans[-1] - scans[0]) / (times[-1] - times[0])
     counts = status.counts
     return [
         ("scans", status.scans, ""),
         ("scans a second", rate, "1/s"),
         ("times real time", rate * SCAN, ""),
-        ("latest of the device", float(said[1]) if said else np.nan, "s"),
+        ("latest of the device", float(delay[1]) if delay else np.nan, "s"),
         ("dropped", counts["dropped"], "scans"),
         ("damaged, lost, missing", counts["rejected"] + counts["lost"] + counts["missing"], ""),
         ("longest queue", longest, "scans"),
         ("latency, median", 1e3 * status.p50, "ms"),
         ("latency, 99th percentile", 1e3 * status.p99, "ms"),
-        ("memory once settled", float(held[settled][0]), "MB"),
-        ("memory at the end", float(held[-1]), "MB"),
-        ("growth once settled", float(slope), "MB/min"),
+        ("memory once settled", float(megabytes[settled][0]), "MB"),
+        ("memory at the end", float(megabytes[-1]), "MB"),
+        ("growth once settled", float(growth), "MB/min"),
     ]
 
 
 def main() -> None:
-    """Run it and print a table."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="20 s")
+    parser.add_argument("--quick", action="store_true", help="run for 20 s")
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--speed", type=float, default=50.0)
     parser.add_argument("--method", choices=("ml", "hough"), default="hough")
-    parser.add_argument("--map", action="store_true", help="build the map, too")
-    parser.add_argument("--record", choices=(".csv", ".parquet", ".mcap"), help="record, too")
-    parser.add_argument("--device", action="store_true", help="be the device")
+    parser.add_argument("--map", action="store_true", help="also build the map")
+    parser.add_argument("--record", choices=(".csv", ".parquet", ".mcap"), help="also record in this format")
+    parser.add_argument("--device", action="store_true", help="run the device (used internally)")
     options = parser.parse_args()
     seconds = 20.0 if options.quick else options.seconds
     if options.device:

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.detection import accuracy, plots, scenarios, scoring
 from benchmarks.detection.baselines import PairConsensus, PointHough, arcs_of_scans, distinct
 from benchmarks.detection.conditions import BASE, CONDITIONS, HARD, ISOLATED, Condition
-from benchmarks.detection.methods import METHODS, Reported
+from benchmarks.detection.methods import METHODS, DetectionResult
 from benchmarks.detection.plots import ANSWERS, KINDS
 from benchmarks.detection.scenarios import Truth
 from benchmarks.detection.scoring import Score, score
@@ -27,7 +27,7 @@ def walls():
 def worst(walls, peer):
     """Largest error of the first line of each scan, and how many lines they have."""
     found = [peer(arcs, 1e-9) for arcs in arcs_of_scans(walls.ring, walls.log)]
-    error = np.array([lines[0] - true.place[0] for lines, true in zip(found, walls.truth, strict=True)])
+    error = np.array([lines[0] - true.polar[0] for lines, true in zip(found, walls.truth, strict=True)])
     return np.abs(error[:, 0]).max(), np.abs(wrap_angle(error[:, 1])).max(), {len(lines) for lines in found}
 
 
@@ -48,21 +48,21 @@ def test_points_find_a_single_wall_up_to_their_cells(walls):
 def test_tangents_touch_both_arcs(walls):
     arcs = next(arcs_of_scans(walls.ring, walls.log))
     rho, theta = PairConsensus(hypotheses=50).tangents(arcs)
-    off = np.abs(arcs.ranges(rho, theta) - arcs.reach)
+    off = np.abs(arcs.ranges(rho, theta) - arcs.distance)
     assert (np.sort(off, axis=1)[:, :2] < 1e-9).all()
 
 
 def test_points_of_arcs_are_as_far_as_the_echo_says(walls):
     arcs = next(arcs_of_scans(walls.ring, walls.log))
     count = len(PointHough().points(arcs))
-    each = [len(PointHough().points(arcs.take(np.array([k])))) for k in range(len(arcs.reach))]
+    each = [len(PointHough().points(arcs.take(np.array([k])))) for k in range(len(arcs.distance))]
     assert sum(each) == count
-    for k in range(len(arcs.reach)):
+    for k in range(len(arcs.distance)):
         one = arcs.take(np.array([k]))
         points = PointHough().points(one)
         foci = one.middle - one.half, one.middle + one.half
-        way = np.sum([np.linalg.norm(points - focus, axis=-1) for focus in foci], axis=0)
-        np.testing.assert_allclose(way, np.full(len(way), 2 * one.reach[0]), rtol=1e-12)
+        method = np.sum([np.linalg.norm(points - focus, axis=-1) for focus in foci], axis=0)
+        np.testing.assert_allclose(method, np.full(len(method), 2 * one.distance[0]), rtol=1e-12)
 
 
 def test_distinct_lines_are_apart_across_the_seam():
@@ -84,14 +84,14 @@ def gaussian(rng, *, count, scale=1.0):
 
 @pytest.mark.parametrize("scale", [1.0, 3.0])
 def test_errors_at_the_bound_have_ratio_1_and_nees_2(rng, scale):
-    got = gaussian(rng, count=20_000, scale=scale).measures()
+    found = gaussian(rng, count=20_000, scale=scale).measures()
     for key in ("rho_mm", "theta_deg"):
-        assert got[f"rmse_{key}_per_crb"] == pytest.approx(scale, abs=4 * got[f"rmse_{key}_per_crb_se"])
-        assert got[f"rmse_{key}"] / got[f"crb_{key}"] == pytest.approx(got[f"rmse_{key}_per_crb"])
-        assert got[f"p99_{key}_per_crb"] == pytest.approx(2.576 * scale, rel=0.05)
-    assert got["nees"] == pytest.approx(2 * scale**2, abs=4 * got["nees_se"])
-    assert got["nees_median"] == pytest.approx(2 * np.log(2) * scale**2, rel=0.05)
-    assert got["nees_se"] / scale**2 == pytest.approx(2 / np.sqrt(20_000), rel=0.2)
+        assert found[f"rmse_{key}_per_crb"] == pytest.approx(scale, abs=4 * found[f"rmse_{key}_per_crb_se"])
+        assert found[f"rmse_{key}"] / found[f"crb_{key}"] == pytest.approx(found[f"rmse_{key}_per_crb"])
+        assert found[f"p99_{key}_per_crb"] == pytest.approx(2.576 * scale, rel=0.05)
+    assert found["nees"] == pytest.approx(2 * scale**2, abs=4 * found["nees_se"])
+    assert found["nees_median"] == pytest.approx(2 * np.log(2) * scale**2, rel=0.05)
+    assert found["nees_se"] / scale**2 == pytest.approx(2 / np.sqrt(20_000), rel=0.2)
 
 
 def test_standard_errors_are_those_of_groups(rng):
@@ -105,8 +105,8 @@ def test_standard_errors_are_those_of_groups(rng):
     assert error.mean() == pytest.approx(np.sqrt(0.4 * 0.6 / 50), rel=0.05)
 
 
-def truth(place, kind, heard):
-    return Truth(0, np.array(place), np.array(kind), np.array(heard), np.full((len(place), 2), 0.01))
+def truth(polar, kind, echoes):
+    return Truth(0, np.array(polar), np.array(kind), np.array(echoes), np.full((len(polar), 2), 0.01))
 
 
 def test_walls_are_counted_once_and_kinds_by_place():
@@ -115,23 +115,23 @@ def test_walls_are_counted_once_and_kinds_by_place():
         [0, 0, 0, 1, 2, 0],
         [9, 8, 3, 6, 4, 9],
     )
-    said = Reported(
+    result = DetectionResult(
         # The first wall, the same again, the wall across the seam that few echoes show, and a line at the corner.
         lines=np.array([[1.01, 0.02], [1.05, 0.1], [0.9, 3.13], [1.52, -1.45]]),
         cov=np.stack([np.eye(2), *[np.full((2, 2), np.nan)] * 3]),
         others=np.array([[1.4, 2.5], [1.01, -0.8], [1.7, 0.7]]),
         answers=np.array([ANSWERS.index(answer) for answer in ("edge", "undecided", "corner")]),
     )
-    got = score([true], [said])
+    found = score([true], [result])
     # Three clear walls: one found, one undecided, one not there at all; false are the second line and the corner's.
-    assert got.counts.tolist() == [[3, 1, 1, 2]]
-    np.testing.assert_allclose(got.error, [[0.01, 0.02]])
-    np.testing.assert_allclose(got.nees, [0.01**2 + 0.02**2])
+    assert found.counts.tolist() == [[3, 1, 1, 2]]
+    np.testing.assert_allclose(found.error, [[0.01, 0.02]])
+    np.testing.assert_allclose(found.nees, [0.01**2 + 0.02**2])
     table = {
-        (kind, answer): int(got.confusion[row, column])
+        (kind, answer): int(found.confusion[row, column])
         for row, kind in enumerate((*KINDS, "none"))
         for column, answer in enumerate(ANSWERS)
-        if got.confusion[row, column]
+        if found.confusion[row, column]
     }
     assert table == {
         ("plane", "plane"): 1,
@@ -142,7 +142,7 @@ def test_walls_are_counted_once_and_kinds_by_place():
         ("none", "plane"): 1,
         ("none", "corner"): 1,
     }
-    assert scoring.answers(got.confusion) == pytest.approx(
+    assert scoring.answers(found.confusion) == pytest.approx(
         {"reflectors": 5, "right": 2 / 3, "right_se": np.sqrt(2 / 27), "undecided": 0.2, "nothing": 0.2}
     )
 
@@ -152,18 +152,18 @@ def test_what_finds_everything_has_full_marks():
     perfect = []
     for true in scans.truth:
         plane = true.kind == 0
-        lines = true.place[plane]
+        lines = true.polar[plane]
         nothing = np.zeros((len(lines), 2, 2)) + np.eye(2)
-        perfect.append(Reported(lines, nothing, true.place[~plane], true.kind[~plane]))
-    got = score(scans.truth, perfect)
-    assert got.measures()["recall"] == 1
-    assert got.measures()["false_per_scan"] == got.measures()["rmse_rho_mm"] == 0
-    assert np.trace(got.confusion[:, :3]) == got.confusion.sum() > 0
+        perfect.append(DetectionResult(lines, nothing, true.polar[~plane], true.kind[~plane]))
+    found = score(scans.truth, perfect)
+    assert found.measures()["recall"] == 1
+    assert found.measures()["false_per_scan"] == found.measures()["rmse_rho_mm"] == 0
+    assert np.trace(found.confusion[:, :3]) == found.confusion.sum() > 0
 
 
 def test_rooms_and_poses_are_the_same_in_every_condition():
     some = [scenarios.random_scans(c, 2, 2, seed=3) for c in (BASE, Condition("", sensors=32), HARD)]
-    places = [{tuple(np.round(place, 9)) for true in scans.truth for place in true.place} for scans in some]
+    places = [{tuple(np.round(polar, 9)) for true in scans.truth for polar in true.polar} for scans in some]
     assert all(len(places[0] & other) > 0.6 * min(len(places[0]), len(other)) for other in places[1:])
 
 
@@ -175,30 +175,30 @@ def test_single_reflectors_answer_where_they_are(kind):
         assert true.kind.tolist() == [KINDS.index(kind)]
         own = slice(log.start[k], log.start[k + 1])
         a, b = position[log.tx[own]], position[log.rx[own]]
-        n = np.array([np.cos(true.place[0, 1]), np.sin(true.place[0, 1])])
-        at = true.place[0, 0] * n
+        n = np.array([np.cos(true.polar[0, 1]), np.sin(true.polar[0, 1])])
+        at = true.polar[0, 0] * n
         middle = (a + b) / 2
-        way = {
+        method = {
             "plane": np.linalg.norm(a + 2 * (at - a) @ np.outer(n, n) - b, axis=-1),
             "corner": 2 * np.linalg.norm(middle - at, axis=-1),
             "edge": np.linalg.norm(a - at, axis=-1) + np.linalg.norm(b - at, axis=-1),
         }[kind]
-        np.testing.assert_allclose(2 * log.range[own], way, rtol=0, atol=1e-9)
-        assert true.heard.tolist() == [len(way)]
-        assert len(way) >= 4
+        np.testing.assert_allclose(2 * log.range[own], method, rtol=0, atol=1e-9)
+        assert true.echoes.tolist() == [len(method)]
+        assert len(method) >= 4
 
 
 def test_three_walls_are_three_and_apart():
     scans = scenarios.three_walls(accuracy.THREE_WALLS, 10, seed=5)
     for true in scans.truth:
-        assert len(true.place) == 3
-        turn = np.abs(wrap_angle(true.place[:, None, 1] - true.place[:, 1]))[np.triu_indices(3, 1)]
+        assert len(true.polar) == 3
+        turn = np.abs(wrap_angle(true.polar[:, None, 1] - true.polar[:, 1]))[np.triu_indices(3, 1)]
         assert (turn > np.radians(59.9)).all()
-    found = score(scans.truth, [Reported.of_lines(true.place + np.array([0.001, 0.01])) for true in scans.truth])
-    got = scoring.worst_of_three(found)
-    assert got["all_found"] == 1
-    assert got["rho_mm_p50"] == pytest.approx(1.0)
-    assert got["theta_deg_p90"] == pytest.approx(np.degrees(0.01))
+    found = score(scans.truth, [DetectionResult.of_lines(true.polar + np.array([0.001, 0.01])) for true in scans.truth])
+    found = scoring.worst_of_three(found)
+    assert found["all_found"] == 1
+    assert found["rho_mm_p50"] == pytest.approx(1.0)
+    assert found["theta_deg_p90"] == pytest.approx(np.degrees(0.01))
 
 
 def test_rings_of_conditions():
@@ -212,21 +212,21 @@ def test_rings_of_conditions():
 
 @pytest.mark.slow
 def test_a_tiny_run_makes_every_file(tmp_path):
-    methods = {name: way for name, way in METHODS.items() if not name.startswith("ml")}
+    methods = {name: method for name, method in METHODS.items() if not name.startswith("ml")}
     noise = np.random.default_rng(0)
 
     def nearly(ring, log, sigma):  # something with a covariance, kinds, and what is undecided
-        for said in METHODS["consensus of pairs"](ring, log, sigma):
-            cov = np.zeros((len(said.lines), 2, 2)) + np.diag([1e-6, 1e-4])
+        for result in METHODS["consensus of pairs"](ring, log, sigma):
+            cov = np.zeros((len(result.lines), 2, 2)) + np.diag([1e-6, 1e-4])
             other = noise.uniform(0.5, 1.5, (2, 2))
-            yield Reported(said.lines, cov, other, np.array([1, 3]))
+            yield DetectionResult(result.lines, cov, other, np.array([1, 3]))
 
     settings = {"rooms": 1, "poses": 2, "single": 3, "seed": 0}
-    said = []
+    result = []
     conditions = [BASE, Condition("sigma 1 mm", sigma=0.001), Condition("clean", lost=0.0, false=0.0)]
-    found = accuracy.run(conditions, ISOLATED[:1], methods | {"nearly": nearly}, **settings, progress=said.append)
-    told = accuracy.write(found, tmp_path, settings)
-    assert len(said) == len(conditions) + 2
+    found = accuracy.run(conditions, ISOLATED[:1], methods | {"nearly": nearly}, **settings, progress=result.append)
+    content = accuracy.write(found, tmp_path, settings)
+    assert len(result) == len(conditions) + 2
     names = {path.name for path in tmp_path.iterdir()}
     figures = {f"{name}.{suffix}" for name in ("crb", "robustness", "confusion", "nees") for suffix in ("svg", "png")}
     assert names == figures | {"accuracy.json"}
@@ -235,4 +235,4 @@ def test_a_tiny_run_makes_every_file(tmp_path):
     assert set(read["conditions"][0]["methods"]) == {*methods, "nearly"}
     assert read["versions"]["jax"]
     assert read["settings"]["seed"] == 0
-    assert [table.row_count > 0 for table in plots.tables(told)] == [True] * 4
+    assert [table.row_count > 0 for table in plots.tables(content)] == [True] * 4

@@ -1,4 +1,4 @@
-"""The SLAM benchmark: places that a robot can drive through, a bound by laws of its own, measures of known errors."""
+"""The SLAM benchmark: drivable scenes, laws of the bound, measures of known errors."""
 
 import json
 import sys
@@ -12,15 +12,14 @@ import shapely
 from shapely import LineString, MultiLineString
 
 from benchmarks.slam import accuracy as slam
-from benchmarks.slam import scenarios as slam_scenes
-from benchmarks.slam import summary
-from benchmarks.slam.cramer_rao import Bound, _links, _Slopes, bound, pose_bound
+from benchmarks.slam import scenarios, summary
+from benchmarks.slam.cramer_rao import Bound, _odometry_information, _RangeJacobians, bound, pose_bound
 from benchmarks.slam.scenarios import (
     CLEARANCE,
     DISTANCE,
-    STEP,
+    SCAN_DISTANCE,
+    SCAN_ROTATION,
     TURN,
-    TURNING,
     Scene,
     clearance,
     corridor,
@@ -33,75 +32,75 @@ from jaxsonar.geometry.se2 import relative
 from jaxsonar.graph_slam.initial_poses import LoopClosure
 from jaxsonar.simulation.traced_echoes import EchoKind
 
-PLACES = {
-    "office": slam_scenes.office,
-    "twins": slam_scenes.twins,
+SCENES = {
+    "office": scenarios.office,
+    "twins": scenarios.twins,
     "corridor": corridor,
-    "long": lambda: slam_scenes.long_run(scans=1500),
+    "long": lambda: scenarios.long_run(scans=1500),
 } | {f"loop {k}": lambda k=k: loop(k) for k in range(20)}
 
 
 @cache
 def scene_of(name):
-    return PLACES[name]()
+    return SCENES[name]()
 
 
-@pytest.fixture(params=PLACES)
-def place(request):
+@pytest.fixture(params=SCENES)
+def scene(request):
     return scene_of(request.param)
 
 
 @pytest.fixture(scope="module")
 def office():
-    return slam_scenes.office()
+    return scenarios.office()
 
 
-def test_ways_are_free_of_walls(place):
-    way, walls = LineString(place.poses[:, :2]), MultiLineString(list(place.room.walls))
+def test_trajectories_keep_clear_of_walls(scene):
+    way, walls = LineString(scene.poses[:, :2]), MultiLineString(list(scene.room.walls))
     assert not way.crosses(walls)
-    assert clearance(place) == way.distance(walls) >= CLEARANCE
-    # The walls close around the way: one piece of floor holds all of it.
+    assert clearance(scene) == way.distance(walls) >= CLEARANCE
+    # The walls enclose the trajectory: one piece of floor contains all of it.
     floor = [piece for piece in shapely.polygonize(list(walls.geoms)).geoms if piece.intersects(way)]
-    assert len(floor) == 1 or place.name == "office"
+    assert len(floor) == 1 or scene.name == "office"
 
 
-def test_ways_are_gentle(place):
-    if place.name == "office":
+def test_steps_and_rotations_are_bounded(scene):
+    if scene.name == "office":
         return
-    step = relative(place.poses[:-1], place.poses[1:])
+    step = relative(scene.poses[:-1], scene.poses[1:])
     way, turn = np.linalg.norm(step[:, :2], axis=-1), np.abs(step[:, 2])
-    assert way.max() <= STEP[1] + 1e-9
-    assert turn.max() <= TURNING + 0.06
+    assert way.max() <= SCAN_DISTANCE[1] + 1e-9
+    assert turn.max() <= SCAN_ROTATION + 0.06
     moving = way > 1e-9
-    assert (turn[~moving] > 0).all(), "it turns where it stands"
+    assert (turn[~moving] > 0).all(), "it turns in place"
     ahead = np.abs(np.arctan2(step[:, 1], step[:, 0]))[moving]
-    assert ahead.max() < np.radians(15), "it looks where it goes"
+    assert ahead.max() < np.radians(15), "it faces its direction of travel"
 
 
-def test_loops_are_loops():
+def test_loops_return_to_their_start():
     for seed in range(20):
         scene = scene_of(f"loop {seed}")
-        place = scene.poses[:, :2]
-        early, late = place[: len(place) // 8], place[-len(place) // 8 :]
+        position = scene.poses[:, :2]
+        early, late = position[: len(position) // 8], position[-len(position) // 8 :]
         apart = np.linalg.norm(early[:, None] - late, axis=-1).min(axis=1)
-        assert np.sum(apart < 0.3) >= 10, "it comes back to where it began"
-        assert 35 < scene.way < 125
+        assert np.sum(apart < 0.3) >= 10, "it returns to its start"
+        assert 35 < scene.distance_traveled < 125
 
 
-def test_walls_are_in_reach_and_the_same_seed_is_the_same_place():
+def test_walls_are_in_range_and_a_seed_determines_the_scene():
     scene, again = scene_of("loop 3"), loop(3)
     np.testing.assert_array_equal(scene.poses, again.poses)
     np.testing.assert_array_equal(scene.room.walls, again.room.walls)
-    walls = np.bincount(scene.heard.scan[scene.heard.kind == EchoKind.PLANE], minlength=len(scene.poses))
+    walls = np.bincount(scene.simulation.scan[scene.simulation.kind == EchoKind.PLANE], minlength=len(scene.poses))
     assert np.mean(walls >= 8) > 0.9
     assert len(scene_of("loop 4").poses) != len(scene.poses)
     log = scene.log(7)
     np.testing.assert_array_equal(log.pose, scene.odometry(7))
-    assert len(log.range) == len(scene.heard.range)
+    assert len(log.range) == len(scene.simulation.range)
     np.testing.assert_array_equal(log.pose[0], scene.poses[0])
 
 
-def test_one_scan_hears_two_walls_that_cross():
+def test_one_scan_determines_the_whole_pose():
     scene = one_scan(2)
     assert len(scene.poses) == 1
     assert np.linalg.eigvalsh(pose_bound(scene)[0]).max() < 0.03**2
@@ -111,17 +110,17 @@ def test_one_scan_hears_two_walls_that_cross():
 
 
 def dense(scene):
-    """The same from one large matrix."""
-    slopes, scans = _Slopes.of(scene), len(scene.poses)
-    row, pose, place = np.arange(len(slopes.scan)), 3 * slopes.scan, 3 * scans + 2 * slopes.own
-    jacobian = np.zeros((len(row), 3 * scans + 2 * len(slopes.places)))
+    """The bound of the poses from one dense matrix."""
+    jacobians, scans = _RangeJacobians.of(scene), len(scene.poses)
+    row, pose, column = np.arange(len(jacobians.scan)), 3 * jacobians.scan, 3 * scans + 2 * jacobians.reflector
+    jacobian = np.zeros((len(row), 3 * scans + 2 * len(jacobians.parameters)))
     for k in range(3):
-        jacobian[row, pose + k] = slopes.by_pose[:, k]
+        jacobian[row, pose + k] = jacobians.d_range_d_pose[:, k]
     for k in range(2):
-        jacobian[row, place + k] = slopes.by_place[:, k]
+        jacobian[row, column + k] = jacobians.d_range_d_reflector[:, k]
     information = jacobian.T @ jacobian
-    information[3 * scans :, 3 * scans :] += np.eye(2 * len(slopes.places))
-    for k, (first, second, between) in enumerate(zip(*_links(scene.poses, DISTANCE, TURN), strict=True)):
+    information[3 * scans :, 3 * scans :] += np.eye(2 * len(jacobians.parameters))
+    for k, (first, second, between) in enumerate(zip(*_odometry_information(scene.poses, DISTANCE, TURN), strict=True)):
         a, b = slice(3 * k, 3 * k + 3), slice(3 * k + 3, 3 * k + 6)
         information[a, a] += first
         information[b, b] += second
@@ -131,13 +130,13 @@ def dense(scene):
     return np.stack([covariance[k : k + 3, k : k + 3] for k in range(0, 3 * scans - 3, 3)])
 
 
-def test_the_bound_in_parts_is_the_bound_at_once(office):
+def test_the_sparse_bound_equals_the_dense_one(office):
     got = bound(office)
     np.testing.assert_array_equal(got.poses[0], 0)
     np.testing.assert_allclose(got.poses[1:], dense(office), rtol=1e-6, atol=1e-12)
 
 
-def test_more_is_known_with_better_odometry_and_less_noise(office):
+def test_better_odometry_and_less_noise_lower_the_bound(office):
     base = bound(office)
     better, quieter = bound(office, distance=DISTANCE / 4, turn=TURN / 4), bound(replace(office, sigma=2e-4))
     for less in (better, quieter):
@@ -146,18 +145,20 @@ def test_more_is_known_with_better_odometry_and_less_noise(office):
         assert (less.distance < base.distance).all()
 
 
-def test_the_bound_turns_with_the_frame(office):
+def test_the_bound_does_not_depend_on_the_frame(office):
     turn, shift = 0.7, np.array([1.0, -2.0])
     c, s = np.cos(turn), np.sin(turn)
     matrix = np.array([[c, s], [-s, c]])
     poses = np.column_stack([office.poses[:, :2] @ matrix + shift, office.poses[:, 2] + turn])
     moved = bound(Scene("moved", Room(office.room.walls @ matrix + shift, poles=office.room.poles @ matrix), poses))
     still = bound(replace(office, room=Room(office.room.walls, poles=office.room.poles)))
-    np.testing.assert_allclose(moved.ate, still.ate, rtol=0.02)  # other noise, hence other echoes at the threshold
+    np.testing.assert_allclose(
+        moved.ate, still.ate, rtol=0.02
+    )  # the noise differs, and with it echoes near the threshold
     np.testing.assert_allclose(moved.ate_heading, still.ate_heading, rtol=0.02)
 
 
-def test_along_a_bare_corridor_odometry_is_all_there_is():
+def test_along_a_bare_corridor_the_bound_is_that_of_odometry():
     scene = corridor()
     out = np.argmax(np.linalg.norm(scene.poses[:, :2] - scene.poses[0, :2], axis=-1))
     along = np.append(np.cos(scene.poses[3, 2]), np.sin(scene.poses[3, 2]))
@@ -171,7 +172,7 @@ def test_along_a_bare_corridor_odometry_is_all_there_is():
 
 
 def fake(scene, off):
-    """Results that are wrong by so much, as the library would give them."""
+    """Results of the library with a known error."""
     walls = scene.room.walls + np.array([0.0, 0.004])
     none = np.zeros(len(walls))
     world = GlobalMap(walls, none, none, none, none, np.zeros(len(walls), int), ((),) * len(walls))
@@ -191,7 +192,7 @@ def fake(scene, off):
         )
     ]
     steps = np.concatenate([[900.0], np.linspace(1, 3, len(poses) - 1)])
-    trajectory = Trajectory(scene.heard.stamps, poses, covariance)
+    trajectory = Trajectory(scene.simulation.stamps, poses, covariance)
     return SimpleNamespace(
         trajectory=trajectory, world=world, odometry=scene.odometry(0), closures=closures, step_ms=steps
     )
@@ -212,19 +213,19 @@ def test_measures_of_known_errors(office, monkeypatch):
     assert got.false < 0.01
     assert 1.9 < got.p50 < 2.1
     assert 2.9 < got.p99 <= 3
-    told = slam.run({"office": [lambda: office]}, ["smoothed", "front end"], ones=0)
-    assert [row["way"] for row in told] == ["smoothed", "front end"]
-    np.testing.assert_allclose(told[0]["ratio"], got.odometry / got.ate)
-    json.dumps(slam.without_nan(told), allow_nan=False)
+    rows = slam.run({"office": [lambda: office]}, ["smoothed", "front end"], single_scans=0)
+    assert [row["way"] for row in rows] == ["smoothed", "front end"]
+    np.testing.assert_allclose(rows[0]["ratio"], got.odometry / got.ate)
+    json.dumps(slam.without_nan(rows), allow_nan=False)
     settings = {"sigma": 0.001, "distance": DISTANCE, "turn": TURN}
     versions = {"jax": "1", "device": "cpu", "commit": "abc"}
-    table = summary.table(slam.without_nan({"versions": versions, "settings": settings, "scenarios": told}))
+    table = summary.table(slam.without_nan({"versions": versions, "settings": settings, "scenarios": rows}))
     assert table.row_count == 2
     assert len(table.columns) == len(summary.COLUMNS) + 1
 
 
-def test_a_run_that_fails_is_told(office, monkeypatch):
-    monkeypatch.setitem(sys.modules, "jaxsonar.graph_slam.slam", None)  # as if it were not there
+def test_a_failed_run_is_reported(office, monkeypatch):
+    monkeypatch.setitem(sys.modules, "jaxsonar.graph_slam.slam", None)  # the import fails
     nothing = Bound(np.zeros((17, 3, 3)), np.zeros(0, int), np.zeros(0), np.zeros(0))
     got = slam.outcome(office, "smoothed", nothing)
     assert got.failed
@@ -234,14 +235,14 @@ def test_a_run_that_fails_is_told(office, monkeypatch):
     assert np.isnan(row["ate_mm"])
 
 
-def test_wrong_closures_are_those_that_are_off():
+def test_wrong_closures_contradict_the_truth_in_the_directions_that_they_determine():
     poses = np.array([[0.0, 0, 0], [1.0, 1, np.pi / 2]])
     right = relative(poses[0], poses[1])
 
     def wrong(off, determined):
         return slam.wrong(poses, LoopClosure(0, 1, right + off, "counted", determined))
 
-    whole, along_x = np.eye(3), np.eye(3)[:, 1:]  # walls along x leave x open
+    whole, along_x = np.eye(3), np.eye(3)[:, 1:]  # walls along x do not determine x
     assert not wrong([0.1, 0.1, 0.1], whole)
     assert wrong([0.0, 0.31, 0.0], whole)
     assert wrong([0.0, 0.0, np.radians(11)], whole)

@@ -1,5 +1,6 @@
-"""The benchmark suite: peers that do what the product does, a gate that notices, results that can be read back."""
+"""The benchmark suite: peers agree with the product, the gate detects regressions, results can be read back."""
 
+import importlib
 import itertools
 import json
 import math
@@ -11,12 +12,9 @@ import numpy as np
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks import markdown_tables as page
-from benchmarks import plots as suite_figures
+from benchmarks import markdown_tables, plots
 from benchmarks.metrics import RATIO, Metric, Options, Results, failures, load_baseline, ratios, save_baseline
-from benchmarks.speed import batch_at_scale as million
-from benchmarks.speed import scaling as growth
-from benchmarks.speed import timing
+from benchmarks.speed import batch_at_scale, scaling, timing
 from benchmarks.speed.baselines import FusedPeer, NumpyPeer, PointSetPeer, RasterPeer
 from benchmarks.speed.scan_fixtures import batch, echoes_of, single_scans
 from benchmarks.speed.timing import Contestant
@@ -30,7 +28,7 @@ SCANS = 48
 
 
 def walls(ring, rho, theta):
-    """Ranges (paths, walls) of wide walls that everything hears whose detection range holds their direction."""
+    """Ranges (paths, walls) of wide walls, received by all paths whose detection range contains their direction."""
     tx, rx = np.asarray(ring.position)[ring.paths.T]
     middle, half = (tx + rx) / 2, (rx - tx) / 2
     n, t = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
@@ -42,7 +40,7 @@ def walls(ring, rho, theta):
 
 @pytest.fixture(scope="module", params=["outward", "inward"])
 def given(request):
-    """Scans of rooms and of walls where theta wraps; or a ring that looks inward, and walls through its centre."""
+    """Scans of rooms and of walls at the seam of theta, or a ring that faces inward with walls through its centre."""
     ring = replace(Ring.circular(), range_offset=np.full(24, 0.004, np.float32))
     rng = np.random.default_rng(1)
     if request.param == "outward":
@@ -56,7 +54,7 @@ def given(request):
 SHAPE = (SETTINGS.theta_cells, SETTINGS.rho_cells)
 
 
-def of_product(ring, ranges):
+def product_votes(ring, ranges):
     """Votes and occupied cells by the kernels."""
     arcs, (votes, high) = arc_tables(ring, SETTINGS).arcs, np.zeros((2, len(ranges), *SHAPE), np.int64)
     for step in pack(FlatEchoes.from_dense(ring, ranges), SETTINGS.cells, pieces=arc_tables(ring, SETTINGS).pieces):
@@ -68,9 +66,9 @@ def of_product(ring, ranges):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("peer", ["numba", "numpy"])
-def test_peers_vote_and_occupy_as_the_product_does(given, peer):
+def test_votes_and_occupied_cells_of_peers_equal_those_of_the_product(given, peer):
     ring, ranges = given
-    votes, high = of_product(ring, ranges)
+    votes, high = product_votes(ring, ranges)
     if peer == "numba":
         fused = FusedPeer(ring, SETTINGS)
         got, got_high = fused.votes(ranges), fused.occupied(ranges)
@@ -93,7 +91,7 @@ def test_the_numba_loop_finds_the_lines_of_the_product(given):
     lines = extract_lines(ring, ranges, method="hough")
     got = [column[:, : lines.rho.shape[1]] for column in FusedPeer(ring, SETTINGS).lines(ranges)]
     same = (lines.echoes == got[3]).all(axis=1)
-    assert same.mean() > 0.95  # the others have a point on the border of a cell, or two lines equally strong
+    assert same.mean() > 0.95  # the rest has a point on the border of a cell, or two equally strong lines
     assert lines.echoes[same].astype(bool).sum() > 100
     for of, column in zip((lines.rho, lines.votes, lines.segments), (got[0], got[2], got[4]), strict=True):
         np.testing.assert_allclose(column[same], of[same], rtol=0, atol=3e-5)
@@ -115,13 +113,13 @@ def test_plain_numpy_finds_the_lines_of_the_product(given):
 
 
 @pytest.mark.slow
-def test_points_are_those_of_the_arcs(given):
-    """OpenCV's transform gets a point for every tangent of the product, on the same arc."""
+def test_points_lie_on_the_arcs(given):
+    """The transform of OpenCV gets one point for each tangent of the product, on the same arc."""
     ring, ranges = given
     peer, scan = PointSetPeer(ring, SETTINGS), ranges[0]
     path, slot = np.nonzero(np.isfinite(scan))
     points = peer.points(scan)[:, 0]
-    votes, _ = of_product(ring, scan[None])
+    votes, _ = product_votes(ring, scan[None])
     assert len(points) == votes.sum()
     arcs, paths = arc_tables(ring, SETTINGS).arcs, ring.echo_paths
     counts, theta = np.asarray(arcs.arcs.exists), np.asarray(arcs.arcs.theta)
@@ -138,7 +136,7 @@ def test_points_are_those_of_the_arcs(given):
     assert 0.01 * len(points) < image.sum() <= len(points)
 
 
-def test_scans_are_what_they_are_said_to_be():
+def test_batches_have_the_stated_numbers_of_echoes():
     some = batch(60)
     assert some.mixed.shape == some.dense.shape == (60, 168, 2)
     assert 40 < echoes_of(some.mixed).mean() < 55
@@ -146,12 +144,12 @@ def test_scans_are_what_they_are_said_to_be():
     scans = single_scans(some.ring, some.dense)
     assert [len(scan.range) for scan in scans] == echoes_of(some.dense).tolist()
     for count in (8, 128):
-        made = growth.with_echoes(some.dense, count, np.random.default_rng(0))
+        made = scaling.with_echoes(some.dense, count, np.random.default_rng(0))
         assert set(echoes_of(made).tolist()) == {count}
 
 
-def test_ratios_are_those_of_the_work():
-    """On a machine that becomes slower and slower, twice the work for as many scans takes twice the time."""
+def test_ratios_are_those_of_the_amounts_of_work():
+    """On a machine that becomes slower, twice the work for the same number of scans takes twice the time."""
     now, order = [0.0], []
 
     def work(name, amount):
@@ -164,7 +162,7 @@ def test_ratios_are_those_of_the_work():
     assert order == [*entered, *([*entered, *[*entered][::-1]] * 4)]  # once to warm up, then in turn
     assert timing.ratio(taken["two"], taken["one"]) == pytest.approx(2, rel=0.02)
     assert timing.ratio(taken["many"], taken["two"]) == pytest.approx(1, rel=0.02)
-    assert growth.exponent([(n, 3e-6 * n**1.5) for n in (10, 100, 1000, 10_000)]) == pytest.approx(1.5)
+    assert scaling.exponent([(n, 3e-6 * n**1.5) for n in (10, 100, 1000, 10_000)]) == pytest.approx(1.5)
 
 
 def results(**values):
@@ -208,7 +206,7 @@ def test_the_gate_passes_on_itself_and_fails_on_worse(tmp_path):
     save_baseline(results(), path)
     held = load_baseline(path)
     assert set(held["ratios"]) == set(ratios(results().metrics.values()))
-    assert "throughput.hough.rate" not in held["ratios"]  # times are no part of it
+    assert "throughput.hough.rate" not in held["ratios"]  # only ratios are in the baseline
     assert failures(results().metrics, held) == {}
     assert failures(results(numba=2.9, ml=0.1).metrics, held) == {}
     assert failures(results(numba=0.75, ml=4.9).metrics, held) == {}
@@ -218,7 +216,7 @@ def test_the_gate_passes_on_itself_and_fails_on_worse(tmp_path):
     assert failures({}, held, only=["latency"]) == {}
 
 
-def test_the_best_of_three_tries_counts(tmp_path, monkeypatch):
+def test_the_gate_takes_the_best_of_three_attempts(tmp_path, monkeypatch):
     path = tmp_path / "baseline.json"
     save_baseline(results(), path)
     tries = iter([results(numba=0.1, ml=2.0), results(numba=0.2, ml=99.0), results(numba=0.9)])
@@ -234,11 +232,11 @@ def test_the_best_of_three_tries_counts(tmp_path, monkeypatch):
     assert command.main(call) == 0
 
 
-def test_the_committed_baseline_is_what_the_gate_measures():
-    """Ratios only, of workloads that the gate runs, with where they were measured."""
+def test_the_committed_baseline_matches_the_workloads_of_the_gate():
+    """It has only ratios, of the workloads of the gate, and the environment."""
     held = load_baseline()
     assert {"device", "jax", "jaxlib", "numpy", "commit"} <= set(held["environment"])
-    assert {key.partition(".")[0] for key in held["ratios"]} == set(command.SHORT["gate"])
+    assert {key.partition(".")[0] for key in held["ratios"]} == set(command.DEFAULT_WORKLOADS["gate"])
     assert all(was["tolerance"] >= 2 and was["value"] > 0 for was in held["ratios"].values())
 
 
@@ -250,18 +248,18 @@ def test_targets():
 
 
 @pytest.mark.slow
-def test_a_page_is_filled_and_stays_so(tmp_path):
+def test_updating_a_page_is_idempotent(tmp_path):
     end = "<!-- /benchmarks -->\n"
     text = f"a\n<!-- benchmarks: targets -->\nold\n{end}b\n<!-- benchmarks: device -->\nkept\n{end}"
     path = tmp_path / "page.md"
     path.write_text(text)
-    page.write(path, results())
+    markdown_tables.write(path, results())
     made = path.read_text()
     assert "| hough, batch, one core : plain NumPy + OpenCV | 12 x | at least 10 x | yes |" in made
     assert "| ml, two cores : one | not measured here | at least 1.8 x |  |" in made
     assert "old" not in made
     assert "kept" in made
-    page.write(path, results())
+    markdown_tables.write(path, results())
     assert path.read_text() == made
     path.write_text(text.replace("targets", "goals"))
     assert command.main(["--from", str(saved(tmp_path)), "-o", str(tmp_path), "--write", str(path)]) == 2
@@ -273,48 +271,54 @@ def saved(folder):
 
 
 @pytest.mark.slow
-def test_figures_and_tables_from_kept_results(tmp_path, capsys):
+def test_figures_and_tables_from_saved_results(tmp_path, capsys):
     command.main(["--from", str(saved(tmp_path)), "-o", str(tmp_path)])
     names = {path.name for path in tmp_path.iterdir()}
     assert {f"{name}.{suffix}" for name in ("peers", "stages", "growth") for suffix in ("svg", "png")} <= names
     assert "throughput.hough:numba" in capsys.readouterr().out
     empty = replace(results(), metrics={})
-    assert suite_figures.all_of(empty) == {}
-    assert all(block(empty) for block in page.BLOCKS.values())
+    assert plots.all_of(empty) == {}
+    assert all(block(empty) for block in markdown_tables.BLOCKS.values())
+
+
+def test_every_workload_is_a_function():
+    for function, _ in command.WORKLOADS.values():
+        module, _, name = function.rpartition(".")
+        assert callable(getattr(importlib.import_module(f"benchmarks.{module}"), name)), function
 
 
 def test_workloads_are_listed(capsys):
     command.main(["--list"])
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(command.WORKLOADS)
-    assert all(set(names) <= set(command.WORKLOADS) for names in command.SHORT.values())
+    assert all(set(names) <= set(command.WORKLOADS) for names in command.DEFAULT_WORKLOADS.values())
 
 
 @pytest.mark.slow
-def test_a_run_that_was_killed_and_went_on_has_the_tables_of_one_that_was_not(tmp_path):
-    whole, killed = million.measure(tmp_path, scans=96, each=48, engines=["local"])
+def test_a_killed_and_continued_run_has_the_tables_of_an_uninterrupted_one(tmp_path):
+    whole, killed = batch_at_scale.measure(tmp_path, scans=96, each=48, engines=["local"])
     assert whole["same"]
     assert killed["same"]
     assert "not in its middle" in killed["run"] or 0 < killed["shards"] < 2
     assert whole["rate"] > 0
     (tmp_path / "killed" / "lines" / "other.parquet").write_bytes(b"")
-    assert not million.same(tmp_path / "local", tmp_path / "killed")
+    assert not batch_at_scale.same_tables(tmp_path / "local", tmp_path / "killed")
 
 
 @pytest.mark.parametrize(
     "call", [["--from", "{}"], ["--gate", "--baseline", "{}"], ["--only", "latency", "--write", "{}/no.md"]]
 )
 @pytest.mark.parametrize("holds", [None, "{", "[]", "{}"])
-def test_files_that_the_suite_did_not_write_are_refused_before_the_work(call, holds, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(command, "measured", lambda *_: pytest.fail("it was measured"))
+def test_foreign_files_are_refused_before_measuring(call, holds, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command, "measured", lambda *_: pytest.fail("it measured"))
     file = tmp_path / "file.json"
     if holds is not None:
         file.write_text(holds)
     assert command.main([*(one.format(file) for one in call), "-o", str(tmp_path)]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "needed is" in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "needed" in message
 
 
-def test_a_baseline_is_what_is_usual():
+def test_a_baseline_is_the_median_of_several_runs():
     runs = [[Metric("a", value, RATIO), Metric("b", -value, RATIO)] for value in (3.0, 1.0, 2.0)]
-    assert [one.value for one in command.usual(runs)] == [2.0, -2.0]
+    assert [one.value for one in command.medians(runs)] == [2.0, -2.0]

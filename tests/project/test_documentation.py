@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import pytest
 from support.recordings import recorded
 
@@ -72,6 +73,9 @@ def test_a_block_runs_as_printed(block, folder):
         **os.environ,
         "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
         "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])),
+        # Examples in Python share the programs that the commands compile.
+        "JAX_COMPILATION_CACHE_DIR": getattr(jax.config, "jax_compilation_cache_dir", None) or "",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
     }
     if block.recording:
         environment[block.recording.upper()] = str(recorded(block.recording))
