@@ -107,7 +107,7 @@ def csv_chunk_reader(filename: str | os.PathLike[str], chunk: LogChunk, *, name:
     first, lines = next(_find_starts(name, iter([text]), 0))[1:]
     offset, line = np.append(first, len(text)), lines + chunk.line
     if len(first) != chunk.scans:
-        raise SonarError(f"{shown(name)}: changed since it was looked at; needed is a log that stays as it is")
+        raise SonarError(f"{shown(name)}: the file changed during processing; needed is a log that does not change")
 
     def read(begin: int, end: int) -> Log:
         body = text[offset[begin] : offset[end]]

@@ -82,8 +82,8 @@ def recover_recording(filename: str | os.PathLike[str]) -> Log:
     complete = text[:size] if len(text) >= size else _without_last_scan(text)
     log = read_csv_text(source, complete) if b"\n" in complete else Log.from_scans([])
     if parquet or len(complete) < len(text):
-        detail = f", taken from {shown(source)}" if parquet else "; a last one is not whole"
-        message = f"{shown(filename)}: the recording was cut short: {len(log)} scans{detail}"
+        detail = f" recovered from {shown(source)}" if parquet else " recovered, the last one is truncated"
+        message = f"{shown(filename)}: the recording is incomplete: {len(log)} scans{detail}"
         warnings.warn(message, TruncatedRecording, stacklevel=3)
     return log
 

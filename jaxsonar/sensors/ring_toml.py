@@ -64,7 +64,7 @@ def shipped_rings() -> tuple[str, ...]:
     return tuple(sorted(file.stem.removeprefix("ring-") for file in DATA.glob("ring-*.toml")))
 
 
-def load_ring(path: str | os.PathLike[str]) -> Ring:
+def load_ring(filename: str | os.PathLike[str]) -> Ring:
     """Load a ring from a TOML file, or one of the shipped rings by name.
 
     The file contains ``name``, optionally ``speed_of_sound`` (m/s), and either a circular ring or a general array. A
@@ -73,17 +73,17 @@ def load_ring(path: str | os.PathLike[str]) -> Ring:
     beam_deg and optionally range_offset. Lengths are in metres. A table ``[calibration]`` is ignored.
 
     Args:
-        path: the file; if there is no such file, a name from ``shipped_rings()``, as in ``load_ring("faw")``.
+        filename: the file; if there is no such file, a name from ``shipped_rings()``, as in ``load_ring("faw")``.
 
     Raises:
         SonarError: no such ring, or an invalid file; the message names file, key and allowed values.
     """
-    file = Path(path)
-    if not os.path.isfile(path) and os.fspath(path) in shipped_rings():
-        file = DATA / f"ring-{os.fspath(path)}.toml"
-    elif not os.path.exists(path):
+    file = Path(filename)
+    if not os.path.isfile(filename) and os.fspath(filename) in shipped_rings():
+        file = DATA / f"ring-{os.fspath(filename)}.toml"
+    elif not os.path.exists(filename):
         allowed = f"allowed is a ring file or one of the shipped rings {', '.join(shipped_rings())}"
-        raise SonarError(f"{shown(path)}: no such ring; {allowed}")
+        raise SonarError(f"{shown(filename)}: no such ring; {allowed}")
     given = _read(file)
     if (given.ring is None) == (given.array is None):
         came = "neither [ring] nor [array]" if given.ring is None else "both [ring] and [array]"
@@ -132,19 +132,19 @@ def _ring(given: _File) -> Ring:
     )
 
 
-def save_ring(ring: Ring, path: str | os.PathLike[str]) -> None:
+def save_ring(ring: Ring, filename: str | os.PathLike[str]) -> None:
     """Write a ring as TOML, so that ``load_ring`` restores it to within 1e-12 (m, rad, m/s).
 
     A circular ring of equal sensors without range offsets is written as ``[ring]``, any other as ``[array]``.
 
     Args:
         ring: the ring.
-        path: the file; an existing one is replaced only after the new one is complete.
+        filename: the file; an existing one is replaced only after the new one is complete.
 
     Raises:
         SonarError: the file cannot be written.
     """
-    with atomic_write(path) as file:
+    with atomic_write(filename) as file:
         file.write(ring_toml(ring))
 
 

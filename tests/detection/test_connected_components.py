@@ -1,4 +1,4 @@
-"""Connected components against a flood fill on the surface of lines; both seams; many scans in one call."""
+"""Connected components against a flood fill in the parameter space, with both seams and many scans."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from jaxsonar.detection.connected_components import label_components
 
 
 def partition(labels):
-    """The components as sets of cells: numbers do not matter, only what belongs together."""
+    """The components as sets of cells, independent of their numbers."""
     return {frozenset(map(tuple, np.argwhere(np.abs(labels) == k))) for k in range(1, np.abs(labels).max() + 1)}
 
 
@@ -43,7 +43,7 @@ def test_components_join_across_theta_pi(column):
 def test_components_join_across_rho_zero():
     labels, counts = cells((2, 0), (8, 0))
     assert counts == [1]
-    assert labels[0, 2, 0] * labels[0, 8, 0] == -1  # one component, its two sides marked apart
+    assert labels[0, 2, 0] * labels[0, 8, 0] == -1  # one component with different signs on its two sides
     assert cells((2, 0), (9, 0))[1] == [1]
     assert cells((2, 0), (10, 0))[1] == [2]
     assert cells((2, 1), (8, 0))[1] == [2]

@@ -1,4 +1,4 @@
-"""The paper's local models against the slow oracle; rotations, mirrors, padding, batches change nothing else; errors.
+"""Method hough against the slow oracle; symmetries under rotation, reflection, padding and batching; errors.
 
 Method hough throughout; method ml has test_explained.
 """
@@ -25,7 +25,7 @@ local_model = partial(jaxsonar.local_model, method="hough")
 local_models = partial(jaxsonar.local_models, method="hough")
 
 THREE_WALLS = [(1.2, 0.3), (1.7, -1.9), (1.5, 3.1)]
-TURNED_RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # no point on a cell's border
+TURNED_RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # no point at the border of a cell
 BUMPER = Ring(
     [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
     np.radians([-15.0, -5.0, 5.0, 15.0]),
@@ -48,7 +48,7 @@ def dense(ring, echoes, slots=3):
 
 
 def a_scan(ring, rng, walls=THREE_WALLS, noise=0.003, false=10):
-    """Echoes of infinite walls with noise, and false ones."""
+    """Noisy echoes of infinite walls, and clutter."""
     echoes = [(k, r + rng.normal(0, noise)) for wall in walls for k, r in oracles.echoes_of_wall(ring, *wall)]
     return echoes + [(int(k), float(rng.uniform(0.2, 2.2))) for k in rng.integers(0, len(ring.paths), false)]
 
@@ -105,7 +105,7 @@ def test_walls_are_detected_at_their_positions(faw_ring):
 @settings(max_examples=20)
 @given(st.integers(0, 10_000), st.integers(0, 23))
 def test_rotation_by_sensor_steps_permutes_paths_and_shifts_theta(seed, steps):
-    """With cells of 3 deg a step of 15 deg is a whole number of cells, so nothing else may change."""
+    """A step of 15 deg is an integer number of cells of 3 deg; therefore only theta changes."""
     ring, setup = Ring.circular(), HoughSettings(theta_cells=120)
     echoes = a_scan(ring, np.random.default_rng(seed))
     turned = [(int(ring.path_index[tuple((ring.paths[k] - steps) % 24)]), r) for k, r in echoes]
@@ -193,7 +193,7 @@ def test_no_scans_give_no_lines(faw_ring):
 
 
 def test_no_echoes_give_no_wall(faw_ring):
-    """Paths without an echo, and devices that write the maximum range instead, give no line."""
+    """Missing echoes, and maximum ranges that some devices write instead, give no line."""
     everywhere = np.full((1, 168, 1), faw_ring.max_range, np.float32)
     assert not extract_lines(faw_ring, everywhere).echoes.any()
     assert not extract_lines(faw_ring, everywhere + 3).echoes.any()
@@ -252,7 +252,7 @@ def test_offsets_and_speed_of_sound_are_corrected():
 
 
 def test_compiles_once_per_ring(faw_ring, rng):
-    """New scans, other numbers of echoes and a recalibrated ring run what was compiled before."""
+    """New scans, other numbers of echoes and a recalibrated ring compile nothing."""
     compiled: list[Any] = [kernels.vote, kernels.ring_arcs]
     for kernel in compiled:
         kernel.clear_cache()
@@ -264,7 +264,7 @@ def test_compiles_once_per_ring(faw_ring, rng):
 
 
 def primitives(jaxpr):
-    """Names of all operations of a program, those of its inner programs included."""
+    """Names of all operations of a program and of its inner programs."""
     for equation in jaxpr.eqns:
         yield equation.primitive.name
         for value in jax.tree.leaves(equation.params, is_leaf=lambda leaf: hasattr(leaf, "jaxpr")):
@@ -273,7 +273,7 @@ def primitives(jaxpr):
 
 
 def test_one_compiled_call_from_echoes_to_cells(faw_ring):
-    """Votes, low pass and threshold are one program: no call of the host in it, cells and points come out."""
+    """Votes, low pass and threshold are one program without host calls."""
     echoes = kernels.PackedEchoes(jnp.zeros((2, 64), jnp.int32), jnp.full((2, 64), jnp.nan, jnp.float32))
     step = partial(kernels.vote, settings=HoughSettings())
     program = jax.make_jaxpr(step)(arc_tables(faw_ring, HoughSettings()).arcs, echoes)
@@ -287,7 +287,7 @@ def test_one_compiled_call_from_echoes_to_cells(faw_ring):
 
 @pytest.mark.parametrize(("offset", "speed"), [(0.25, 343.2), (-0.1, 343.2), (0.0, 319.0), (0.1, 360.0)])
 def test_the_maximum_range_applies_to_corrected_ranges(offset, speed):
-    """Echoes just within it vote and those beyond it do not, whatever the sensors add and the air does."""
+    """Echoes just within the maximum range vote and others do not, for any range offset and speed of sound."""
     ring = dataclasses.replace(Ring.circular(), range_offset=offset, speed_of_sound=speed)
     for rho, heard in [(2.2, True), (2.5, False)]:
         near = oracles.echoes_of_wall(Ring.circular(max_range=3.0), rho, 0.4)

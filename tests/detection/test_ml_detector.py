@@ -1,4 +1,4 @@
-"""Method ml from ranges and logs to walls, corners, edges and what stays open; JSON; the command line.
+"""Method ml from ranges and logs to walls, corners, edges and undecided reflectors; JSON; the command line.
 
 Scans have at most 64 echoes and never come alone where they need not, so that little is compiled.
 """
@@ -38,7 +38,7 @@ SCANS, ROOM = 16, 64
 
 @pytest.fixture(scope="module")
 def log():
-    """Scans of different places in different rooms: walls, corners, edges, noise of 3 mm, false echoes."""
+    """Scans in different rooms: walls, corners, edges, noise of 3 mm, clutter."""
     return log_of(*(scan for scan in some_scans(60) if len(scan) <= ROOM))[:SCANS]
 
 
@@ -123,7 +123,7 @@ def test_lines_are_sorted_normalized_and_padded(log):
 
 @pytest.mark.slow
 def test_unused_slots_do_not_change_the_lines(log):
-    """Of paths with more echoes, the nearest two."""
+    """The nearest two echoes of every path."""
     ranges = np.sort(dense_of(log), axis=2)
     two = ranges[:, :, :2]
     wide = np.concatenate([two, np.full_like(two, np.nan)], axis=2)
@@ -210,7 +210,7 @@ def test_a_known_noise_is_reported_and_scales_covariances(log):
     np.testing.assert_allclose(np.median(ratios, axis=0), 1.21, rtol=0.05)
 
 
-# what stands there
+# kinds of reflectors
 
 
 def test_a_corner_between_its_walls_is_reported():
@@ -252,7 +252,7 @@ def test_direct_echoes_alone_do_not_distinguish_corner_and_edge(corner):
 
 
 def test_method_hough_takes_the_same_echoes_for_a_wall():
-    """Why there is a method ml: a pole is its best line."""
+    """The motivation of method ml: method hough reports a pole as its strongest line."""
     loud = Acoustics(pole_strength=1.0)
     came = simulate(RING, Room(np.zeros((0, 2, 2)), poles=np.array([[1.0, 0.2]])), np.zeros((1, 3)), acoustics=loud)
     scan = list(zip(came.path.tolist(), came.range.tolist(), strict=True))
@@ -264,7 +264,7 @@ def test_method_hough_takes_the_same_echoes_for_a_wall():
     assert point.kind == "edge"
 
 
-# mistakes
+# invalid arguments
 
 
 @pytest.mark.parametrize("sigma", [0.0, -0.001, 1e-7, 1.5, math.nan, math.inf])

@@ -1,4 +1,4 @@
-"""Windows of a sparse ring in simulated corridors: walls where they are, not where posts are, not across doors."""
+"""Windows of a sparse ring in simulated corridors: walls are detected; posts and door openings are not walls."""
 
 import numpy as np
 import pytest
@@ -17,13 +17,13 @@ SIGMA, STEP = 0.005, 0.01
 
 
 def drive(sway=0.05, scans=97):
-    """A robot going down the corridor, not quite straight."""
+    """A slightly curved trajectory along the corridor."""
     x = np.linspace(0.0, 8.0, scans)
     return np.column_stack([x, sway * np.sin(x), sway * np.cos(x)])
 
 
 def recorded(room, poses, seed, *, stale=True):
-    """The log of a device with readings of 10 mm; every second scan repeats what the one before it had."""
+    """The log of a device with a range step of 10 mm, in which every second scan repeats the previous one."""
     heard = simulate(RING, room, poses, sigma=SIGMA, seed=seed, max_echoes=1).as_log(RING, poses)
     scan, tx, rx, reach = [], [], [], []
     for k in range(len(poses)):
@@ -43,7 +43,7 @@ def models_of(room, seed, poses=None, **how):
 
 
 def is_wall(room, pose, line):
-    """For every wall of a room whether a line is within 15 mm and 1 deg of it."""
+    """For every wall of a room, whether a line is within 15 mm and 1 deg of it."""
     rho, theta = walls_in_robot_frame(room, pose)
     return (np.abs(rho - line.rho) < 0.015) & (np.abs(oracles.wrap(theta - line.theta)) < np.radians(1))
 
@@ -60,12 +60,12 @@ def test_exactly_both_walls_of_a_corridor_are_detected(seed, stale):
         assert all(sum(which) == 1 for which in walls), f"window {k}: a line elsewhere"
         times = np.sum(walls, axis=0)
         assert times.max() == 1, f"window {k}: a wall is there twice"
-        assert k == 0 or times.min() == 1, f"window {k}: a wall is missing"  # the first has gathered half of one
+        assert k == 0 or times.min() == 1, f"window {k}: a wall is missing"  # the first window is only half full
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_lines_are_consistent_with_their_echoes(seed):
-    """Every echo is in one line at most, enough of them and long enough; segments lie on their lines."""
+    """Every echo is in one line at most; lines have enough echoes and length; segments lie on their lines."""
     windows, log = models_of(CORRIDOR, seed)
     for _, model in windows:
         for line in model.lines:
@@ -92,7 +92,7 @@ def test_poles_are_not_reported_as_walls(poles, seed):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("middle", [3.0, 4.3])
 def test_a_door_splits_a_wall(middle, seed):
-    """No segment covers the middle of an opening of 1 m, and both parts of the wall are there."""
+    """No segment covers the middle of an opening of 1 m, and both parts of the wall are detected."""
     left = [[[-3.0, 0.9], [middle - 0.5, 0.9]], [[middle + 0.5, 0.9], [12.0, 0.9]]]
     room = Room(np.array([*left, RIGHT]))
     windows, _ = models_of(room, seed)
@@ -108,7 +108,7 @@ def test_a_door_splits_a_wall(middle, seed):
 
 
 def test_lines_are_invariant_under_motions_of_the_world():
-    """The same log driven elsewhere: local models are in the robot's frame."""
+    """The same log after a motion of the world: local models are in the robot frame."""
     room, poses = CORRIDOR, drive()
     log = recorded(room, poses, 0)
     motion = np.array([3.0, -7.0, 2.0])
@@ -125,7 +125,7 @@ def test_lines_are_invariant_under_motions_of_the_world():
 
 
 def test_lines_refer_to_scans_by_their_numbers():
-    """A model is called after its window's last scan, its lines after those that their echoes come from."""
+    """A model has the number of its window's last scan; its lines have the numbers of the scans of their echoes."""
     log = recorded(CORRIDOR, drive(), 0)
     numbers = np.arange(len(log))[::-1] * 7 + 100
     named = Log.from_echoes(log.echo_scan, log.tx, log.rx, log.range, stamp=log.stamp, pose=log.pose, scan=numbers)
@@ -140,7 +140,7 @@ def test_lines_refer_to_scans_by_their_numbers():
 
 def test_an_accumulator_must_cover_the_range_of_a_window():
     log = recorded(CORRIDOR, drive(scans=5), 0)
-    local_models(RING, log, settings=HoughSettings())  # 4 m are enough for a single scan
+    local_models(RING, log, settings=HoughSettings())  # 4 m suffice for a single scan
     with pytest.raises(SonarError, match=r"rho_cells 100 x rho_cell 0\.04 m = 4 m; allowed is 5\.19\d m or more"):
         local_models(RING, log, window=LENGTH, settings=HoughSettings())
 

@@ -14,7 +14,7 @@ from jaxsonar import HoughSettings, Ring, kernels
 from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.geometry.se2 import relative, transform_points
 
-RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # no point on a cell's border
+RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # no point at the border of a cell
 SETTINGS = HoughSettings()
 ROOM = 256
 endpoints_of = jax.jit(kernels.segment_endpoints)
@@ -24,7 +24,7 @@ metres = st.floats(-1, 1)
 
 
 def packed(echoes, *, poses=True, gathered=None):
-    """(1, ROOM) echoes from a list of (pose, path, range); the poses left out if asked for."""
+    """(1, ROOM) echoes from a list of (pose, path, range), optionally without the poses."""
     path, reported = np.zeros((1, ROOM), np.int32), np.full((1, ROOM), np.nan, np.float32)
     pose = np.zeros((1, ROOM, 3), np.float32)
     for k, (stood, row, reach) in enumerate(echoes):
@@ -40,7 +40,7 @@ def one_scan(echoes):
 
 
 def mixed_echoes(rng, ring=RING, poses=((0, 0, 0),)):
-    """A wall and as many false echoes."""
+    """Echoes of a wall, and as many false echoes."""
     true = [echo for pose in poses for echo in oracles.plane_echoes(ring, np.array(pose), 1.2, 0.3)]
     false = [(pose, int(rng.integers(len(ring.paths))), rng.uniform(0.4, 1.9)) for pose, _, _ in true]
     return (true + false)[:ROOM]

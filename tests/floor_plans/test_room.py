@@ -1,4 +1,4 @@
-"""Rooms: GeoJSON there and back, where walls meet, lines in the robot frame, random rooms and poses."""
+"""Rooms: junctions of walls, GeoJSON round trips, lines in the robot frame, random rooms and poses."""
 
 import json
 import subprocess
@@ -24,13 +24,13 @@ def loop(points):
 
 
 def widths_at(room, point):
-    """Wedges around the vertex at this point, degrees, ascending; none where there is no vertex."""
+    """Widths of the wedges around the vertex at this point, degrees, ascending; empty without a vertex."""
     junctions = room.junctions
     vertex = np.flatnonzero(np.linalg.norm(junctions.vertices - point, axis=-1) < 1e-3)
     return np.sort(np.degrees(junctions.wedge_width[np.isin(junctions.wedge_vertex, vertex)]))
 
 
-# Where walls meet.
+# Junctions.
 
 
 def test_a_rectangle_has_four_right_angles_inside_and_four_edges_outside():
@@ -59,11 +59,11 @@ def test_wedges_of_t_x_and_straight_junctions():
 def test_overlapping_walls_share_one_direction():
     room = Room(np.array([[[0.0, 0.0], [2.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]]))
     assert np.allclose(widths_at(room, [0, 0]), [90, 270])
-    assert room.junctions.right_angled.sum() == 4  # both walls along x with the one along y, both orders
+    assert room.junctions.right_angled.sum() == 4  # both walls along x with the wall along y, in both orders
     corner = room.junctions.corners
     assert np.allclose(np.sort(room.junctions.wedge_reach[corner]), [[1.0, 2.0]])
     leftwards = Room(np.array([[[0.0, 0.0], [-1.0, 1e-17]], [[0.0, 0.0], [-1.0, -1e-17]], [[0.0, 0.0], [0.0, 1.0]]]))
-    assert np.allclose(widths_at(leftwards, [0, 0]), [90, 270])  # on both sides of the seam at pi
+    assert np.allclose(widths_at(leftwards, [0, 0]), [90, 270])  # on both sides of theta = pi
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.9e-3])
@@ -151,7 +151,7 @@ def test_geojson_round_trip(seed, tmp_path):
 
 def test_every_geometry_becomes_walls_and_poles(tmp_path):
     ring = [*SQUARE, SQUARE[0]]
-    hole = [[1, 1], [2, 1], [2, 1], [2, 2], [1, 1]]  # a position twice
+    hole = [[1, 1], [2, 1], [2, 1], [2, 2], [1, 1]]  # a repeated position
     room = load_room(
         write(
             tmp_path / "room.geojson",

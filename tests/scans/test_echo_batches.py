@@ -18,7 +18,7 @@ PATHS = len(RING.paths)
 
 
 def some_ranges(count, *, slots=2):
-    """Scans of random rooms, some of them thinned, one of them empty, one with an echo in every slot."""
+    """Scans of random rooms: some with dropout, one without echoes, one with an echo in every slot."""
     rng = np.random.default_rng(3)
     room = random_room(rng)
     poses = np.stack([random_pose(rng, room) for _ in range(count)])

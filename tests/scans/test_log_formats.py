@@ -87,7 +87,7 @@ def test_logs_are_immutable():
         SMALL.range[0] = -1.0
     ranges = np.array([1.0])
     Log.from_echoes(np.array([0]), np.array([0]), np.array([0]), ranges, stamp=np.zeros(1), pose=np.zeros((1, 3)))
-    ranges[0] = 2.0  # the caller's own array stays writable
+    ranges[0] = 2.0  # the caller's array stays writable
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_logs_are_immutable():
     ],
 )
 def test_invalid_values_raise_an_error(change, message, monkeypatch):
-    # Users have no shape checks; those of the test run would get there first.
+    # Without the shape checks of the test run, which would fail first.
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     columns = {
         "scan_index": [0, 1],
@@ -125,7 +125,7 @@ def test_invalid_values_raise_an_error(change, message, monkeypatch):
         Log.from_echoes(**arrays)
 
 
-# ---- without loss
+# ---- round trips
 
 
 @settings(deadline=None)
@@ -196,8 +196,8 @@ def test_a_log_without_scans():
         lambda text: b"\xef\xbb\xbf" + text,
         lambda text: text.replace(b"\n", b"\r\n"),
         lambda text: b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n"),
-        lambda text: text.replace(b"7,0.5", b"7.0,5e-1"),  # as a table program may write it
-        lambda text: text.replace(b"7,0.5", b"+07,.5", 1),  # the same numbers in other letters within a scan
+        lambda text: text.replace(b"7,0.5", b"7.0,5e-1"),  # as a spreadsheet may write it
+        lambda text: text.replace(b"7,0.5", b"+07,.5", 1),  # the same numbers in another notation within a scan
     ],
 )
 def test_other_csv_dialects_of_the_same_log(dialect):
@@ -208,7 +208,7 @@ def test_upper_case_suffixes():
     assert read(SMALL_CSV, "LOG.CSV") == SMALL
 
 
-# ---- what is wrong is named
+# ---- errors
 
 GOOD = "0,0.5,1,2,3,4,5,1.5"
 BAD_ROWS = [
@@ -266,7 +266,7 @@ def test_an_invalid_value_is_named(row, column, came, allowed, before):
         (["0,,,,,,,", "0,,,,,,,"], "row 3, column tx: nothing", "the only one of its scan"),
         (["0,,,,,1,1,1.5", "0,,,,,1,1"], "row 3: 7 columns", "allowed are 8, scan,stamp,x,y,theta,tx,rx,range"),
         (["0,,,,,1,1,1.5", "0,,,,,1,1,1.5,3"], "row 3: 9 columns", "allowed are 8"),
-        (["0,,,,,1,1", "0,,,,,1,1,1.5,3"], "row 2: 7 columns", "allowed are 8"),  # right on average
+        (["0,,,,,1,1", "0,,,,,1,1,1.5,3"], "row 2: 7 columns", "allowed are 8"),  # the right total number
         (["0,,,,,1,1,1.5", "", "1,,,,,1,1,1.5"], "row 3: no columns", "allowed are 8"),
         (["0,,,,,1,1,1.5", "\0\1\2"], "row 3: this is no text", "allowed are 8 numbers"),
     ],

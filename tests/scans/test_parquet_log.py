@@ -128,6 +128,3 @@ def test_a_missing_parquet_extra_is_explained(monkeypatch, tmp_path):
         expected = "Parquet needs the parquet extra: pip install 'jaxsonar[parquet]'"
         assert str(caught.value) == f"{file}: {expected}"
     assert not list(tmp_path.iterdir())
-
-
-# ---- writing

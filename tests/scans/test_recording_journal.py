@@ -1,4 +1,4 @@
-"""Records of a device: nothing of what came is lost but the last second, whatever happens to the process."""
+"""Recordings of a device: a killed process loses at most the last second."""
 
 import os
 import random
@@ -54,7 +54,7 @@ def assembled(sent: list[Message]) -> list[RawScan]:
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_recorded_log_contains_all_scans(suffix, tmp_path):
     path = tmp_path / f"log{suffix}"
-    save_log(Log.from_scans([]), path)  # what was there before goes
+    save_log(Log.from_scans([]), path)  # an old file is replaced
     sent = list(messages())
     scans, reader = read_all(Given(map(encode, sent)), open_log_recorder(path))
     assert reader.counts["scans"] == len(scans) == 5
@@ -94,7 +94,7 @@ def test_a_raw_recording_contains_all_bytes_and_both_clocks(tmp_path):
     assert before - 1e-6 <= min(host) <= max(host) <= time.time() + 1e-6
     from mcap.reader import make_reader
 
-    with open(path, "rb") as file:  # and for everyone else's tools
+    with open(path, "rb") as file:  # readable for other MCAP tools
         found = make_reader(file).get_summary()
         assert found is not None
         assert found.statistics is not None
@@ -130,7 +130,7 @@ def test_a_raw_recording_is_replayed_with_its_timing(speed, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_truncated_log_can_be_recovered(suffix, tmp_path):
-    """Killed within any write: all scans that were written whole, and no part of another one."""
+    """After a kill during any write, exactly the complete scans are recovered."""
     path = tmp_path / f"log{suffix}"
     scans = assembled(list(messages(4, groups=2, echoes=2)))
     text = as_log(scans).encode()
@@ -146,7 +146,7 @@ def test_a_truncated_log_can_be_recovered(suffix, tmp_path):
     lengths = {*range(ends[0], len(text) + 1, 29), *(end + k for end in ends[1:] for k in (-1, 0, 1))}
     for length in sorted(length for length in lengths if length <= len(text)):
         told_whole = max(k for k in range(5) if ends[k] <= length)
-        for known in {told_whole, max(0, told_whole - 1)}:  # killed before it could say that the scan is whole
+        for known in {told_whole, max(0, told_whole - 1)}:  # killed before the marker was updated
             journal.write_bytes(text[:length])
             mark.write_text(f"{ends[known]:20d}\n")
             with warnings.catch_warnings(record=True) as told:
@@ -155,8 +155,8 @@ def test_a_truncated_log_can_be_recovered(suffix, tmp_path):
             assert log == whole[:known]
             said = [str(warning.message) for warning in told]
             assert len(said) == (suffix == ".parquet" or length > ends[known])
-            assert all(f"log{suffix}: the recording was cut short: {known} scans" in text for text in said)
-    for length in range(0, len(text), 41):  # a machine that lost power may have lost more than it said
+            assert all(f"log{suffix}: the recording is incomplete: {known} scans" in text for text in said)
+    for length in range(0, len(text), 41):  # after a power failure the file may be shorter than the marker says
         journal.write_bytes(text[:length])
         mark.write_text(f"{len(text):20d}\n")
         with warnings.catch_warnings():
@@ -168,7 +168,7 @@ def test_a_truncated_log_can_be_recovered(suffix, tmp_path):
     assert load_log(path) == whole
     if suffix == ".csv":
         path.write_bytes(text[:-20])
-        with pytest.raises(SonarError, match="columns came"):  # a file that nobody was writing
+        with pytest.raises(SonarError, match="columns came"):  # no marker: the file was not being recorded
             load_log(path)
 
 
@@ -205,7 +205,7 @@ def test_a_truncated_raw_recording_can_be_read(tmp_path):
 
 
 def test_errors_of_the_reading_thread_reach_the_consumer(tmp_path):
-    """After everything that came before them, and with the record closed."""
+    """The errors arrive after all earlier messages, and the recording is closed."""
     sent = [encode(message) for message in messages(3)]
     queue: DropOldestQueue[RawScan] = DropOldestQueue()
     path = tmp_path / "log.csv"
@@ -239,7 +239,7 @@ def test_a_full_disk_raises_a_one_line_error(tmp_path):
 def test_invalid_frames_and_groups_are_counted_together():
     echoes = np.zeros(1, ECHO)
     echoes["time_us"] = 1000.0
-    many = encode(Group(9, 2_000_000, 1, 0, 500, 20.0, echoes))  # of so many groups makes nobody a scan
+    many = encode(Group(9, 2_000_000, 1, 0, 500, 20.0, echoes))  # too many groups for a scan
     hot = encode_frame(struct.pack("<BBBBIQIHHfHH", 1, 0, 1, 0, 10, 2_000_000, 1, 0, 4, 1e9, 0, 0))
     scans, reader = read_all(Given([*map(encode, messages(1)), many, hot, hot]))
     assert len(scans) == 1
@@ -317,10 +317,10 @@ def test_a_waiting_reader_drops_nothing_and_stops_after_the_requested_scans():
 @pytest.mark.slow
 @pytest.mark.parametrize("played_back", [True, False])
 def test_the_reader_waits_for_replays_but_not_for_live_devices(played_back):
-    """Also once it has been made to wait for longer than its own clock is ahead."""
+    """This also holds after a wait that is longer than the lead of the device's clock."""
     scans = 120
     sent = list(messages(scans, groups=1))
-    for message in sent:  # a scan is 0.1 s, or as long as it takes to come
+    for message in sent:  # a scan takes 0.1 s, or as long as its transmission
         object.__setattr__(message, "time_us", message.time_us * (9 if played_back else 0) + message.sequence * 100)
     queue: DropOldestQueue[RawScan] = DropOldestQueue(16)
     reader = ReaderThread(Given(map(encode, sent), pause=0.0002), queue, block_when_full=None)
@@ -363,7 +363,7 @@ reader._thread.join()
 
 
 def killed(stem, pause, after):
-    """A process that records, killed so long after its first scan: what it said until then, and when that was."""
+    """Output with times of a recording process that is killed this long after its first scan."""
     code = WRITER.format(tests=str(Path(__file__).parents[1]), stem=stem, pause=pause)
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -379,7 +379,7 @@ def killed(stem, pause, after):
 
 @pytest.mark.slow
 def test_a_killed_recorder_loses_at_most_one_second(tmp_path):
-    """Twenty processes, four at a time, killed at random moments: every file opens, with what came a second before."""
+    """Twenty processes killed at random times: every file opens and contains all scans up to one second before."""
     rng = random.Random(7)
     stems = [str(tmp_path / f"log{k}") for k in range(20)]
     pauses = [rng.choice([0.0, 0.001, 0.01]) for _ in stems]

@@ -35,7 +35,7 @@ def test_relative_poses_agree_with_matrices(a, b):
 
 
 def a_log(seed, *, ring=FOUR, scans=40, missing=0.05, strangers=True):
-    """A path with stops, turns in place and scans without pose; readings that are repeated, lost and come again."""
+    """A trajectory with stops, rotations in place and missing poses, with repeated and missing readings."""
     rng = np.random.default_rng(seed)
     pose, poses, readings, before = np.zeros(3), [], [], []
     for _ in range(scans):
@@ -68,7 +68,7 @@ def log_of(readings, poses, scan=None):
 
 
 def heard(ring, log):
-    """Per scan the (path, range) that the ring listens to."""
+    """The (path, range) of each scan on the ring's paths."""
     return [
         [
             (int(ring.path_index[tx, rx]), float(reach))
@@ -96,7 +96,7 @@ def test_a_log_of_no_scans():
     assert Log.from_scans([]) == log_of([], [])
 
 
-# what a window keeps
+# contents of windows
 
 
 @settings(max_examples=40)
@@ -140,12 +140,12 @@ def test_windows_cover_the_trajectory_with_their_length_and_cross_no_gap(seed, l
         way = np.hypot(*np.diff(log.pose[first : last + 1, :2], axis=0).T)
         assert known[first : last + 1].all()
         assert way.sum() <= length + 1e-9
-        if first > 0 and known[first - 1]:  # one scan more would be too long
+        if first > 0 and known[first - 1]:  # one more scan would exceed the length
             assert way.sum() + np.hypot(*(log.pose[first] - log.pose[first - 1])[:2]) > length - 1e-9
         covered[first : last + 1] = True
     assert not covered[~known].any()
     steps = np.hypot(*np.diff(log.pose[:, :2], axis=0).T)
-    if np.nanmax(steps) < length / 2:  # else the robot leaps
+    if np.nanmax(steps) < length / 2:  # otherwise steps are longer than windows
         assert covered[known].all()
 
 
@@ -161,7 +161,7 @@ def test_every_echo_is_in_two_windows_of_a_uniform_trajectory():
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [0.1, 0.05, 0.025])
 def test_incremental_windows_of_decimal_steps_end_at_the_same_scans(step):
-    """A pose may come to lie just on the end of a window; both ways must round alike."""
+    """A pose may lie exactly at the end of a window; both algorithms must round alike."""
     log = log_of([[(0, 0, 1 + k / 100)] for k in range(120)], np.arange(120)[:, None] * [step, 0.0, 0.0])
     for length in (0.2, 0.3, 0.4, 0.6, 1.0, 1.4):
         whole, _ = gather_windows(FOUR, log, length=length)
@@ -174,11 +174,11 @@ def test_short_windows_contain_one_scan_each():
     assert windows.last.tolist() == [1, 2]
 
 
-# readings that are repeated, robots that wait
+# repeated readings, robots at rest
 
 
 def kept_of(readings, poses=None, ring=FOUR):
-    """(scan, path, range) of the readings that ``is_fresh_reading`` keeps."""
+    """(scan, path, range) of the fresh readings."""
     poses = straight([0.1] * (len(readings) - 1)) if poses is None else poses
     flat, _ = FlatEchoes.from_log(ring, log_of(readings, poses))
     fresh = is_fresh_reading(flat)
@@ -207,7 +207,7 @@ def test_fresh_readings_agree_with_the_slow_oracle(seed):
 
 @pytest.mark.parametrize("times", [1, 2, 5])
 def test_duplicates_in_a_scan_are_fresh_like_single_readings(times):
-    """A device that rounds may report two echoes of a path at one range."""
+    """A device with coarse ranges may report two echoes of a path at one range."""
     twice = kept_of([[(0, 0, 1.0), (0, 0, 1.0)]] * times)
     assert sorted({scan for scan, _, _ in twice}) == [scan for scan, _, _ in kept_of([[(0, 0, 1.0)]] * times)]
 
@@ -244,7 +244,7 @@ def test_a_robot_at_rest_adds_one_scan_to_its_window():
     assert sorted(set(windows.scan.tolist()) & set(range(9))) == [0, 1, 2, 3]
 
 
-# logs with hardly anything in them
+# nearly empty logs
 
 
 @pytest.mark.parametrize(
@@ -311,11 +311,11 @@ def test_the_order_of_scans_does_not_depend_on_their_numbers():
     np.testing.assert_array_equal(one.echoes.pose, other.echoes.pose)
 
 
-# scan by scan
+# incremental windows
 
 
 def scan_by_scan(ring, log, length):
-    """Windows of a log as a robot gathers them, with rows as in the log."""
+    """Windows of a log, built scan by scan, with the rows of the log."""
     buffer, ended, row, found = WindowBuffer(), True, {int(number): k for k, number in enumerate(log.scan)}, []
 
     def close(buffer):

@@ -72,7 +72,7 @@ def test_detection_ranges_are_the_intersection_of_both_cones(ring):
         for k, (tx, rx) in enumerate(ring.paths):
             edges = [abs(abs(oracles.wrap(direction - ring.heading[s])) - ring.beam[s] / 2) for s in (tx, rx)]
             if min(edges) < 1e-4:
-                continue  # on the edge of a cone
+                continue  # at the border of a cone
             both = all(oracles.receives(ring.heading[s], ring.beam[s], direction) for s in (tx, rx))
             assert both == ((direction - first[k]) % (2 * np.pi) < last[k] - first[k])
 
@@ -100,10 +100,10 @@ def test_firing_groups_do_not_interfere(shape):
                 assert a == b or apart >= 2 * neighbors + 2
         audible = [(group[:, None] + np.arange(-neighbors, neighbors + 1)).ravel() % count]
         if len(group) > 1:
-            assert len(np.unique(audible)) == len(np.ravel(audible))  # every receiver listens to one transmitter
+            assert len(np.unique(audible)) == len(np.ravel(audible))  # every receiver can receive one transmitter only
             gaps = np.diff(np.append(group, group[0] + count))
             between = (group + gaps // 2)[gaps == 2 * neighbors + 2] % count
-            assert not np.isin(between, audible).any()  # the one in the middle hears nothing
+            assert not np.isin(between, audible).any()  # the sensor in the middle receives nothing
 
 
 def test_firing_groups_are_as_few_as_the_spacing_allows():

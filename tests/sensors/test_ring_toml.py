@@ -1,4 +1,4 @@
-"""Ring files: what is saved loads as the same ring, and every bad key is named with what is allowed."""
+"""Ring files: lossless round trips, and errors that name the key and the allowed values."""
 
 import os
 import tempfile
@@ -55,7 +55,7 @@ def refused(text):
     with pytest.raises(SonarError) as caught:
         read(text)
     message = str(caught.value)
-    assert message.isprintable()  # so one line, too
+    assert message.isprintable()  # therefore one line
     assert "/ring.toml: " in message
     return message.partition("/ring.toml: ")[2]
 
@@ -67,7 +67,7 @@ def assert_same(one, other):
 
 
 def saved(ring):
-    """The tables of the file, and the ring that is read from it."""
+    """The tables of the file, and the ring loaded from it."""
     with tempfile.TemporaryDirectory() as folder:
         file = os.path.join(folder, "ring.toml")
         save_ring(ring, file)
@@ -271,7 +271,7 @@ def test_shipped_rings_load_by_name(tmp_path, monkeypatch):
         ring = load_ring(name)
         assert_same(saved(ring)[1], ring)
     assert_same(load_ring("faw"), Ring.circular(name="FAW ring"))
-    (tmp_path / "faw").write_text(CIRCLE)  # a file of that name comes first
+    (tmp_path / "faw").write_text(CIRCLE)  # a file of that name has priority
     assert load_ring("faw").name == "round"
 
 

@@ -16,7 +16,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def pra_images(pra, corners, tx, rx):
-    """Visible image sources of tx up to second order in a polygon: as they come (float32), and refined to float64.
+    """Visible image sources of tx up to second order in a polygon: in float32 as returned, and refined to float64.
 
     pyroomacoustics computes in float32: 24 bits of a few metres are no better than 1e-6 m. Which images are visible and
     over which walls they came is its answer; mirroring tx again at those walls in float64 removes its rounding.
@@ -27,7 +27,7 @@ def pra_images(pra, corners, tx, rx):
     scene.image_source_model()
     source = scene.sources[0]
     walls = [(wall.corners[:, 0].astype(float), wall.normal.astype(float)) for wall in scene.walls]
-    # Its walls are ours, in float32: take the exact ones.
+    # Its walls are rounded to float32; use the exact ones.
     exact = loop(corners)
     nearest = [np.abs(exact[:, 0] - start).sum(-1).argmin() for start, _ in walls]
 
@@ -74,9 +74,9 @@ def test_path_lengths_agree_with_pyroomacoustics():
         for k in range(len(tx)):
             lengths = np.sort(found.length[(found.pair == k) & np.isin(found.kind, SPECULAR)])
             raw, refined = pra_images(pra, corners, tx[k], rx[k])
-            assert len(lengths) == len(raw)  # both ways: nothing missed, nothing invented
+            assert len(lengths) == len(raw)  # exactly the same echoes
             assert np.abs(lengths - refined).max() < 1e-6
-            assert np.abs(lengths - raw).max() < 1e-5  # as far as float32 goes
+            assert np.abs(lengths - raw).max() < 1e-5  # float32 precision
             total += len(lengths)
     assert 5 < convex < 35
     assert total > 2000
@@ -90,7 +90,7 @@ def mirror(point, wall):
 
 
 def meeting(p, q, wall):
-    """Where the open segment p-q meets a closed wall, or None."""
+    """Intersection of the open segment p-q with a closed wall, or None."""
     start, end = wall
     matrix = np.stack([q - p, start - end], axis=1)
     if abs(np.linalg.det(matrix)) < 1e-14:
@@ -100,13 +100,13 @@ def meeting(p, q, wall):
 
 
 def clear(shapely, walls, p, q):
-    """Whether no wall stands between p and q; the legs' ends may lie on walls."""
+    """Whether no wall intersects the leg p-q; its ends may lie on walls."""
     margin = 1e-7 * (q - p)
     return not shapely.LineString([p + margin, q - margin]).intersects(walls)
 
 
 def oracle(shapely, room, tx, rx):
-    """All echoes of one pair, one after the other: sorted lengths of planes, double reflections, edges, poles."""
+    """All echoes of one pair by loops: sorted lengths of planes, double reflections, edges, poles."""
     walls = shapely.MultiLineString(list(room.walls))
     planes, doubles = [], []
     for wall in room.walls:
@@ -132,7 +132,7 @@ def oracle(shapely, room, tx, rx):
 
 
 def opening(room, c, sensor):
-    """Degrees between the walls on either side of a sensor, as seen from the end c of a wall."""
+    """Angle (degrees) of the wedge at the end c of a wall in which a sensor lies."""
     leaving = []
     for start, end in room.walls:
         if np.linalg.norm(start - c) + np.linalg.norm(end - c) < np.linalg.norm(end - start) + 1e-9:
@@ -259,7 +259,7 @@ def test_max_range_limits_the_traced_echoes(rng):
     assert 0 < len(near) < len(far)
 
 
-# The table of path lengths.
+# Closed-form path lengths.
 
 coordinate = st.floats(-1.5, 1.5)
 
@@ -272,7 +272,7 @@ def test_length_of_a_plane_echo(xi, xj, yi, yj, angle):
     plane = found.length[found.kind == EchoKind.PLANE]
     normal, tangent = turned([[0.0, 1.0], [1.0, 0.0]], angle)
     middle, half = (tx + rx)[0] / 2, (rx - tx)[0] / 2
-    # rho = 0 here: the wall goes through the origin.
+    # Here rho = 0: the wall contains the origin.
     assert np.allclose(plane, 2 * np.hypot(middle @ normal, half @ tangent) if yi * yj > 0 else [])
     assert len(plane) == 1
 
@@ -288,7 +288,7 @@ def test_length_of_a_corner_echo(xi, xj, yi, yj, angle, off):
     room = Room(corner + np.stack([np.zeros((2, 2)), directions], axis=1))
     e1, e2 = directions / 9.0
     tx, rx = (corner + np.array([x]) * e1 + np.array([y]) * e2 for x, y in ((xi, yi), (xj, yj)))
-    for a, b in ((tx, rx), (tx, tx)):  # the direct echo goes through the corner itself
+    for a, b in ((tx, rx), (tx, tx)):  # the direct echo passes through the vertex
         found = trace_between(room, a[None], b[None])
         corners = found[found.kind == EchoKind.CORNER]
         assert np.allclose(corners.length, [2 * np.linalg.norm((a + b) / 2 - corner)])
@@ -303,7 +303,7 @@ def test_only_right_angled_corners_are_retroreflectors(off_deg):
     room = Room(np.array(walls))
     found = trace_between(room, inside, inside)
     assert (np.count_nonzero(found.kind == EchoKind.CORNER) == 1) == (abs(off_deg) < 1)
-    # A wedge below 90 deg sends the sound back as well, by way of both walls; one above does not.
+    # A wedge below 90 deg also returns the sound by both walls; one above 90 deg does not.
     assert np.count_nonzero(found.kind == EchoKind.SECOND_ORDER) == (off_deg < -1)
     found = trace_between(room, outside, outside)
     assert not np.isin(found.kind, [EchoKind.CORNER, EchoKind.SECOND_ORDER]).any()

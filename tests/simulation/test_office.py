@@ -1,4 +1,4 @@
-"""The embedded office is the room it claims to be, and the demo writes what it promises."""
+"""The embedded office has the documented geometry, and the demo writes the documented files."""
 
 import json
 import math
@@ -39,20 +39,20 @@ def noisy(office):
 
 
 def gap(point, wall):
-    """Distance of a point from a segment, by trying points along it."""
+    """Distance of a point from a segment, by sampling points along it."""
     along = np.linspace(0, 1, 20_001)[:, None]
     return np.linalg.norm(wall[0] + along * (wall[1] - wall[0]) - point, axis=-1).min()
 
 
 def in_frame(pose, point):
-    """A point of the world as the robot sees it."""
+    """A world point in the robot frame."""
     x, y = np.asarray(point) - pose[:2]
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     return np.array([cos * x + sin * y, cos * y - sin * x])
 
 
 def seen_line(pose, wall):
-    """(rho, theta) of a wall's line as the robot sees it: the foot of the perpendicular."""
+    """(rho, theta) of a wall's line in the robot frame, from the foot of the perpendicular."""
     start, end = (in_frame(pose, point) for point in wall)
     along = (end - start) / np.linalg.norm(end - start)
     foot = start - (start @ along) * along
@@ -119,7 +119,7 @@ def test_the_robot_crosses_no_wall(office):
 
 
 def test_the_room_is_closed_and_not_aligned_with_the_ring(office):
-    """Every end of an outer wall is the end of another one; no wall is square to a sensor at the first pose."""
+    """Outer walls form a closed loop; no wall is perpendicular to a sensor axis at the first pose."""
     outer = [wall for wall, name in zip(office.room.walls, office.room.wall_names, strict=True) if name != CHAIR]
     ends = [tuple(end) for wall in outer for end in wall.tolist()]
     assert all(ends.count(end) == 2 for end in ends)
@@ -129,7 +129,7 @@ def test_the_room_is_closed_and_not_aligned_with_the_ring(office):
 
 
 def test_the_chair_is_detected_at_later_poses_only(office, noisy):
-    """With every seed: none at the first pose, one from at least one later pose."""
+    """For every seed: no line at the first pose, and a line at one or more later poses."""
     chair = chair_of(office)
     for _, models in noisy:
         seen = [
@@ -141,7 +141,7 @@ def test_the_chair_is_detected_at_later_poses_only(office, noisy):
 
 
 def test_three_walls_at_the_first_pose_with_deviations_as_in_the_paper(office, noisy):
-    """In 8 of 10 seeds all three walls have a line within the paper's deviations, and nothing else has one."""
+    """For 8 of 10 seeds exactly the three walls have lines, within the paper's deviations."""
     good = 0
     for _, models in noisy:
         walls = {
@@ -168,7 +168,7 @@ def test_most_clearly_visible_walls_are_detected(office, noisy):
 
 
 def test_segments_of_true_walls_lie_on_them(office, noisy):
-    """Of the lines that are the back wall: the middle of each segment is near it in the world."""
+    """The middle of each segment of the back wall is near that wall in the world frame."""
     wall = office.room.walls[office.room.wall_names.index("back wall")]
     for _, models in noisy[:3]:
         for model, pose in zip(models[:4], office.poses, strict=False):
@@ -193,7 +193,7 @@ FILES = {
 
 @pytest.fixture(scope="module")
 def written(short_demo):
-    """The folder of a short demo, and what it said."""
+    """The folder of a short demo, and its output."""
     folder, tables, said = short_demo
     return folder / "demo", tables, said
 
@@ -231,12 +231,12 @@ def test_the_table_contains_finite_numbers(written):
             assert row["theta_max_deg"] == pytest.approx(np.degrees(np.abs(result.theta_error)).max())
     first = table[0]
     assert (first["walls"], first["recall"]) == (3, 1.0)
-    # Both methods and both rings are asked for the same walls; the paper's ring finds more of them.
+    # Both methods and both rings are evaluated on the same walls; the paper's ring detects more of them.
     for full, paper, usual in ((2, 3, 4), (5, 6, 7)):
         assert table[full]["walls"] == table[paper]["walls"] == table[usual]["walls"]
         assert table[full]["recall"] > table[usual]["recall"]
         assert table[full]["echoes_per_scan"] > table[usual]["echoes_per_scan"]
-        # Maximum likelihood is nearer to the truth than the centre of gravity, and takes fewer corners for walls.
+        # Maximum likelihood is more accurate than centers of gravity, and reports fewer corners as walls.
         assert table[full]["rho_rms_mm"] < table[paper]["rho_rms_mm"] / 3
         assert table[full]["theta_rms_deg"] < table[paper]["theta_rms_deg"] / 2
         assert table[full]["false_per_scan"] < table[paper]["false_per_scan"] / 2
@@ -244,7 +244,7 @@ def test_the_table_contains_finite_numbers(written):
 
 @pytest.mark.slow
 def test_the_map_has_one_segment_for_every_wall_in_range(written, office):
-    """The chair back-rest included, and nothing else; nearer to the truth than the segments it is made of."""
+    """Exactly one segment per wall, chair back-rest included, more accurate than the single segments."""
     folder, (_, maps), _ = written
     assert json.loads((folder / "map-table.json").read_text()) == maps
     of_paper, paper, aggregated, world = maps
@@ -326,7 +326,7 @@ def test_the_conventional_ring_receives_direct_echoes_only(office):
 
 
 def test_the_demo_command_prints_the_table(tmp_path, capsys, monkeypatch):
-    """With the work itself left out: rows in, tables to standard output, the rest to standard error."""
+    """With a stub for the computation: tables on standard output, everything else on standard error."""
     rows = []
     some = np.array([[[0.0, 0.0], [1.0, 0.0]]])
     nothing = demo.map_summary(evaluate(np.zeros((0, 2, 2)), some), np.ones(1, dtype=bool), sigma=SIGMA)

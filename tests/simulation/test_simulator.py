@@ -24,12 +24,12 @@ EVERYTHING: dict[str, Any] = {"max_echoes": 1000, "blanking": 0.0, "acoustics": 
 
 
 def rows(simulation: Simulation):
-    """One row an echo: scan, path, range, amplitude, kind, reflector."""
+    """One row per echo: scan, path, range, amplitude, kind, reflector."""
     return np.column_stack([getattr(simulation, field.name) for field in fields(simulation) if field.name != "stamps"])
 
 
 def by_cause(scan, path, kind, reflector, *values):
-    """Rows in an order that does not depend on the last digits of the values."""
+    """Rows sorted independently of rounding errors of the values."""
     table = np.column_stack([scan, path, kind, reflector, *values])
     return table[np.lexsort(table.T[4::-1])]
 
@@ -115,7 +115,7 @@ def test_an_empty_room_gives_no_echoes(rng):
     assert heard.dense(168, 3).shape == (0, 168, 3)
 
 
-# From echoes to a detector.
+# Acoustics and detection.
 
 
 def sensor(beam=np.pi / 3, **options):
@@ -215,7 +215,7 @@ def test_the_ring_corrects_reported_ranges_to_path_lengths(rng):
     assert clean.max() <= 2.0 + 1e-12
 
 
-# Errors.
+# Measurement errors.
 
 
 def many(seed=0, scans=400, **options):
@@ -227,7 +227,7 @@ def many(seed=0, scans=400, **options):
 
 def test_white_noise():
     exact, noisy = many(max_echoes=1), many(max_echoes=1, sigma=0.005)
-    error = noisy.range - exact.range  # one echo a path: noise cannot change their order
+    error = noisy.range - exact.range  # one echo per path: noise cannot change the order
     n = len(error)
     assert abs(error.mean()) < 5 * 0.005 / np.sqrt(n)
     assert abs(error.std() / 0.005 - 1) < 5 / np.sqrt(2 * n)
@@ -289,7 +289,7 @@ def test_clutter_statistics():
 
 
 def test_clutter_only_on_paths_with_overlapping_cones():
-    narrow = Ring.circular(beam=np.radians(20), neighbors=3)  # 15 deg apart: the second neighbor hears nothing
+    narrow = Ring.circular(beam=np.radians(20), neighbors=3)  # 15 deg spacing: no overlap beyond neighbors
     room = Room(loop([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
     heard = simulate(narrow, room, np.zeros((50, 3)), clutter=2.0, max_echoes=1000)
     assert set(heard.path[heard.kind == EchoKind.CLUTTER].tolist()) == set(range(72))

@@ -1,4 +1,4 @@
-"""Simulated odometry: exact without errors, a random walk with them, whatever the steps."""
+"""Simulated odometry: exact without errors, otherwise a random walk that does not depend on the step length."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_odometry_is_equivariant_under_motions_of_the_world(rng):
 
 
 def errors_of_parts(poses, length, **errors):
-    """Of every so many steps by themselves: they are independent."""
+    """Errors of consecutive parts of a trajectory, which are independent."""
     told = simulate_odometry(poses, **errors)[::length]
     true = poses[::length]
     return relative(relative(true[:-1], true[1:]), relative(told[:-1], told[1:]))
@@ -51,7 +51,7 @@ def errors_of_parts(poses, length, **errors):
 
 @pytest.mark.parametrize("steps", [9, 90])
 def test_random_walk_grows_with_the_square_root_of_the_distance(steps):
-    """After 9 m three times as much as after one, in few steps as in many."""
+    """After 9 m the error is three times that after 1 m, for any number of steps."""
     parts = 2000
     poses = straight(9.0 * parts, steps * parts)
     off = errors_of_parts(poses, steps, distance=0.02, turn=0.0)
@@ -59,7 +59,7 @@ def test_random_walk_grows_with_the_square_root_of_the_distance(steps):
     np.testing.assert_allclose(off.mean(axis=0), 0, atol=0.006)
     off = errors_of_parts(poses, steps, distance=0.0, turn=0.01)
     np.testing.assert_allclose(off[:, 2].std(), 0.03, rtol=0.08)
-    # A heading that wanders moves the end sideways: integral of the walk, turn * sqrt(way^3 / 3), for many steps.
+    # The heading error moves the end laterally by the integral of the random walk, turn * sqrt(length^3 / 3).
     assert 0.8 < off[:, 1].std() / (0.01 * np.sqrt(9.0**3 / 3)) < 1.1
 
 
