@@ -94,8 +94,8 @@ def autofocus_ring(
     # 1. Pack the echoes of the selected scans.
     echoes, radius = _pack_scans(ring, log, poses, scans, settings)
     # 2. Choose the accumulator.
-    with_poses = 0 if poses else 1
-    rows, pitch = settings.theta_cells[with_poses], float(np.radians(settings.point_pitch_deg[with_poses]))
+    variant = 0 if poses else 1
+    rows, pitch = settings.theta_cells[variant], float(np.radians(settings.point_pitch_deg[variant]))
     columns = bucket_size(int(np.ceil((radius + settings.range_margin * ring.max_range) / settings.rho_cell)), least=64)
     accumulator = HoughSettings(
         theta_cells=rows,

@@ -111,10 +111,12 @@ class _Point(NamedTuple):
 
     @classmethod
     def of(cls, unknowns: kernels.Unknowns) -> "_Point":
+        """The same values."""
         leaves = unknowns.coordinates, unknowns.poses, unknowns.landmarks
         return cls(*(np.array(leaf, dtype=np.float64) for leaf in leaves))
 
     def unknowns(self) -> kernels.Unknowns:
+        """The same values as JAX arrays."""
         return kernels.Unknowns(*(jnp.asarray(leaf) for leaf in self))
 
 
@@ -142,9 +144,12 @@ class _Product(NamedTuple):
     """Contribution of two dependencies of the same factors to the normal matrix."""
 
     kind: int
+    """0: echoes, 1: odometry."""
     first: int
     second: int
+    """Indices of the two dependencies."""
     term: Int[np.ndarray, " chosen"]
+    """Terms that have both dependencies."""
     entry: Int[np.ndarray, "_ _ _"]
     """Storage index of each entry, term by term; one index for all terms if they all depend on the same two blocks."""
 
@@ -159,10 +164,8 @@ class _SparseProblem:
         self.weight = weight[scan, echo]
         self.odometry_information = np.asarray(problem.odometry_information)[:-1]
         self.prior_information = np.asarray(problem.prior_information)
-        self.prior_poses, self.prior_landmarks = (
-            np.asarray(problem.prior_poses),
-            np.asarray(problem.landmarks.parameters),
-        )
+        self.prior_poses = np.asarray(problem.prior_poses)
+        self.prior_landmarks = np.asarray(problem.landmarks.parameters)
         self.coordinate_count, self.landmark_count = problem.basis.shape[1], len(self.prior_landmarks)
         steps = np.flatnonzero((self.odometry_information > 0).any(axis=1))
         # Poses behind the last one with an echo or odometry are padding; they keep their values.
@@ -186,11 +189,11 @@ class _SparseProblem:
             np.asarray(leaf)[scan, echo] for leaf in (reflection.kind, reflection.first, reflection.second)
         )
         every, ring = np.arange(len(scan)), self.pose_count + self.landmark_count
-        twice = np.flatnonzero(kind == kernels.SECOND_ORDER)
+        second_order = np.flatnonzero(kind == kernels.SECOND_ORDER)
         none = np.zeros(0, dtype=np.int64)
         echoes = [
             _Dependency(self.pose_count + first, every),
-            _Dependency(self.pose_count + second[twice], twice),
+            _Dependency(self.pose_count + second[second_order], second_order),
             _Dependency(scan, every) if poses_free else _Dependency(none, none),
         ]
         odometry = [_Dependency(steps, steps), _Dependency(steps + 1, steps)] if poses_free else []
