@@ -34,7 +34,7 @@ class PackedEchoes(NamedTuple):
     pose: Float[AnyArray, "*scans echoes 3"] | None = None
     """model_from_robot for each echo, where model is the frame of the lines: x, y (metres), theta (radians). None: all
     are the identity."""
-    scan_count: Float[AnyArray, "*scans"] | None = None
+    scans_per_row: Float[AnyArray, "*scans"] | None = None
     """Number of scans that are gathered in one row: a factor of the vote threshold. None: one."""
     piece: Int[AnyArray, "*scans pieces"] | None = None
     """Index of each piece of ``PIECE_POINTS`` points within its arc; -1 for unused rows. Pieces save memory and time
@@ -191,7 +191,7 @@ def vote(ring: RingArcs, echoes: PackedEchoes, *, settings: HoughSettings) -> Vo
     """
     # Arcs -> equidistant points -> tangent lines. Elementwise, so all scans at once.
     lines = jax.vmap(lambda scan: tangent_lines(ring, scan, settings))(echoes)
-    scan_count = jnp.ones(len(lines.cell)) if echoes.scan_count is None else echoes.scan_count
+    scan_count = jnp.ones(len(lines.cell)) if echoes.scans_per_row is None else echoes.scans_per_row
 
     def one_scan(cell: Int[Array, "arcs points"], threshold: Float[Array, ""]) -> Bool[Array, "theta rho"]:
         votes = hough.accumulate(cell, settings)  # points per cell

@@ -62,17 +62,17 @@ class EchoBatch(NamedTuple):
     """Index of the echo in the columns of ``FlatEchoes``; 0 where there is no echo."""
     pose: Float[np.ndarray, "rows columns 3"] | None
     """model_from_robot of each echo: x, y (m), theta (rad); None: the identity for all."""
-    gathered: Float[np.ndarray, " rows"] | None
+    scans_per_row: Float[np.ndarray, " rows"] | None
     """Effective number of scans that were gathered into each row; None: one."""
     piece: Int[np.ndarray, "rows pieces"] | None
-    """Index of each arc piece within its arc (``kernels.Echoes``); -1 is padding."""
+    """Index of each arc piece within its arc (``kernels.PackedEchoes``); -1 is padding."""
     owner: Int[np.ndarray, "rows pieces"] | None
     """Column of the echo to which each arc piece belongs."""
 
     @property
     def packed(self) -> kernels.PackedEchoes:
         """The arrays as the argument of a kernel; they stay NumPy arrays until the compiled call transfers them."""
-        arrays: Any = (self.path, self.reported, self.pose, self.gathered, self.piece, self.owner)
+        arrays: Any = (self.path, self.reported, self.pose, self.scans_per_row, self.piece, self.owner)
         return kernels.PackedEchoes(*arrays)
 
 
@@ -177,13 +177,13 @@ def _fill(
     reported[row, column] = np.minimum(echoes.reported[index], _MAX_REPORTED)
     echo = np.zeros((rows, columns), np.int64)
     echo[row, column] = index
-    pose = gathered = piece = owner = None
+    pose = scans_per_row = piece = owner = None
     if echoes.pose is not None:
         pose = np.zeros((rows, columns, 3), np.float32)
         pose[row, column] = echoes.pose[index]
-    if echoes.gathered is not None:
-        gathered = np.ones(rows, np.float32)
-        gathered[: len(scans)] = echoes.gathered[scans]
+    if echoes.scans_per_window is not None:
+        scans_per_row = np.ones(rows, np.float32)
+        scans_per_row[: len(scans)] = echoes.scans_per_window[scans]
     if pieces is not None:
         echo_pieces = pieces[echoes.path[index]]
         slot = _ranks(np.bincount(row, echo_pieces, minlength=len(scans)).astype(np.int64))
@@ -191,7 +191,7 @@ def _fill(
         piece, owner = np.full((2, rows, int(np.ceil(columns * density))), -1, np.int32)
         piece[target], owner[target] = _ranks(echo_pieces), np.repeat(column, echo_pieces)
         owner = np.maximum(owner, 0)
-    return EchoBatch(scans, path, reported, echo, pose, gathered, piece, owner)
+    return EchoBatch(scans, path, reported, echo, pose, scans_per_row, piece, owner)
 
 
 def _ranks(counts: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " all"]:

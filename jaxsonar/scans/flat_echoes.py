@@ -19,7 +19,7 @@ class FlatEchoes:
         reported: Float[np.ndarray, " echoes"],
         *,
         pose: Float[np.ndarray, "echoes 3"] | None = None,
-        gathered: Float[np.ndarray, " scans"] | None = None,
+        scans_per_window: Float[np.ndarray, " scans"] | None = None,
     ):
         """Store columns that are sorted by scan.
 
@@ -30,10 +30,10 @@ class FlatEchoes:
             reported: ranges as a log holds them, metres.
             pose: model_from_robot when each echo was received: x, y (m), theta (rad). All echoes share one pose if
                 omitted.
-            gathered: effective number of scans that were gathered into each of these scans; 1 if omitted.
+            scans_per_window: effective number of scans that were gathered into each of these scans; 1 if omitted.
         """
         self.scan_count, self.scan, self.path, self.reported = scan_count, scan, path, reported
-        self.pose, self.gathered = pose, gathered
+        self.pose, self.scans_per_window = pose, scans_per_window
         self.start = np.searchsorted(scan, np.arange(scan_count + 1))
 
     @classmethod

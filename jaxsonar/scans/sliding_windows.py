@@ -152,8 +152,10 @@ def _build_windows(
     # The occupancy threshold scales with the number of scans; a scan counts by its fraction of used readings.
     fraction = np.bincount(flat.scan[used], minlength=len(pose)) / np.maximum(np.diff(flat.start), 1)
     total = np.append(0, np.cumsum(fraction))
-    gathered = np.maximum(total[last + 1] - total[begin], 1)
-    echoes = FlatEchoes(len(last), window, flat.path[echo], flat.reported[echo], pose=poses, gathered=gathered)
+    scans_per_window = np.maximum(total[last + 1] - total[begin], 1)
+    echoes = FlatEchoes(
+        len(last), window, flat.path[echo], flat.reported[echo], pose=poses, scans_per_window=scans_per_window
+    )
     return Windows(last, echoes, flat.scan[echo], gap=max(SETTINGS.min_gap, length / 4))
 
 

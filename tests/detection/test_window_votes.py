@@ -23,15 +23,15 @@ turns = st.floats(-3, 3)
 metres = st.floats(-1, 1)
 
 
-def packed(echoes, *, poses=True, gathered=None):
+def packed(echoes, *, poses=True, scans_per_row=None):
     """(1, ROOM) echoes from a list of (pose, path, range), optionally without the poses."""
     path, reported = np.zeros((1, ROOM), np.int32), np.full((1, ROOM), np.nan, np.float32)
     pose = np.zeros((1, ROOM, 3), np.float32)
     for k, (stood, row, reach) in enumerate(echoes):
         path[0, k], reported[0, k], pose[0, k] = row, reach, stood
-    gathered = None if gathered is None else jnp.full(1, gathered, jnp.float32)
+    scans_per_row = None if scans_per_row is None else jnp.full(1, scans_per_row, jnp.float32)
     return kernels.PackedEchoes(
-        jnp.asarray(path), jnp.asarray(reported), jnp.asarray(pose) if poses else None, gathered
+        jnp.asarray(path), jnp.asarray(reported), jnp.asarray(pose) if poses else None, scans_per_row
     )
 
 
@@ -103,7 +103,7 @@ def test_rotation_of_the_frame_by_whole_cells_shifts_the_cells(rng):
     results = []
     for step in (0, 7, 50):
         motion = np.array([0, 0, step * SETTINGS.theta_cell])
-        turned = packed([(composed(motion, pose), path, reach) for pose, path, reach in echoes], gathered=2.0)
+        turned = packed([(composed(motion, pose), path, reach) for pose, path, reach in echoes], scans_per_row=2.0)
         cells = np.asarray(kernels.vote(arcs, turned, settings=SETTINGS).occupied)
         results.append(np.roll(cells[0], -step, axis=0))
     assert results[0].any()
@@ -124,7 +124,7 @@ def test_scans_of_a_moving_robot_vote_for_the_wall_in_the_frame_of_the_last_pose
         ],
         SETTINGS,
     )
-    gathered = packed([(relative(last, pose), path, reach) for pose, path, reach in echoes], gathered=5.0)
+    gathered = packed([(relative(last, pose), path, reach) for pose, path, reach in echoes], scans_per_row=5.0)
     votes, _ = kernels.accumulators(arc_tables(RING, SETTINGS).arcs, gathered, settings=SETTINGS)
     votes = np.asarray(votes[0])
     assert votes.sum() == wanted.sum()
@@ -139,15 +139,17 @@ def test_scans_of_a_moving_robot_vote_for_the_wall_in_the_frame_of_the_last_pose
 def test_repeated_echoes_with_an_equal_scan_count_give_the_same_cells(rng, times):
     echoes = [*mixed_echoes(rng)][: ROOM // 4]
     arcs = arc_tables(RING, SETTINGS).arcs
-    once = kernels.vote(arcs, packed(echoes, gathered=1.0), settings=SETTINGS).occupied
-    often = kernels.vote(arcs, packed(echoes * times, gathered=float(times)), settings=SETTINGS).occupied
+    once = kernels.vote(arcs, packed(echoes, scans_per_row=1.0), settings=SETTINGS).occupied
+    often = kernels.vote(arcs, packed(echoes * times, scans_per_row=float(times)), settings=SETTINGS).occupied
     assert once.any()
     np.testing.assert_array_equal(often, once)
 
 
-@pytest.mark.parametrize("gathered", [0.5, 1.0, 3.25])
-def test_scan_count_scales_the_threshold(rng, gathered):
+@pytest.mark.parametrize("scans_per_row", [0.5, 1.0, 3.25])
+def test_scan_count_scales_the_threshold(rng, scans_per_row):
     echoes, arcs = mixed_echoes(rng), arc_tables(RING, SETTINGS).arcs
-    _, smooth = kernels.accumulators(arcs, packed(echoes, gathered=gathered), settings=SETTINGS)
-    came = kernels.vote(arcs, packed(echoes, gathered=gathered), settings=SETTINGS).occupied
-    np.testing.assert_array_equal(came, np.asarray(smooth) > np.float32(arcs.vote_threshold) * np.float32(gathered))
+    _, smooth = kernels.accumulators(arcs, packed(echoes, scans_per_row=scans_per_row), settings=SETTINGS)
+    came = kernels.vote(arcs, packed(echoes, scans_per_row=scans_per_row), settings=SETTINGS).occupied
+    np.testing.assert_array_equal(
+        came, np.asarray(smooth) > np.float32(arcs.vote_threshold) * np.float32(scans_per_row)
+    )

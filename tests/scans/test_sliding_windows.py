@@ -114,7 +114,7 @@ def test_windows_contain_the_fresh_echoes_of_their_section_in_the_frame_of_its_e
     flat = windows.echoes
     assert flat.scan_count == len(spans)
     assert flat.pose is not None
-    assert flat.gathered is not None
+    assert flat.scans_per_window is not None
     for k, span in enumerate(spans):
         wanted = oracles.window_echoes(scans, log.pose, span, fresh)
         mine = slice(flat.start[k], flat.start[k + 1])
@@ -125,7 +125,7 @@ def test_windows_contain_the_fresh_echoes_of_their_section_in_the_frame_of_its_e
         np.testing.assert_allclose(flat.pose[mine, :2], poses[:, :2], atol=1e-12)
         np.testing.assert_allclose(wrap_angle(flat.pose[mine, 2] - poses[:, 2]), 0, atol=1e-12)
         shares = [sum(fresh[scan]) / max(len(scans[scan]), 1) for scan in range(span[0], span[1] + 1)]
-        assert flat.gathered[k] == pytest.approx(max(sum(shares), 1))
+        assert flat.scans_per_window[k] == pytest.approx(max(sum(shares), 1))
 
 
 @settings(max_examples=40)
@@ -341,14 +341,14 @@ def assert_same_windows(ring, log, length):
     assert [int(windows.last[0]) for windows in single] == whole.last.tolist()
     flat = whole.echoes
     assert flat.pose is not None
-    assert flat.gathered is not None
+    assert flat.scans_per_window is not None
     for k, windows in enumerate(single):
         mine, one = slice(flat.start[k], flat.start[k + 1]), windows.echoes
         np.testing.assert_array_equal(windows.scan, whole.scan[mine])
         np.testing.assert_array_equal(one.path, flat.path[mine])
         np.testing.assert_array_equal(one.reported, flat.reported[mine])
         np.testing.assert_array_equal(one.pose, flat.pose[mine])
-        np.testing.assert_allclose(one.gathered, flat.gathered[k : k + 1], rtol=1e-12)
+        np.testing.assert_allclose(one.scans_per_window, flat.scans_per_window[k : k + 1], rtol=1e-12)
         assert windows.gap == whole.gap
 
 
