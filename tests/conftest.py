@@ -1,4 +1,4 @@
-"""Strict everywhere: no silent broadcast over ranks, no silent change of type; warnings are errors (pyproject)."""
+"""Strict settings and shared fixtures: rank and dtype promotion are errors, as are warnings (pyproject)."""
 
 import contextlib
 import dataclasses
@@ -15,44 +15,46 @@ from hypothesis import settings
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-_with_shapes = jaxtyping.jaxtyped
+_jaxtyped = jaxtyping.jaxtyped
 
 
-def _plain(annotation):
-    """Whether no array's shape can be in it; a name in quotes is looked up later, so it may be one."""
+def _has_no_shapes(annotation):
+    """Whether an annotation contains no array type. A quoted annotation is evaluated later, so it may contain one."""
     if isinstance(annotation, str):
         return False
     is_array = inspect.isclass(annotation) and issubclass(annotation, jaxtyping.AbstractArray | jaxtyping.PyTree)
-    return not is_array and all(map(_plain, get_args(annotation)))
+    return not is_array and all(map(_has_no_shapes, get_args(annotation)))
 
 
-def _checked(of=None, *, typechecker):
-    """What ``jaxtyped`` does, but without its binding of arguments to names where no shape is to be compared.
+def _jaxtyped_where_needed(target=None, *, typechecker):
+    """``jaxtyped``, but without its binding of arguments for functions without shapes in their signature.
 
-    That binding takes far longer than the check of the types, and most of the time of a test that calls a small
-    function a hundred thousand times.
+    The binding takes far longer than the type check. It dominates tests that call a small function a hundred thousand
+    times.
     """
-    if of is None:
-        return lambda one: _checked(one, typechecker=typechecker)
-    function = vars(of).get("__init__") if dataclasses.is_dataclass(of) and inspect.isclass(of) else of
-    if not isinstance(function, types.FunctionType) or not all(map(_plain, function.__annotations__.values())):
-        return _with_shapes(of, typechecker=typechecker)  # pyright: ignore
+    if target is None:
+        return lambda function: _jaxtyped_where_needed(function, typechecker=typechecker)
+    is_dataclass = dataclasses.is_dataclass(target) and inspect.isclass(target)
+    function = vars(target).get("__init__") if is_dataclass else target
+    if not isinstance(function, types.FunctionType) or not all(map(_has_no_shapes, function.__annotations__.values())):
+        return _jaxtyped(target, typechecker=typechecker)  # pyright: ignore
     checked = typechecker(function)
-    if function is of:
+    if function is target:
         return checked
-    of.__init__ = checked
-    return of
+    target.__init__ = checked
+    return target
 
 
-jaxtyping.jaxtyped = _checked
+jaxtyping.jaxtyped = _jaxtyped_where_needed
 
-from jaxsonar.fileio.compilation_cache import use_compilation_cache  # noqa: E402  what is imported from now on is checked
+from jaxsonar.fileio.compilation_cache import use_compilation_cache  # noqa: E402  imports from here on are type-checked
 
-use_compilation_cache()  # where the commands keep theirs, so that no process compiles what another one has
+use_compilation_cache()  # shared with the commands and between test processes
 
 
 @pytest.fixture
 def rng():
+    """A random generator with a fixed seed."""
     return np.random.default_rng(20240917)
 
 
@@ -74,25 +76,25 @@ def office():
 
 @pytest.fixture(scope="session")
 def short_demo(tmp_path_factory):
-    """A folder in which ``jaxsonar demo -o demo`` has run with two random rooms; its tables, and what it said."""
+    """A folder in which ``jaxsonar demo -o demo`` ran with two random rooms; its tables, and its progress messages."""
     from jaxsonar.cli.app import main
     from jaxsonar.demo import run_demo as demo
 
-    folder, tables, said, run_demo = tmp_path_factory.mktemp("readme"), [], [], demo.run_demo
+    folder, tables, messages, run_demo = tmp_path_factory.mktemp("demo"), [], [], demo.run_demo
 
     def run(output, *, on_step, **choices):
-        def told(step):
-            said.append(step)
-            on_step(step)
+        def record(message):
+            messages.append(message)
+            on_step(message)
 
-        tables.extend(run_demo(output, on_step=told, **choices))
+        tables.extend(run_demo(output, on_step=record, **choices))
         return tables
 
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
         patch.setattr(demo, "SETTINGS", demo.DemoSettings(random_rooms=2))
         patch.setattr(demo, "run_demo", run)
         assert main(["demo", "-o", "demo"]) == 0
-    return folder, tables, said
+    return folder, tables, messages
 
 
 settings.register_profile("project", deadline=None, derandomize=True)

@@ -1,4 +1,4 @@
-"""The accuracy benchmark: peers on echoes without noise, measures on errors of known size, and all of its files."""
+"""The detection benchmark: baselines on echoes without noise, scores of known errors, output files."""
 
 import json
 
@@ -52,7 +52,7 @@ def test_tangents_touch_both_arcs(walls):
     assert (np.sort(off, axis=1)[:, :2] < 1e-9).all()
 
 
-def test_points_of_arcs_are_as_far_as_the_echo_says(walls):
+def test_points_on_arcs_have_the_range_of_the_echo(walls):
     arcs = next(arcs_of_scans(walls.ring, walls.log))
     count = len(PointHough().points(arcs))
     each = [len(PointHough().points(arcs.take(np.array([k])))) for k in range(len(arcs.distance))]
@@ -71,7 +71,7 @@ def test_distinct_lines_are_apart_across_the_seam():
 
 
 def gaussian(rng, *, count, scale=1.0):
-    """A score of walls whose errors are normal with the bound's own covariance, times a factor."""
+    """A score of walls with normal errors whose covariance is that of the bound, times a factor."""
     factor = rng.normal(size=(count, 2, 2)) * [[1e-3], [1e-2]]
     cov = factor @ np.swapaxes(factor, 1, 2)
     error = scale * np.einsum("kij,kj->ki", factor, rng.normal(size=(count, 2)))
@@ -94,7 +94,7 @@ def test_errors_at_the_bound_have_ratio_1_and_nees_2(rng, scale):
     assert found["nees_se"] / scale**2 == pytest.approx(2 / np.sqrt(20_000), rel=0.2)
 
 
-def test_standard_errors_are_those_of_groups(rng):
+def test_standard_errors_account_for_groups(rng):
     group = np.repeat(np.arange(50), 20)
     values = []
     for _ in range(300):
@@ -109,21 +109,21 @@ def truth(polar, kind, echoes):
     return Truth(0, np.array(polar), np.array(kind), np.array(echoes), np.full((len(polar), 2), 0.01))
 
 
-def test_walls_are_counted_once_and_kinds_by_place():
+def test_walls_are_counted_once_and_classes_by_position():
     true = truth(
         [[1.0, 0.0], [1.2, 1.5], [0.9, -3.1], [1.5, -1.5], [1.4, 2.5], [1.0, -0.8]],
         [0, 0, 0, 1, 2, 0],
         [9, 8, 3, 6, 4, 9],
     )
     result = DetectionResult(
-        # The first wall, the same again, the wall across the seam that few echoes show, and a line at the corner.
+        # The first wall, a duplicate of it, the wall across the seam with few echoes, and a line at the corner.
         lines=np.array([[1.01, 0.02], [1.05, 0.1], [0.9, 3.13], [1.52, -1.45]]),
         cov=np.stack([np.eye(2), *[np.full((2, 2), np.nan)] * 3]),
         others=np.array([[1.4, 2.5], [1.01, -0.8], [1.7, 0.7]]),
         answers=np.array([ANSWERS.index(answer) for answer in ("edge", "undecided", "corner")]),
     )
     found = score([true], [result])
-    # Three clear walls: one found, one undecided, one not there at all; false are the second line and the corner's.
+    # Three walls with enough echoes: found, undecided, missed. The duplicate and the line at the corner are false.
     assert found.counts.tolist() == [[3, 1, 1, 2]]
     np.testing.assert_allclose(found.error, [[0.01, 0.02]])
     np.testing.assert_allclose(found.nees, [0.01**2 + 0.02**2])
@@ -147,7 +147,7 @@ def test_walls_are_counted_once_and_kinds_by_place():
     )
 
 
-def test_what_finds_everything_has_full_marks():
+def test_a_perfect_result_has_a_perfect_score():
     scans = scenarios.random_scans(BASE, 3, 3, seed=2)
     perfect = []
     for true in scans.truth:
@@ -168,7 +168,7 @@ def test_rooms_and_poses_are_the_same_in_every_condition():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_single_reflectors_answer_where_they_are(kind):
+def test_single_reflectors_produce_echoes_from_their_position(kind):
     scans = scenarios.single_reflectors(EXACT, kind, 20, seed=4)
     position, log = np.asarray(scans.ring.position), scans.log
     for k, true in enumerate(scans.truth):
@@ -188,7 +188,7 @@ def test_single_reflectors_answer_where_they_are(kind):
         assert len(method) >= 4
 
 
-def test_three_walls_are_three_and_apart():
+def test_three_walls_are_at_least_60_degrees_apart():
     scans = scenarios.three_walls(accuracy.THREE_WALLS, 10, seed=5)
     for true in scans.truth:
         assert len(true.polar) == 3
@@ -211,11 +211,11 @@ def test_rings_of_conditions():
 
 
 @pytest.mark.slow
-def test_a_tiny_run_makes_every_file(tmp_path):
+def test_a_tiny_run_writes_every_file(tmp_path):
     methods = {name: method for name, method in METHODS.items() if not name.startswith("ml")}
     noise = np.random.default_rng(0)
 
-    def nearly(ring, log, sigma):  # something with a covariance, kinds, and what is undecided
+    def nearly(ring, log, sigma):  # a method with covariances, points and undecided reflectors
         for result in METHODS["consensus of pairs"](ring, log, sigma):
             cov = np.zeros((len(result.lines), 2, 2)) + np.diag([1e-6, 1e-4])
             other = noise.uniform(0.5, 1.5, (2, 2))

@@ -1,4 +1,4 @@
-"""Thickness of walls as a laser draws them, against walls whose thickness is known."""
+"""Thickness of walls in laser points, for walls of known thickness."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from benchmarks.slam.laser_reference import thicknesses
 
 @pytest.mark.parametrize("turn", [0.0, 0.7, 2.1])
 def test_two_walls_of_known_noise(rng, turn):
-    """Whatever their direction; clutter and what is between them counts for neither."""
+    """The result does not depend on the direction; clutter and points between the walls do not count."""
     along = rng.uniform(-6, 6, 6000)
     first = np.column_stack([along, 1.2 + 0.03 * rng.standard_normal(6000)])
     second = np.column_stack([along[:3000], -1.1 + 0.01 * rng.standard_normal(3000)])

@@ -1,4 +1,4 @@
-"""The example of a loss of one's own runs, and finds what was simulated."""
+"""The example of a custom loss runs and finds the simulated temperatures."""
 
 import re
 import runpy
@@ -17,4 +17,4 @@ def test_the_temperature_of_every_scan_is_found(capsys):
     assert len(found) == 5
     assert found == sorted(found)  # the air warms up
     (rms,) = re.findall(r"RMS error ([\d.]+) K", out)
-    assert float(rms) < 1.5  # the air changes by 8 K; unknown to within 2.5 K before
+    assert float(rms) < 1.5  # the air changes by 8 K; the standard deviation of a single scan is 2.5 K
