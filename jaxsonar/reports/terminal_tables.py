@@ -91,7 +91,7 @@ def map_accuracy_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     table = Table(
         title=f"Segments of the office against its true walls, simulated, range noise sigma = {sigma:g} mm",
         caption="false: no wall within 100 mm and 15 deg along half of the segment; "
-        "visible: walls with 8 or more echoes in one of the scans",
+        "visible: walls with 8 or more echoes in a scan",
     )
     for heading, _, _ in MAP_COLUMNS:
         table.add_column(heading, justify="right" if heading else "left")

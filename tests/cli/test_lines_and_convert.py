@@ -1,5 +1,6 @@
 """Commands lines, simulate and convert: files are as documented, results are reproducible, an error is one line."""
 
+import argparse
 import csv
 import json
 import math
@@ -13,12 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.commands import DATA, HEADER, OFFICE, PATH, RING, SIMULATE, call, contents, interrupted_after, script
+from support.commands import DATA, HEADER, OFFICE, PATH, SIMULATE, call, contents, interrupted_after, script
+from support.invalid_lines_calls import INVALID_CALLS
 
 from jaxsonar import load_log, load_ring, save_log
-from jaxsonar.cli import app as cli
+from jaxsonar.cli.arguments import figure_filename
 from jaxsonar.detection.settings_toml import load_settings
-from jaxsonar.reports.plot_style import FIGURE_FORMATS
+from jaxsonar.fileio.atomic_files import FIGURE_FORMATS
 
 
 @pytest.fixture(scope="module")
@@ -205,8 +207,11 @@ def test_the_scan_option_selects_the_figure(here):
     assert drawn() != drawn("--scan", 3)
 
 
-def test_the_command_line_knows_the_figure_formats():
-    assert cli.FIGURES == FIGURE_FORMATS
+def test_the_command_line_accepts_exactly_the_figure_formats():
+    for suffix in FIGURE_FORMATS:
+        assert figure_filename(f"a{suffix}") == f"a{suffix}"
+    with pytest.raises(argparse.ArgumentTypeError, match=", ".join(FIGURE_FORMATS)):
+        figure_filename("a.gif")
 
 
 def test_logs_without_scans_or_echoes_are_valid(here, capsys):
@@ -232,186 +237,8 @@ def test_echoes_of_no_path_are_reported(here, capsys):
 
 # Errors: one line with what came and what is allowed, and nothing is written
 
-ROOM = '{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"kind": "%s"}, "geometry": %s}]}'
-SIMULATE_ANY = "simulate {office} --ring faw --path {path} -o out.csv"
-LINES = "lines log.csv --ring faw -o out.jsonl"
 
-MISTAKES = {
-    "no command": ("", {}, ["COMMAND"]),
-    "unknown command": ("slam2 log.csv", {}, ["slam2", "demo", "lines", "simulate", "convert"]),
-    "no ring": ("lines log.csv -o out.jsonl", {}, ["--ring"]),
-    "no output": ("lines log.csv --ring faw", {}, ["--output"]),
-    "unknown option": (f"{LINES} --speed 3", {}, ["--speed"]),
-    "abbreviated option": ("lines log.csv --rin faw -o out.jsonl", {}, ["--ring"]),
-    "unknown method": (f"{LINES} --method best", {}, ["best", "hough"]),
-    "missing log": ("lines no.csv --ring faw -o out.jsonl", {}, ["no.csv", "No such file"]),
-    "log that is a directory": ("lines dir.csv --ring faw -o out.jsonl", {"dir.csv": None}, ["dir.csv", "directory"]),
-    "log of unknown suffix": (
-        "lines log.txt --ring faw -o out.jsonl",
-        {"log.txt": HEADER},
-        [".txt", ".csv", ".parquet"],
-    ),
-    "log that is no number": (
-        "lines bad.csv --ring faw -o out.jsonl",
-        {"bad.csv": HEADER + "0,,,,,3,3,1.0\n0,,,,,3,3,one\n"},
-        ["bad.csv", "row 3", "column range", "one", "above 0"],
-    ),
-    "log with a column too few": (
-        "lines bad.csv --ring faw -o out.jsonl",
-        {"bad.csv": HEADER + "0,,,,3,3,1.0\n"},
-        ["bad.csv", "row 2", "7 columns", "8"],
-    ),
-    "log without a header": ("lines bad.csv --ring faw -o out.jsonl", {"bad.csv": ""}, ["bad.csv", "row 1", "header"]),
-    "no such ring": ("lines log.csv --ring fawn -o out.jsonl", {}, ["fawn", "faw", "corridor8", "scitos24", "sew-amr"]),
-    "ring with an unknown key": (
-        "lines log.csv --ring ring.toml -o out.jsonl",
-        {"ring.toml": RING + "colour = 'red'\n"},
-        ["ring.toml", "ring.colour", "count", "radius"],
-    ),
-    "ring out of range": (
-        "lines log.csv --ring ring.toml -o out.jsonl",
-        {"ring.toml": RING.replace("= 60", "= 190")},
-        ["ring.toml", "ring.beam_deg", "190", "180"],
-    ),
-    "ring with a missing key": (
-        "lines log.csv --ring ring.toml -o out.jsonl",
-        {"ring.toml": RING.replace("radius = 0.28\n", "")},
-        ["ring.toml", "ring.radius", "missing"],
-    ),
-    "ring that is no TOML": ("lines log.csv --ring ring.toml -o o.jsonl", {"ring.toml": "{]"}, ["ring.toml", "TOML"]),
-    "sensor that the ring does not have": (
-        "lines log.csv --ring corridor8 -o out.jsonl",
-        {},
-        ["scan 0", "tx", "0 to 7", "corridor8"],
-    ),
-    "scan that the log does not have": (f"{LINES} --figure a.svg --scan 17", {}, ["17", "log.csv", "0 to 16"]),
-    "scan that is no number": (f"{LINES} --figure a.svg --scan one", {}, ["--scan", "one", "whole number"]),
-    "scan without a figure": (f"{LINES} --scan 3", {}, ["--scan 3", "--figure"]),
-    "figure of unknown suffix": (f"{LINES} --figure a.gif", {}, ["a.gif", ".svg", ".png", ".pdf"]),
-    "figure without a suffix": (f"{LINES} --figure png", {}, ["png", ".svg", ".png", ".pdf"]),
-    "missing output folder": ("lines log.csv --ring faw -o no/out.jsonl", {}, ["no/out.jsonl", "no such folder"]),
-    "output folder that is a file": (
-        "lines log.csv --ring faw -o log.csv/out.jsonl",
-        {},
-        ["log.csv/out.jsonl", "no such folder"],
-    ),
-    "output that is a folder": ("lines log.csv --ring faw -o dir", {"dir": None}, ["dir", "directory"]),
-    "missing settings": (f"{LINES} --settings no.toml", {}, ["no.toml", "No such file"]),
-    "settings that are no TOML": (
-        f"{LINES} --settings s.toml",
-        {"s.toml": "theta_cells"},
-        ["s.toml", "'='", "TOML"],
-    ),
-    "settings with an unknown key": (f"{LINES} --settings s.toml", {"s.toml": "cells = 9"}, ["cells", "theta_cells"]),
-    "settings of a wrong type": (
-        f"{LINES} --settings s.toml",
-        {"s.toml": "theta_cells = 'many'"},
-        ["s.toml", "theta_cells", "int"],
-    ),
-    "settings out of range": (
-        f"{LINES} --settings s.toml",
-        {"s.toml": "theta_cells = 7"},
-        ["s.toml", "theta_cells = 7", "even"],
-    ),
-    "settings that are not finite": (
-        f"{LINES} --settings s.toml",
-        {"s.toml": "rho_cell = nan"},
-        ["rho_cell = nan", "0 m"],
-    ),
-    "settings too small for the ring": (
-        f"{LINES} --settings s.toml",
-        {"s.toml": "rho_cells = 20"},
-        ["rho_cells 20", "0.8 m", "2.28"],
-    ),
-    "dropout beyond 1": (f"{SIMULATE_ANY} --dropout 1.5", {}, ["--dropout", "1.5", "0 to 1"]),
-    "sigma below 0": (f"{SIMULATE_ANY} --sigma -1", {}, ["--sigma", "-1", "from 0"]),
-    "sigma that is not a number": (f"{SIMULATE_ANY} --sigma nan", {}, ["--sigma", "nan", "from 0"]),
-    "sigma without end": (f"{SIMULATE_ANY} --sigma inf", {}, ["--sigma", "inf", "from 0"]),
-    "drift that is no number": (f"{SIMULATE_ANY} --drift much", {}, ["--drift", "much", "from 0"]),
-    "more clutter than a log can hold": (f"{SIMULATE_ANY} --clutter 1e9", {}, ["--clutter", "1e9", "0 to 100"]),
-    "clutter below 0": (f"{SIMULATE_ANY} --clutter=-0.1", {}, ["--clutter", "-0.1", "from 0"]),
-    "seed below 0": (f"{SIMULATE_ANY} --seed -1", {}, ["--seed", "-1", "from 0"]),
-    "seed that is not whole": (f"{SIMULATE_ANY} --seed 1.5", {}, ["--seed", "1.5", "whole number"]),
-    "no echo a path": (f"{SIMULATE_ANY} --max-echoes 0", {}, ["--max-echoes", "0", "1 to 64"]),
-    "log of unknown suffix from a simulation": (
-        SIMULATE_ANY.replace("out.csv", "out.log"),
-        {},
-        ["out.log", ".csv", ".parquet"],
-    ),
-    "missing room": ("simulate no.geojson --ring faw --path {path} -o out.csv", {}, ["no.geojson", "No such file"]),
-    "room that is no JSON": (
-        "simulate r.geojson --ring faw --path {path} -o out.csv",
-        {"r.geojson": "{"},
-        ["r.geojson", "JSON", "FeatureCollection"],
-    ),
-    "room with a point of unknown kind": (
-        "simulate r.geojson --ring faw --path {path} -o out.csv",
-        {"r.geojson": ROOM % ("tree", '{"type": "Point", "coordinates": [1, 2]}')},
-        ["r.geojson", "feature 0", "tree", "pole"],
-    ),
-    "room with half a wall": (
-        "simulate r.geojson --ring faw --path {path} -o out.csv",
-        {"r.geojson": ROOM % ("wall", '{"type": "LineString", "coordinates": [[1], [2]]}')},
-        ["r.geojson", "feature 0", "[1]", "[x, y]"],
-    ),
-    "missing path": ("simulate {office} --ring faw --path no.csv -o out.csv", {}, ["no.csv", "No such file"]),
-    "path with a missing column": (
-        "simulate {office} --ring faw --path p.csv -o out.csv",
-        {"p.csv": "x,y\n0,0\n"},
-        ["p.csv", "row 1", "x,y", "theta"],
-    ),
-    "path that is not a number": (
-        "simulate {office} --ring faw --path p.csv -o out.csv",
-        {"p.csv": "x,y,theta\n0,0,0\n0,nan,0\n"},
-        ["p.csv", "row 3", "column y", "nan", "finite"],
-    ),
-    "path without a pose": (
-        "simulate {office} --ring faw --path p.csv -o out.csv",
-        {"p.csv": "x,y,theta\n"},
-        ["p.csv", "no pose"],
-    ),
-    "output over its input": (
-        "lines log.csv --ring faw -o log.csv",
-        {},
-        ["log.csv", "another file"],
-    ),
-    "figure into a missing folder": (f"{LINES} --figure nowhere/a.svg", {}, ["nowhere/a.svg", "folder"]),
-    "ring far too large": (
-        "lines log.csv --ring ring.toml -o o.jsonl",
-        {"ring.toml": RING.replace("max_range = 2", "max_range = 200")},
-        ["ring.toml", "max_range", "100 m"],
-    ),
-    "settings nested deeply": (f"{LINES} --settings s.toml", {"s.toml": "a = " + "[" * 3000}, ["s.toml", "TOML"]),
-    "settings with too many cells": (
-        f"{LINES} --settings s.toml",
-        {"s.toml": "theta_cells = 10000\nrho_cells = 10000"},
-        ["s.toml", "rho_cells", "million"],
-    ),
-    "path with an endless field": (
-        "simulate {office} --ring faw --path p.csv -o out.csv",
-        {"p.csv": "x,y,theta\n" + "1" * 200_000 + ",0,0\n"},
-        ["p.csv", "row 2", "finite"],
-    ),
-    "path back in time": (
-        "simulate {office} --ring faw --path p.csv -o out.csv",
-        {"p.csv": "stamp,x,y,theta\n1,0,0,0\n0,0,0,0\n"},
-        ["p.csv", "row 3", "stamp", "no earlier"],
-    ),
-    "log to an unknown suffix": ("convert log.csv out.txt", {}, ["out.txt", ".txt", ".csv", ".parquet"]),
-    "log from an unknown suffix": (
-        "convert log.dat out.csv",
-        {"log.dat": HEADER},
-        ["log.dat", "scitos24", "corridor8"],
-    ),
-    "log from an unknown format": ("convert log.csv out.csv --from bag", {}, ["bag", "scitos24", "parquet"]),
-    "log from what it is not": ("convert log.csv out.csv --from parquet", {}, ["log.csv", "Parquet"]),
-    "recording from what it is not": ("convert log.csv out.csv --from scitos24", {}, ["log.csv"]),
-    "demo into a file": ("demo -o log.csv", {}, ["log.csv", "folder"]),
-    "demo of no seed": ("demo -o d --seed x", {}, ["--seed", "x", "whole number"]),
-}
-
-
-@pytest.mark.parametrize(("line", "files", "said"), list(MISTAKES.values()), ids=list(MISTAKES))
+@pytest.mark.parametrize(("line", "files", "said"), list(INVALID_CALLS.values()), ids=list(INVALID_CALLS))
 def test_an_invalid_call_is_answered_in_one_line_and_changes_nothing(here, capsys, line, files, said):
     if "parquet" in line:
         pytest.importorskip("pyarrow")

@@ -170,7 +170,7 @@ def test_every_figure_can_be_drawn(case, draw):
 
 
 def test_every_figure_function_is_tested():
-    modules = (plot_style, plot_scan, plot_map)
+    modules = (plot_scan, plot_map)
     drawing = {name for module in modules for name in vars(module) if name.endswith("_figure")}
     assert drawing == {f"{name.split()[0]}_figure" for name in DRAW if name != "last sensor fires"}
 

@@ -1,0 +1,132 @@
+"""Shards: chunks of logs give the same rows as the whole log, in bounded memory."""
+
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxsonar
+from jaxsonar import Log, load_log, load_ring, save_log
+from jaxsonar.batch_jobs.inputs import Input, find_inputs
+from jaxsonar.batch_jobs.parquet_tables import TABLES
+from jaxsonar.batch_jobs.shards import split_input
+from jaxsonar.batch_jobs.worker import job_spec, run_shard
+from jaxsonar.detection.settings import hough_settings
+from jaxsonar.scans.log_chunks import csv_chunk_reader, csv_chunks, parquet_chunk_reader, parquet_chunks
+from jaxsonar.simulation.poses_csv import load_poses
+
+pa = pytest.importorskip("pyarrow")
+
+
+pq = pytest.importorskip("pyarrow.parquet")
+
+
+RING = load_ring("faw")
+
+
+HEADER = "scan,stamp,x,y,theta,tx,rx,range\n"
+
+
+def office(scans, *, first=0):
+    """Repeated scans of the office; one has no echoes, one has no pose and no stamp."""
+    data = Path(jaxsonar.__file__).with_name("data")
+    poses, stamps = load_poses(data / "office-path.csv")
+    room = jaxsonar.load_room(data / "office.geojson")
+    seen = jaxsonar.simulate(RING, room, poses, sigma=0.003, seed=first, stamps=stamps).as_log(RING, poses)
+    rows = [seen[k % len(seen)] for k in range(scans)]
+    rows = [replace(scan, scan=first + k, stamp=0.5 * k) for k, scan in enumerate(rows)]
+    rows[3] = replace(
+        rows[3], **{name: rows[3].tx[:0] for name in ("tx", "rx")}, range=np.zeros(0), amplitude=np.zeros(0)
+    )
+    rows[4] = replace(rows[4], pose=np.full(3, np.nan), stamp=np.nan)
+    return Log.from_scans(rows)
+
+
+def shard(path, *, scans=100, part=0):
+    (log,) = find_inputs([path])
+    return split_input(log, staging=Path(path).parent / "copies", sensors=RING.count, scans=scans)[part]
+
+
+JOB = job_spec(RING, method="hough", settings=hough_settings(RING, None), sigma=None)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@pytest.mark.parametrize("scans", [1, 7, 50])
+def test_chunks_concatenate_to_the_log(tmp_path, suffix, scans):
+    log, path = office(40), tmp_path / f"log.{suffix}"
+    save_log(log, path)
+    plan, reader = (csv_chunks, csv_chunk_reader) if suffix == "csv" else (parquet_chunks, parquet_chunk_reader)
+    parts = plan(path, name="log", scans=scans)
+    assert [part.first for part in parts] == list(range(0, 40, scans))
+    read = [reader(path, part, name="log")(0, part.scans) for part in parts]
+    assert Log.from_scans([scan for one in read for scan in one]) == log == load_log(path)
+
+
+def test_csv_and_parquet_give_the_same_rows(tmp_path):
+    log = office(10)
+    save_log(log, tmp_path / "log.csv")
+    save_log(log, tmp_path / "log.parquet")
+    text = (tmp_path / "log.csv").read_bytes()
+    (tmp_path / "log.windows.csv").write_bytes(b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n").removesuffix(b"\r\n"))
+    came = [run_shard(JOB, shard(tmp_path / name)) for name in ("log.csv", "log.parquet", "log.windows.csv")]
+    for name in TABLES:
+        rows = [pq.read_table(pa.BufferReader(one.tables[name])).drop_columns("source").to_pylist() for one in came]
+        assert rows[0] == rows[1] == rows[2]
+
+
+def test_scans_may_come_in_any_order(tmp_path):
+    log = office(9)
+    mixed = Log.from_scans([log[k] for k in (5, 2, 8, 0, 1, 7, 3, 6, 4)])
+    save_log(mixed, tmp_path / "log.csv")
+    assert not any(part.repeated for part in csv_chunks(tmp_path / "log.csv", name="log", scans=4))
+    rows = pq.read_table(pa.BufferReader(run_shard(JOB, shard(tmp_path / "log.csv")).tables["scans"]))
+    assert rows["scan"].to_pylist() == mixed.scan.tolist()
+
+
+def test_a_log_without_scans_has_no_shards(tmp_path):
+    for name in ("log.csv", "log.parquet"):
+        save_log(Log.from_scans([]), tmp_path / name)
+    assert [split_input(one, staging=tmp_path, sensors=24) for one in find_inputs([tmp_path])] == [[], []]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_planning_takes_bounded_memory(tmp_path, suffix, monkeypatch):
+    """Four times the scans, the same memory."""
+    monkeypatch.setattr("jaxsonar.scans.log_chunks.BLOCK", 1 << 16)
+    monkeypatch.setattr("jaxsonar.scans.log_chunks.ROWS_PER_READ", 1 << 10)
+    path, peaks = tmp_path / f"log.{suffix}", []
+    for scans in (10_000, 40_000):
+        echo = np.arange(scans * 4)
+        sensor, index = echo % 24, echo // 4
+        none = np.full((scans, 3), np.nan)
+        log = Log.from_echoes(index, sensor, sensor, 1 + 0.001 * (echo % 7), stamp=none[:, 0], pose=none)
+        save_log(log, path)
+        del log
+        plan = csv_chunks if suffix == "csv" else parquet_chunks
+        before = pa.total_allocated_bytes()
+        tracemalloc.start()
+        assert sum(part.scans for part in plan(path, name="log", scans=2048)) == scans
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert pa.total_allocated_bytes() - before < 1e6
+    assert peaks[1] < 1.3 * peaks[0] + 1e5
+
+
+def test_large_row_groups_are_staged(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxsonar.batch_jobs.shards.MAX_ROW_GROUP", 8)
+    save_log(office(20), tmp_path / "log.parquet")
+    parts = split_input(*find_inputs([tmp_path / "log.parquet"]), staging=tmp_path / "copies", sensors=24, scans=4)
+    assert parts[0].filename == str(tmp_path / "copies" / "log.parquet.parquet")
+    assert pq.ParquetFile(parts[0].filename).metadata.num_row_groups == 5
+    assert load_log(parts[0].filename) == load_log(tmp_path / "log.parquet")
+
+
+def test_keys_are_valid_filenames_and_distinct():
+    keys = [
+        Input(name, "", "csv").key for name in ("a.csv", "a b.csv", "a_b.csv", "_a.csv", "ä.csv", ".a.csv", "x" * 300)
+    ]
+    assert len(set(keys)) == len(keys)
+    assert keys[0] == "a.csv"
+    assert all(key[0].isalnum() and key.isascii() and len(key) < 120 for key in keys)
