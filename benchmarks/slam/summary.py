@@ -172,9 +172,9 @@ def table(content: dict[str, Any]) -> Table:
         "odometry divided by ATE; tenth: runs whose ATE is at most a tenth of the odometry's; best: ATE after the best "
         "alignment, and its tenth; CRB: Cramer-Rao bound; /CRB: median over the runs; NEES: per degree of freedom, "
         "mean and median of the runs, 1 is consistent; closures made, wrong, withdrawn; walls: distance of the "
-        "map's walls from the true ones; missed: of the walls with echoes; false: of the map's length; p99: of the slowest run; "
-        "grows: last tenth of the steps divided by the second. Echoes alone: sigma 5 mm, no odometry, walls after the "
-        "best alignment. "
+        "map's walls from the true ones; missed: of the walls with echoes; false: of the map's length; p99: of the "
+        "slowest run; grows: last tenth of the steps divided by the second. Echoes alone: sigma 5 mm, no odometry, "
+        "walls after the best alignment. "
         f"jax {v['jax']} on {v['device']}, {v['commit'][:10]}",
     )
     for column in ["", *COLUMNS]:
