@@ -109,7 +109,7 @@ def robust_refit(
 ) -> WallSegments:
     """The walls, estimated again with outlying segments down-weighted (iteratively reweighted least squares).
 
-    A line with echoes of another reflector is farther off than its covariance says. If a segment deviates from its wall
+    A line with echoes of another reflector is farther off than its covariance indicates. If a segment deviates from its wall
     by more than ``outlier_gate`` standard deviations, its information is divided by the square of the excess.
 
     Args:

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import oracles
+from support.rings import bumper_ring
 
 import jaxsonar
 from jaxsonar import HoughSettings, Log, Ring, SonarError, kernels
@@ -26,15 +27,7 @@ local_models = partial(jaxsonar.local_models, method="hough")
 
 THREE_WALLS = [(1.2, 0.3), (1.7, -1.9), (1.5, 3.1)]
 TURNED_RING = Ring.circular(count=32, beam=1.5, neighbors=4, first_heading=0.0123)  # no point at the border of a cell
-BUMPER = Ring(
-    [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
-    np.radians([-15.0, -5.0, 5.0, 15.0]),
-    beam=np.radians(70),
-    neighbors=3,
-    max_range=2.5,
-    range_offset=[0.01, -0.02, 0.03, 0.0],
-    speed_of_sound=340.0,
-)
+BUMPER = bumper_ring()
 
 
 def dense(ring, echoes, slots=3):

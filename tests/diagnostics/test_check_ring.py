@@ -180,12 +180,12 @@ def test_the_reason_for_missing_walls_is_reported(log, rng):
 
 def test_left_out_echoes_are_reported(log):
     """For a device that listens to more neighbors than the ring specifies."""
-    seen, told, far = [], [], np.flatnonzero(log.tx == log.rx)[::4]
+    seen, reported, far = [], [], np.flatnonzero(log.tx == log.rx)[::4]
     index = np.insert(log.echo_scan, far, log.echo_scan[far])
     tx, rx = np.insert(log.tx, far, log.tx[far]), np.insert(log.rx, far, (log.rx[far] + 4) % 24)
     more = Log.from_echoes(index, tx, rx, np.insert(log.range, far, log.range[far]), stamp=log.stamp, pose=log.pose)
-    found = check(RING, more, on_left_out=told.append, progress=lambda *done: seen.append(done))
-    assert told == [len(far)]
+    found = check(RING, more, on_left_out=reported.append, progress=lambda *done: seen.append(done))
+    assert reported == [len(far)]
     assert seen[-1] == (len(log), len(log))
     assert found.left_out == len(far)
     assert any("does not listen to" in finding for finding in found.findings)

@@ -169,11 +169,11 @@ def test_a_segment_of_no_length_matches_nothing():
 
 def test_json_and_table_agree():
     result = evaluate(SQUARE + np.array([0.03, 0.0]), SQUARE)
-    told = json.loads(json.dumps(result.as_json(), allow_nan=False))
-    assert told["distance_max_m"] == pytest.approx(0.03)
-    assert told["distance_rms_m"] == pytest.approx(0.03 / math.sqrt(2))
-    assert told["reference_length_m"] == 14
-    assert [pair["segment"] for pair in told["pairs"]] == [0, 1, 2, 3]
+    document = json.loads(json.dumps(result.as_json(), allow_nan=False))
+    assert document["distance_max_m"] == pytest.approx(0.03)
+    assert document["distance_rms_m"] == pytest.approx(0.03 / math.sqrt(2))
+    assert document["reference_length_m"] == 14
+    assert [pair["segment"] for pair in document["pairs"]] == [0, 1, 2, 3]
     console = Console(width=100, record=True, file=None, quiet=False)
     with console.capture() as captured:
         console.print(evaluation_table(result))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import oracles
+from support.rings import bumper_ring
 
 from jaxsonar import HoughSettings, Ring, Room, kernels, load_ring, random_pose, random_room, simulate
 from jaxsonar.detection.arc_tables import arc_tables
@@ -434,15 +435,7 @@ def padded_arcs(ring):
 
 UNUSUAL_RINGS = {
     "corridor8": load_ring("corridor8"),
-    "bumper": Ring(
-        [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
-        np.radians([-15.0, -5.0, 5.0, 15.0]),
-        beam=np.radians(60),
-        neighbors=3,
-        max_range=2.5,
-        range_offset=[0.01, -0.02, 0.03, 0.0],
-        speed_of_sound=340.0,
-    ),
+    "bumper": bumper_ring(60.0),
     "one sensor": Ring([(0.1, 0.0)], [0.0], beam=1.0, neighbors=0, max_range=2.0),
     "direct echoes only": Ring.circular(neighbors=0),
     "two sensors in one place": Ring([(0.2, 0.0)] * 2, [0.0, 0.3], beam=1.0, neighbors=1, max_range=2.0),

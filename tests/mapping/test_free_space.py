@@ -8,6 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import oracles
+from support.rings import bumper_ring
 
 from jaxsonar import Log, Ring, load_ring, local_models, random_pose, random_room, simulate
 from jaxsonar.geometry.se2 import transform_points
@@ -20,13 +21,7 @@ FREE = SETTINGS.free_space
 STEP = 2 * math.pi / FREE.directions
 RAYS, POINTS = 17, 33
 """Samples of a cone and of an arc. The oracle uses the same samples, but its own arithmetic."""
-BUMPER = Ring(
-    [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
-    np.radians([-15.0, -5.0, 5.0, 15.0]),
-    beam=np.radians(70),
-    neighbors=3,
-    max_range=2.5,
-)
+BUMPER = bumper_ring(calibrated=False)
 
 
 def direction_of(theta):

@@ -341,7 +341,7 @@ def test_a_saved_grid_is_read_by_map_server(tmp_path, office, heard, office_grid
     x, y, yaw = ast.literal_eval(header["origin"])
     assert (x, y) == pytest.approx(office_grid.origin)
     assert (yaw, float(header["resolution"]), header["mode"], header["negate"]) == (0, 0.05, "trinary", "0")
-    # The first pose is in a free cell where the file says it is.
+    # By the origin in the file, the first pose is in a free cell.
     column, row = np.floor((office.poses[0, :2] - (x, y)) / 0.05).astype(int)
     assert image[len(image) - 1 - row, column] == FREE
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from support.rings import bumper_ring
 
 from jaxsonar import LocalModel, Log, Ring, Room, Scan, SonarError, local_model, local_models, simulate
 from jaxsonar.evaluation.laser_segments import PolygonalModel
@@ -17,16 +18,7 @@ from jaxsonar.occupancy.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from jaxsonar.reports import plot_map, plot_scan, plot_style
 from jaxsonar.simulation.office import load_office
 
-BUMPER = Ring(
-    [(0.6, -0.3), (0.65, -0.1), (0.65, 0.1), (0.6, 0.3)],
-    np.radians([-15.0, -5.0, 5.0, 15.0]),
-    beam=np.radians([70.0, 60.0, 60.0, 50.0]),
-    neighbors=3,
-    max_range=2.5,
-    range_offset=[0.01, -0.02, 0.03, 0.0],
-    speed_of_sound=340.0,
-    name="bumper",
-)
+BUMPER = bumper_ring([70.0, 60.0, 60.0, 50.0], name="bumper")
 BACK_TO_BACK = Ring([(0.1, 0.0), (-0.1, 0.0)], [0.0, np.pi], beam=0.5, neighbors=1, max_range=2.0)
 LONE = Ring([(0.0, 0.0)], [0.3], beam=np.pi, neighbors=0, max_range=1.5)
 POLES = Room(np.zeros((0, 2, 2)), poles=np.array([[1.2, 0.1], [0.3, 0.9]]))
