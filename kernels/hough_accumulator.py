@@ -38,8 +38,8 @@ class HoughSettings:
     smoothing: tuple[float | int, ...] = (1.0, 2.0, 1.0)
     """Taps of the low pass along theta and along rho, an odd number; they are normalized to the sum 1."""
     threshold: float = 0.2
-    """Occupancy that a cell must exceed, as a fraction of the votes of a fully visible wall. 0.2 finds most walls for 300
-    poses in random rooms other than the demo's (``python -m benchmarks.detection.threshold_sweep``)."""
+    """Occupancy that a cell must exceed, as a fraction of the votes of a fully visible wall. 0.2 finds most walls for
+    300 poses in random rooms other than the demo's (``python -m benchmarks.detection.threshold_sweep``)."""
     min_echoes: int = 3
     """Smallest number of echoes of a line: two determine it, a third confirms it."""
 
