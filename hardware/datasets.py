@@ -149,7 +149,9 @@ def _sew_messages(file: Path) -> Float[np.ndarray, "messages 4 12 4"]:
         raise SonarError(f"{shown(file)}: row 1: '{shown(lines[0])}' came; allowed is a header of 4 column names")
     columns = [f"{name.strip()} (rx {rx})" for rx, name in enumerate(lines[0].split(","))]
     table = NumericTable(file, lines[1:], tuple(columns), separator=",", first_row=2)
-    table.refuse((table.number <= 0) | (table.number > 65535), columns, "above 0 and up to 65535 mm, which means no object")
+    table.refuse(
+        (table.number <= 0) | (table.number > 65535), columns, "above 0 and up to 65535 mm, which means no object"
+    )
     if len(table.number) % 48 or not len(table.number):
         came = f"{len(table.number)} rows below the header"
         raise SonarError(

@@ -5,16 +5,15 @@ Chunks are small and closed at least every half second. Of a truncated file ever
 
 import json
 import os
-import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from .errors import SonarError, shown
+from .frame_player import FramePlayer
 from .messages import Message
 from .protocol import encode
 from .recorder_base import FLUSH_INTERVAL, Recorder
-from .transport_base import EndOfStream, LinkEvent, Source, Url
+from .transport_base import LinkEvent, Source, Url
 
 CHUNK_SIZE = 16 * 1024
 """Size of an MCAP chunk, bytes. Small, because a truncated file loses its last chunk."""
@@ -119,46 +118,18 @@ def read_mcap(filename: str | os.PathLike[str]) -> Iterator[tuple[str, float, by
         raise SonarError(f"{shown(filename)}: {failure.strerror}; needed is {needed}") from None
 
 
-class McapPlayer(Source):
-    """Replays a raw recording as a source of bytes, with the recorded time between messages."""
+def play_mcap(url: Url, *, speed: float) -> Source:
+    """Replay a raw recording.
 
-    def __init__(self, url: Url, *, speed: float):
-        """Open a recording.
+    Args:
+        url: its ``path`` is the filename.
+        speed: playback speed; 0: as fast as possible.
 
-        Args:
-            url: its ``path`` is the filename.
-            speed: playback speed relative to the recording; 0: as fast as possible.
-
-        Raises:
-            SonarError: the file cannot be read.
-        """
-        self.url = url.text
-        self._speed = speed
-        self._frames = ((time_s, data) for topic, time_s, data in read_mcap(url.path) if topic == MESSAGES)
-        self._next = next(self._frames, None)  # reports an unreadable file here, not in the first read()
-        self._start: tuple[float, float] | None = None
-        """Host clock now (``time.monotonic``) and in the recording, of the first frame."""
-        self._closed = threading.Event()
-
-    def read(self, timeout: float) -> bytes | None:
-        """See ``Source``."""
-        if self._next is None or self._closed.is_set():
-            raise EndOfStream(f"{self.url}: the record ends here")
-        time_s, data = self._next
-        if self._speed:
-            now = time.monotonic()
-            self._start = self._start or (now, time_s)
-            wait = self._start[0] + (time_s - self._start[1]) / self._speed - now
-            if wait > 0:
-                self._closed.wait(min(wait, timeout))
-            if wait > timeout:
-                return None
-        self._next = next(self._frames, None)
-        return data
-
-    def close(self) -> None:
-        """See ``Source``."""
-        self._closed.set()
+    Raises:
+        SonarError: the file cannot be read.
+    """
+    frames = ((time_s, data) for topic, time_s, data in read_mcap(url.path) if topic == MESSAGES)
+    return FramePlayer(url, frames, speed=speed)
 
 
 def _mcap(filename: str | os.PathLike[str]) -> tuple[Any, Any]:

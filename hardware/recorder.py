@@ -121,10 +121,10 @@ def open_recording(url: Url, *, on_event: OnEvent, reconnect: bool, silence: flo
         SonarError: no such file, or another suffix.
     """
     if Path(url.path).suffix.lower() != ".mcap":
-        raise url.fail(f"'{shown(Path(url.path).name)}' came", "a .mcap record (for scan logs use jaxsonar.stream)")
-    from .mcap_recorder import McapPlayer
+        raise url.error(f"'{shown(Path(url.path).name)}' came", "a .mcap record (for scan logs use jaxsonar.stream)")
+    from .mcap_recorder import play_mcap
 
-    return McapPlayer(url, speed=playback_speed(url))
+    return play_mcap(url, speed=playback_speed(url))
 
 
 def playback_speed(url: Url) -> float:
@@ -135,5 +135,5 @@ def playback_speed(url: Url) -> float:
     """
     url.check_options("speed")
     if url.host or url.port is not None or not url.path:
-        raise url.fail("no filename came", "file:LOG?speed=1")
+        raise url.error("no filename came", "file:LOG?speed=1")
     return url.number("speed", 1.0, 0.0, 1e6)

@@ -102,7 +102,7 @@ class Url:
     options: Mapping[str, str]
     """The query: options after the question mark."""
 
-    def fail(self, came: str, allowed: str) -> SonarError:
+    def error(self, came: str, allowed: str) -> SonarError:
         """The error for this URL, for the caller to raise."""
         return SonarError(f"{shown(self.text)}: {came}; allowed is {allowed}")
 
@@ -115,7 +115,7 @@ class Url:
         for name in self.options:
             if name not in known:
                 allowed = ", ".join(known) if known else f"none with {self.scheme}:"
-                raise self.fail(f"option '{shown(name)}' came", allowed)
+                raise self.error(f"option '{shown(name)}' came", allowed)
 
     def number(self, name: str, default: float, low: float, high: float) -> float:
         """The value of a numeric option.
@@ -129,7 +129,7 @@ class Url:
         except ValueError:
             value = float("nan")
         if not low <= value <= high:
-            raise self.fail(f"{name} '{shown(text)}' came", f"a number from {low:g} to {high:g}")
+            raise self.error(f"{name} '{shown(text)}' came", f"a number from {low:g} to {high:g}")
         return value
 
     def address(self, *, default_host: str | None = None, lowest_port: int = 1) -> tuple[str, int]:
@@ -145,7 +145,7 @@ class Url:
         host = self.host or default_host
         if not host or self.port is None or self.port < lowest_port or self.path not in ("", "/"):
             ports = f"PORT from {lowest_port} to 65535"
-            raise self.fail("no such address", f"{self.scheme}://HOST:PORT with {ports}")
+            raise self.error("no such address", f"{self.scheme}://HOST:PORT with {ports}")
         return host, self.port
 
 
@@ -242,7 +242,7 @@ def _opener(url: Url) -> Opener:
     registered_elsewhere = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
     if url.scheme not in registered_elsewhere:
         known = [EXAMPLES.get(name, f"{name}:") for name in (*EXAMPLES, *sorted({*_registered, *registered_elsewhere}))]
-        raise url.fail(f"scheme '{url.scheme}' came", ", ".join(dict.fromkeys(known)))
+        raise url.error(f"scheme '{url.scheme}' came", ", ".join(dict.fromkeys(known)))
     opener: Any = registered_elsewhere[url.scheme].load()
     return opener
 

@@ -88,7 +88,7 @@ def open_serial(url: Url, *, on_event: OnEvent, reconnect: bool, silence: float)
     _check_path(url)
     baud = url.number("baud", 921600.0, 50.0, 2e7)
     if baud != int(baud):
-        raise url.fail(f"baud {baud:g} came", "a whole number")
+        raise url.error(f"baud {baud:g} came", "a whole number")
     _serialx(url.text)
     return TerminalSource(url, baud=int(baud), on_event=on_event, reconnect=reconnect, silence=silence)
 
@@ -96,7 +96,7 @@ def open_serial(url: Url, *, on_event: OnEvent, reconnect: bool, silence: float)
 def _check_path(url: Url) -> None:
     if url.host or url.port is not None or not url.path:
         example = "serial:///dev/ttyUSB0" if url.scheme == "serial" else "pty:/dev/pts/3"
-        raise url.fail(f"no path of a device came (path '{url.path}')", f"a path as in {example}")
+        raise url.error(f"no path of a device came (path '{url.path}')", f"a path as in {example}")
 
 
 def _serialx(url: str) -> Any:

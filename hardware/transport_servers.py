@@ -222,7 +222,7 @@ class PtySink(Sink):
 
     def __init__(self, url: Url):
         if url.host or url.port is not None:
-            raise url.fail("no path came", "pty: for any device, or pty:PATH for a link to it")
+            raise url.error("no path came", "pty: for any device, or pty:PATH for a link to it")
         self._link = Path(url.path) if url.path else None
         self._master: int | None = None
         self._client = False
@@ -332,7 +332,7 @@ def listen(url: str) -> Sink:
     parsed = parse_url(url)
     sinks = {"tcp": TcpSink, "udp": UdpSink, "pty": PtySink}
     if parsed.scheme not in sinks:
-        raise parsed.fail(f"scheme '{parsed.scheme}' came", "tcp://HOST:PORT, udp://HOST:PORT, pty: or pty:PATH")
+        raise parsed.error(f"scheme '{parsed.scheme}' came", "tcp://HOST:PORT, udp://HOST:PORT, pty: or pty:PATH")
     parsed.check_options()
     try:
         return sinks[parsed.scheme](parsed)
