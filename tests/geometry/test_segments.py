@@ -24,8 +24,8 @@ def test_rigid_motions_change_no_length_distance_or_crossing(pose, seed):
     np.testing.assert_allclose(
         point_to_segments(transform_points(pose, points), moved), point_to_segments(points, segments), atol=1e-9
     )
-    u, v = np.diff(segments, axis=1)[:2, 0]
-    moved_u, moved_v = np.diff(moved, axis=1)[:2, 0]
+    u, v = np.diff(segments[:2], axis=1)
+    moved_u, moved_v = np.diff(moved[:2], axis=1)
     assert cross(moved_u, moved_v) == pytest.approx(cross(u, v), abs=1e-9)
     assert cross(v, u) == -cross(u, v)
 
