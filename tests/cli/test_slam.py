@@ -78,7 +78,7 @@ BAD = {
     "slam log.csv --ring faw -o out.geojson --sigma -1": "--sigma",
     "slam log.csv --ring faw -o out.geojson --odometry 3": "--odometry",
     "slam log.csv --ring faw -o - --trajectory -": "standard output",
-    "slam log.csv --ring faw -o out.geojson --scale --no-smoothing": "without smoothing",
+    "slam log.csv --ring faw -o out.geojson --scale --no-smoothing": "estimated by smoothing",
     "slam log.csv --ring faw -o out.geojson --truth other.tum": "--truth",
     "slam log.csv --ring faw -o out.geojson --figure run.xyz": "--figure",
     "slam log.csv --ring faw": "-o",
