@@ -100,9 +100,7 @@ def _input(filename: str, name: str) -> Input:
             f"{shown(filename)}: {came} came; allowed for a log is {', '.join(FORMATS)}, or a folder of logs"
         )
     if not os.path.isfile(filename) and not _is_bag(filename):
-        raise SonarError(
-            f"{shown(filename)}: not a regular file, but a log is read more than once; needed is a log"
-        )
+        raise SonarError(f"{shown(filename)}: not a regular file, but a log is read more than once; needed is a log")
     if format_ in ("csv", "parquet") and recording_marker(filename).exists():
         format_ = "recording"
     return Input(name.encode("utf-8", "surrogateescape").decode("utf-8", "replace"), filename, format_)

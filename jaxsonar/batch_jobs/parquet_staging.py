@@ -11,9 +11,10 @@ from jaxsonar.fileio.atomic_files import atomic_write, reason, shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.mcap_recorder import MESSAGES, PROFILE, read_mcap
 from jaxsonar.hardware.protocol import Decoder
-from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler
+from jaxsonar.hardware.scan_assembler import ScanAssembler
 from jaxsonar.scans.log_file import load_log
 from jaxsonar.scans.parquet_log import open_parquet, write_parquet_chunks
+from jaxsonar.scans.raw_scans import scan_from_raw
 from jaxsonar.scans.scan_log import Log, Scan
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -91,23 +92,10 @@ def _raw_recording_scans(filename: str, name: str, sensors: int) -> Iterator[Sca
         if topic == MESSAGES:
             for message in decoder.feed(frame):
                 assembler.unknown_messages = decoder.counts.unknown + decoder.counts.newer > 0
-                yield from map(_as_scan, assembler.push(message, received))
+                yield from map(scan_from_raw, assembler.push(message, received))
             if decoder.counts.out_of_ring:
                 raise SonarError(f"{shown(name)}: an unknown sensor came; allowed is 0 to {sensors - 1}")
-    yield from map(_as_scan, assembler.flush())
-
-
-def _as_scan(raw: RawScan) -> Scan:
-    echoes = raw.echoes
-    return Scan(
-        scan=raw.scan,
-        stamp=raw.stamp,
-        pose=raw.pose,
-        tx=echoes["tx"].astype(int),
-        rx=echoes["rx"].astype(int),
-        range=raw.ranges,
-        amplitude=echoes["amplitude"].astype(float),
-    )
+    yield from map(scan_from_raw, assembler.flush())
 
 
 def _row_groups(scans: Iterator[Scan], rows: int) -> Iterator[Log]:

@@ -18,6 +18,7 @@ from jaxsonar.geometry.se2 import relative
 from jaxsonar.graph_slam.incremental_mapper import Mapper
 from jaxsonar.hardware.scan_assembler import RawScan
 from jaxsonar.mapping.global_map import GlobalMap
+from jaxsonar.scans.raw_scans import scan_from_raw
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring, speed_of_sound
 
@@ -144,7 +145,8 @@ class LiveMap:
         Raises:
             SonarError: a sensor number that the ring does not have.
         """
-        scans = [self.as_scan(raw) for raw in raw_scans]
+        scans = [scan_from_raw(raw) for raw in raw_scans]
+        self.left_out += sum(int((self._path_index[scan.tx, scan.rx] < 0).sum()) for scan in scans)
         poses = [self.path_poses(raw) for raw in raw_scans]
         self._follow_temperature(raw_scans)
         robot_stood = all(pose is None for pose in poses)
@@ -196,21 +198,6 @@ class LiveMap:
         assert self._state is not None
         poses, covariances = self._mapper.trajectory(self._state)
         return Trajectory(np.array(self._stamps), poses, covariances)
-
-    def as_scan(self, raw: RawScan) -> Scan:
-        """Convert a raw scan to a scan of a log: times of flight to ranges."""
-        echoes = raw.echoes
-        tx, rx = echoes["tx"].astype(np.int64), echoes["rx"].astype(np.int64)
-        self.left_out += int((self._path_index[tx, rx] < 0).sum())
-        return Scan(
-            scan=raw.scan,
-            stamp=raw.stamp,
-            pose=raw.pose,
-            tx=tx,
-            rx=rx,
-            range=raw.ranges,
-            amplitude=echoes["amplitude"].astype(np.float64),
-        )
 
     def path_poses(self, raw: RawScan) -> Float[np.ndarray, "paths 3"] | None:
         """Pose of the robot when each path fired, relative to its pose at the end of the scan; None if it stood still.

@@ -11,7 +11,15 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from jaxsonar.diagnostics.beam_width import detection_probability
 from jaxsonar.diagnostics.health_report import Health
-from jaxsonar.reports.plot_style import CROSS_COLOR, DIRECT_COLOR, FAINT_COLOR, LINE_COLOR, ROBOT_COLOR, figure_style
+from jaxsonar.reports.plot_style import (
+    CROSS_COLOR,
+    DIRECT_COLOR,
+    FAINT_COLOR,
+    LINE_COLOR,
+    PALETTE,
+    ROBOT_COLOR,
+    figure_style,
+)
 
 _MAX_LINES = 7
 """Maximum number of text lines for findings."""
@@ -39,12 +47,12 @@ def health_figure(health: Health) -> Figure:
 
 def _draw_residuals(axes: Axes, health: Health) -> None:
     axes.set_title("Residuals of direct echoes against walls from the other echoes")
-    known = np.flatnonzero(np.isfinite(health.median))
-    low, first, third, high = 1e3 * health.quartiles[known].T
+    has_median = np.flatnonzero(np.isfinite(health.median))
+    low, first, third, high = 1e3 * health.quartiles[has_median].T
     axes.axhline(0, color=FAINT_COLOR, lw=1, zorder=0)
-    axes.vlines(known, low, high, color=DIRECT_COLOR, lw=1, alpha=0.5)
-    axes.vlines(known, first, third, color=DIRECT_COLOR, lw=5, alpha=0.5)
-    axes.plot(known, 1e3 * health.median[known], "_", color=DIRECT_COLOR, ms=9, mew=2)
+    axes.vlines(has_median, low, high, color=DIRECT_COLOR, lw=1, alpha=0.5)
+    axes.vlines(has_median, first, third, color=DIRECT_COLOR, lw=5, alpha=0.5)
+    axes.plot(has_median, 1e3 * health.median[has_median], "_", color=DIRECT_COLOR, ms=9, mew=2)
     has_offset = np.flatnonzero(np.isfinite(health.offset))
     axes.errorbar(
         has_offset + 0.3,
@@ -56,8 +64,8 @@ def _draw_residuals(axes: Axes, health: Health) -> None:
         lw=1,
         capsize=2,
     )
-    bad = np.flatnonzero(["offset" in remark for remark in health.remarks])
-    axes.plot(bad + 0.3, 1e3 * health.offset[bad], "o", color=LINE_COLOR, ms=6)
+    faulty = np.flatnonzero(["offset" in remark for remark in health.remarks])
+    axes.plot(faulty + 0.3, 1e3 * health.offset[faulty], "o", color=LINE_COLOR, ms=6)
     axes.set_ylabel("reported – expected (mm)")
     axes.set_xlim(-0.7, health.ring.count - 0.1)
     axes.tick_params(labelbottom=False)
@@ -65,9 +73,9 @@ def _draw_residuals(axes: Axes, health: Health) -> None:
         Line2D([], [], color=DIRECT_COLOR, marker="_", ls="", ms=9, mew=2, label="median, quartiles, 5–95 %"),
         Line2D([], [], color=ROBOT_COLOR, marker="o", ms=3, lw=1, label="offset ± 2 standard errors"),
     ]
-    if len(bad):
+    if len(faulty):
         handles.append(Line2D([], [], color=LINE_COLOR, marker="o", ls="", label="finding"))
-    if len(known):
+    if len(has_median):
         limit = max(1.0, float(np.abs([low, high]).max()), float(np.nanmax(1e3 * np.abs(health.offset), initial=0)))
         axes.set_ylim(-1.1 * limit, 1.5 * limit)
         axes.legend(handles=handles, loc="upper right", ncols=3, fontsize=8)
@@ -80,14 +88,14 @@ def _draw_detection_rate(axes: Axes, health: Health) -> None:
     columns = (
         (DIRECT_COLOR, "direct echoes", -0.27, health.expected[:, 0], health.heard[:, 0]),
         (CROSS_COLOR, "cross, as transmitter", 0.0, health.expected[:, 1], health.heard[:, 1]),
-        ("#009E73", "cross, as receiver", 0.27, health.expected[:, 2], health.heard[:, 2]),
+        (PALETTE[2], "cross, as receiver", 0.27, health.expected[:, 2], health.heard[:, 2]),
     )
-    shown = [column for column in columns if column[3].any()]
-    width = 0.27 if len(shown) > 1 else 0.6
-    for color, label, shift, expected, heard in shown:
-        there = np.flatnonzero(expected)
-        height = 100 * heard[there] / expected[there]
-        axes.bar(there + (shift if len(shown) > 1 else 0), height, width * 0.9, color=color, label=label)
+    drawn = [column for column in columns if column[3].any()]
+    width = 0.27 if len(drawn) > 1 else 0.6
+    for color, label, shift, expected, detected in drawn:
+        sensors = np.flatnonzero(expected)
+        height = 100 * detected[sensors] / expected[sensors]
+        axes.bar(sensors + (shift if len(drawn) > 1 else 0), height, width * 0.9, color=color, label=label)
     axes.set_ylim(0, 125)
     axes.set_yticks(range(0, 101, 25))
     axes.set_ylabel("detected (%)")
@@ -96,7 +104,7 @@ def _draw_detection_rate(axes: Axes, health: Health) -> None:
     for k, remark in enumerate(health.remarks):
         if remark:
             axes.axvspan(k - 0.5, k + 0.5, color=LINE_COLOR, alpha=0.12, lw=0)
-    if shown:
+    if drawn:
         axes.legend(loc="upper right", ncols=3, fontsize=8)
     else:
         _write_no_data(axes)
@@ -105,22 +113,22 @@ def _draw_detection_rate(axes: Axes, health: Health) -> None:
 def _draw_beam_pattern(axes: Axes, health: Health) -> None:
     width, error = np.degrees(health.beam)
     nominal = np.degrees(health.nominal)
-    measured = (
-        "not enough to measure" if np.isnan(width) else f"{width:.1f} ± {error:.1f}° wide, nominal {nominal:.0f}°"
-    )
+    measured = "not enough data" if np.isnan(width) else f"{width:.1f} ± {error:.1f}° wide, nominal {nominal:.0f}°"
     axes.set_title(f"Cones: {measured}")
     edges = np.linspace(-90, 90, len(health.asked) + 1)
     middle = (edges[1:] + edges[:-1]) / 2
     enough = health.asked >= 3
-    share = 100 * health.answered / np.maximum(health.asked, 1)
+    rate = 100 * health.answered / np.maximum(health.asked, 1)
     size = np.clip(4 * np.sqrt(health.asked / max(1, health.asked.max())), 1.5, None) ** 2
-    axes.scatter(
-        middle[enough], share[enough], size[enough] * 1.6, color=DIRECT_COLOR, label="detected walls, by angle"
-    )
+    axes.scatter(middle[enough], rate[enough], size[enough] * 1.6, color=DIRECT_COLOR, label="detected walls, by angle")
     if np.isfinite(width):
-        fine = np.linspace(-90, 90, 721)
+        angles = np.linspace(-90, 90, 721)
         axes.plot(
-            fine, 100 * detection_probability(health.curve, np.radians(fine)), color=LINE_COLOR, lw=1.4, label="fitted"
+            angles,
+            100 * detection_probability(health.curve, np.radians(angles)),
+            color=LINE_COLOR,
+            lw=1.4,
+            label="fitted",
         )
     for side in (-1, 1):
         label = "nominal border" if side == 1 else None
@@ -145,12 +153,12 @@ def _draw_ring(axes: Axes, health: Health) -> None:
                 (x, y), 0.45 * extent, direction - beam / 2, direction + beam / 2, color=FAINT_COLOR, alpha=0.25, lw=0
             )
         )
-    bad = np.array([bool(remark) for remark in health.remarks])
-    axes.plot(*position[~bad].T, "o", color=ROBOT_COLOR, ms=4)
-    axes.plot(*position[bad].T, "o", color=LINE_COLOR, ms=8)
+    faulty = np.array([bool(remark) for remark in health.remarks])
+    axes.plot(*position[~faulty].T, "o", color=ROBOT_COLOR, ms=4)
+    axes.plot(*position[faulty].T, "o", color=LINE_COLOR, ms=8)
     inward = position - 0.16 * extent * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     for k, (x, y) in enumerate(inward):
-        weight, color = ("bold", LINE_COLOR) if bad[k] else ("normal", ROBOT_COLOR)
+        weight, color = ("bold", LINE_COLOR) if faulty[k] else ("normal", ROBOT_COLOR)
         axes.text(x, y, str(k), ha="center", va="center", fontsize=7, color=color, fontweight=weight)
     axes.annotate(
         "",
@@ -169,12 +177,12 @@ def _draw_ring(axes: Axes, health: Health) -> None:
 def _write_findings(axes: Axes, health: Health) -> None:
     """Write the findings, as many as fit."""
     axes.axis("off")
-    words = list(health.findings) or ["no findings" if health.source else ""]
+    findings = list(health.findings) or ["no findings" if health.source else ""]
     if health.empty:
-        words.insert(0, f"sensors are not compared with walls: {health.empty}")
+        findings.insert(0, f"sensors are not compared with walls: {health.empty}")
     if health.source == "map":
-        words.append("walls from a map: residuals hold errors of the poses and the delay of the sensors, too")
-    lines = [line for word in words if word for line in textwrap.wrap(f"• {word}", 150, subsequent_indent="   ")]
+        findings.append("walls from a map: residuals include errors of the poses and the delay of the sensors")
+    lines = [line for text in findings if text for line in textwrap.wrap(f"• {text}", 150, subsequent_indent="   ")]
     if len(lines) > _MAX_LINES:
         lines = [*lines[: _MAX_LINES - 1], f"… and more: {len(health.findings)} findings in all"]
     color = LINE_COLOR if health.findings else ROBOT_COLOR
