@@ -74,7 +74,7 @@ MISTAKES = {
     "not a unit": (LINE + LINE.replace("0 1\n", "0 1.01\n"), ["line 2", "1.01", "length 1"]),
     "leaning": (LINE + "2 1 2 0 0.05 0 0 0.99874922\n", ["line 2", "deg of tilt", "1 deg"]),
     "upside down": ("2 1 2 0 1 0 0 0\n", ["line 1", "180 deg"]),
-    "no text": (b"\xff\xfe\x00", ["no text", "stamp x y z"]),
+    "not a text file": (b"\xff\xfe\x00", ["not a text file", "stamp x y z"]),
 }
 
 
