@@ -196,5 +196,19 @@ def test_links_lead_to_files():
     assert missing == []
 
 
+def test_named_modules_exist():
+    """``package/module`` in the architecture and ``folder/file.py`` in all pages are files of the project."""
+    packages = {folder.name for folder in (ROOT / "jaxsonar").iterdir() if folder.is_dir()}
+    architecture = (ROOT / "ARCHITECTURE.md").read_text("utf-8")
+    names = [f"{folder}/{file}.py" for folder, file in re.findall(r"\b(\w+)/(\w+)\b(?![.*/])", architecture)]
+    names = [name for name in names if name.split("/")[0] in packages]
+    for page in [*PAGES, ROOT / "ARCHITECTURE.md", ROOT / "CONTRIBUTING.md"]:
+        names += re.findall(r"(?<![\w/.])(?:\w+/)+\w+\.(?:py|h)\b", page.read_text("utf-8"))
+    assert len(names) > 80
+    assert (
+        sorted({name for name in names if not any((base / name).is_file() for base in (ROOT, ROOT / "jaxsonar"))}) == []
+    )
+
+
 def test_every_page_is_in_the_index():
     assert sorted(file.name for file in INDEX.parent.glob("*.md")) == sorted(page.name for page in PAGES[1:])

@@ -224,6 +224,12 @@ def test_layers():
     assert unlayered_imports(ROOT) == []
 
 
+def test_the_architecture_shows_the_layers():
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").partition("## Layers")[2].partition("\n## ")[0]
+    rows = [tuple(re.findall(r"`(\w+)`", line.split("|")[1])) for line in text.splitlines() if line.startswith("| `")]
+    assert rows == list(LAYERS)
+
+
 def test_no_import_cycles():
     assert import_cycles(ROOT) == []
 
