@@ -84,6 +84,11 @@ def wrap_pose(pose: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 
     return np.concatenate([pose[..., :2], wrap_angle(pose[..., 2:])], axis=-1)
 
 
+def diagonal_covariance(sd: tuple[float, float]) -> Float[np.ndarray, "3 3"]:
+    """Covariance of independent errors with the standard deviations (position in x and in y, theta)."""
+    return np.diag(np.square([sd[0], sd[0], sd[1]]))
+
+
 def compose_jacobians(
     a_from_b: Float[np.ndarray, "3"], b_from_c: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:

@@ -15,7 +15,7 @@ from jaxsonar import kernels
 from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
 from jaxsonar.geometry.landmarks import concatenate_landmarks, transform_landmarks
-from jaxsonar.geometry.se2 import propagate, relative, tangent_of, transform_points
+from jaxsonar.geometry.se2 import diagonal_covariance, propagate, relative, tangent_of, transform_points
 from jaxsonar.graph_slam.joint_compatibility import FeatureMeasurements, associate_features, feature_measurements
 from jaxsonar.graph_slam.scan_echoes import ScanEchoes, known_walls_missed, without_padding
 from jaxsonar.loop_closure.submap import Submap
@@ -251,8 +251,7 @@ def close_submap(state: SubmapState) -> Submap:
     unknowns = np.concatenate([np.arange(3), (3 + 2 * kept[:, None] + [0, 1]).ravel()]).astype(np.int64)
     covariance = state.belief.covariance[np.ix_(unknowns, unknowns)]
     if state.track_lost:
-        position_sd, heading_sd = SETTINGS.track_loss_sd
-        covariance[:3, :3] += np.diag(np.square([position_sd, position_sd, heading_sd]))
+        covariance[:3, :3] += diagonal_covariance(SETTINGS.track_loss_sd)
     return Submap(
         landmarks=state.belief.landmarks.take(kept),
         scan_counts=state.scan_counts[kept],

@@ -9,7 +9,15 @@ from jaxtyping import Float, Int
 
 from jaxsonar.detection.local_map import LocalModel
 from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
-from jaxsonar.geometry.se2 import propagate, relative, rotate, subtract_poses, wrap_angle, wrap_pose
+from jaxsonar.geometry.se2 import (
+    diagonal_covariance,
+    propagate,
+    relative,
+    rotate,
+    subtract_poses,
+    wrap_angle,
+    wrap_pose,
+)
 from jaxsonar.graph_slam.frontend import SubmapState, update
 from jaxsonar.localization.known_map import KnownMap
 from jaxsonar.localization.settings import SETTINGS
@@ -54,7 +62,7 @@ class TrackedHypothesis(NamedTuple):
         off = subtract_poses(self.pose, other.pose)
         if np.hypot(off[0], off[1]) > SETTINGS.same_pose[0] or abs(off[2]) > SETTINGS.same_pose[1]:
             return False
-        covariance = self.covariance + other.covariance + _diagonal(SETTINGS.same_pose_sd)
+        covariance = self.covariance + other.covariance + diagonal_covariance(SETTINGS.same_pose_sd)
         return bool(off @ np.linalg.solve(covariance, off) < SETTINGS.same_pose_chi2)
 
 
@@ -84,11 +92,11 @@ class HypothesisTracker:
 
     def initial_hypotheses(self, start: Float[np.ndarray, "3"] | None) -> list[TrackedHypothesis]:
         """Hypotheses for the pose of the first scan: a given start pose, and poses at which features match the map."""
-        covariance = _diagonal(SETTINGS.hypothesis_sd)
+        covariance = diagonal_covariance(SETTINGS.hypothesis_sd)
         found = [TrackedHypothesis(pose, covariance) for pose in self._matching_poses(start)]
         if start is None:
             return found
-        return [TrackedHypothesis(start, _diagonal(SETTINGS.start_sd), is_start=True), *found]
+        return [TrackedHypothesis(start, diagonal_covariance(SETTINGS.start_sd), is_start=True), *found]
 
     def _matching_poses(self, start: Float[np.ndarray, "3"] | None) -> list[Float[np.ndarray, "3"]]:
         """Poses of the first scan at which features of the first scans match the map, the most likely first."""
@@ -100,7 +108,7 @@ class HypothesisTracker:
             for row in richest[: SETTINGS.scoring_scans]
         }
         # 1. Hypotheses of the scans with the most features, as poses of the first scan.
-        information = np.linalg.inv(_diagonal(SETTINGS.hypothesis_sd))
+        information = np.linalg.inv(diagonal_covariance(SETTINGS.hypothesis_sd))
         candidates = []
         for row in richest[: SETTINGS.hypothesis_scans]:
             scan, back = scans[row], relative(self.odometry[row], first)
@@ -217,11 +225,6 @@ class HypothesisTracker:
         """Move a pose, with what it is correlated with, by the odometry between two consecutive rows."""
         step = relative(self.odometry[self.rows[number - 1]], self.odometry[self.rows[number]])
         return propagate(pose, covariance, step, np.diag(step_variance(self.odometry_noise, step)))
-
-
-def _diagonal(sd: tuple[float, float]) -> Float[np.ndarray, "3 3"]:
-    """Covariance of a pose from the standard deviations of position and heading."""
-    return np.diag(np.square([sd[0], sd[0], sd[1]]))
 
 
 def _merged(hypotheses: Sequence[TrackedHypothesis]) -> list[TrackedHypothesis]:

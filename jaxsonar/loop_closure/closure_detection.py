@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxsonar import kernels
 from jaxsonar.geometry.landmarks import landmark_positions
-from jaxsonar.geometry.se2 import perpendicular, subtract_poses, tangent_of, unit, wrap_angle
+from jaxsonar.geometry.se2 import diagonal_covariance, perpendicular, subtract_poses, tangent_of, unit, wrap_angle
 from jaxsonar.loop_closure.perceptual_aliasing import (
     AlternativeHypotheses,
     PenaltyGrid,
@@ -131,8 +131,7 @@ def _fit_from(
     earlier: Submap, newest: Submap, pose: Float[np.ndarray, "3"], prior: PosePrior
 ) -> tuple[Pairs, PoseFit] | None:
     """Pairs near a pose and their fit; the pairs are searched again at the fit."""
-    position, heading = SETTINGS.rough_pose_sd
-    rough = np.diag(np.square([position, position, heading]))
+    rough = diagonal_covariance(SETTINGS.rough_pose_sd)
     pairs = nearest_pairs(earlier, newest, pose, rough)
     found = fit_compatible_pairs(earlier, newest, pairs, pose, least=2)
     if found is not None:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.special import chdtri
 
 from jaxsonar.estimation.pose_graph import BetweenFactor
-from jaxsonar.geometry.se2 import subtract_poses, wrap_pose
+from jaxsonar.geometry.se2 import diagonal_covariance, subtract_poses, wrap_pose
 from jaxsonar.loop_closure.pose_candidates import PosePrior, pose_candidates
 from jaxsonar.loop_closure.settings import SETTINGS
 from jaxsonar.loop_closure.submap import Submap
@@ -72,8 +72,7 @@ class _Update(NamedTuple):
 
 def _update_from(previous: Submap, following: Submap, pose: Float[np.ndarray, "3"]) -> _Update | None:
     """Update with the pairs near a pose; the worst is removed until the rest is jointly compatible."""
-    position, heading = SETTINGS.sequential_pose_sd
-    pairs = nearest_pairs(previous, following, pose, np.diag(np.square([position, position, heading])))
+    pairs = nearest_pairs(previous, following, pose, diagonal_covariance(SETTINGS.sequential_pose_sd))
     fewest = max(1, int(np.ceil(2 * len(pairs) / 3)))
     while len(pairs) >= fewest:
         found, cov, chi2, share = _kalman_update(previous, following, pairs)
