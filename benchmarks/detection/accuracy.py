@@ -1,4 +1,4 @@
-"""Accuracy of local maps in random rooms, with noise, lost and false echoes, compared with two baselines.
+"""Accuracy of local models in random rooms, with noise, lost and false echoes, compared with two baselines.
 
 Run ``python -m benchmarks.detection.accuracy [--quick] [-o DIR]``. Each condition is simulated once, and all methods
 get the others echoes: those of walls, corners, edges, poles and second order without the lost ones, and false ones.

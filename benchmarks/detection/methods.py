@@ -32,7 +32,7 @@ class DetectionResult:
 
     @classmethod
     def of_model(cls, model: LocalModel) -> "DetectionResult":
-        """The lines, points and undecided reflectors of a local map."""
+        """The lines, points and undecided reflectors of a local model."""
         others = [(np.hypot(point.x, point.y), np.arctan2(point.y, point.x)) for point in model.points]
         others += [(one.rho, one.theta) for one in model.undecided]
         answers = [ANSWERS.index(point.kind) for point in model.points]

@@ -48,7 +48,7 @@ MAX_SCIPY_SEGMENTS = 10_000
 def building(
     segments: int, *, wall_thickness: float = WALL_THICKNESS, seed: int = 0
 ) -> tuple[WallSegments, np.ndarray]:
-    """Segments of local maps in a square of rooms, and the true walls (walls, 2, 2)."""
+    """Segments of local models in a square of rooms, and the true walls (walls, 2, 2)."""
     rng = np.random.default_rng(seed)
     clutter = int(CLUTTER * segments)
     rooms = max(1, round((segments - clutter) / (4 * SEGMENTS_PER_WALL)))

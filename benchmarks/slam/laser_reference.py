@@ -32,7 +32,7 @@ _LINE_DISTANCE, _THETA_STEP, _RHO_STEP, _SUBSAMPLE = (
     7,
 )  # m between lines; rad, m of the votes; returns, one in
 WINDOW = 1.5
-"""Length of the trajectory in one local map, metres; one scan has too few echoes."""
+"""Length of the trajectory in one local model, metres; one scan has too few echoes."""
 
 
 @dataclass(frozen=True)
