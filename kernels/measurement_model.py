@@ -88,23 +88,26 @@ def plane_coordinates(
 def image_source(
     path: PlaneCoordinates,
 ) -> tuple[Float[Array, ""], Float[Array, "2"], Float[Array, ""], Float[Array, ""]]:
-    """Range of a plane echo by the image source, exact for direct and cross echoes.
+    """Range of a plane echo by the image source, exact for direct and cross echoes; the height must not be 0.
 
     Returns:
         Range sqrt(height^2 + baseline_tangent^2), metres; its derivatives with respect to rho and theta; cosine and
         sine of the angle between the normal and the sound at the transmitter.
     """
-    distance = safe_sqrt(path.height * path.height + path.baseline_tangent * path.baseline_tangent)
-    divisor = jnp.where(distance > 0, distance, 1)
-    cosine, sine = path.height / divisor, path.baseline_tangent / divisor
+    distance = jnp.sqrt(_squared_range(path))
+    cosine, sine = path.height / distance, path.baseline_tangent / distance
     return distance, jnp.stack([cosine, -(cosine * path.along + sine * path.baseline_normal)]), cosine, sine
+
+
+def _squared_range(path: PlaneCoordinates) -> Float[Array, ""]:
+    return path.height * path.height + path.baseline_tangent * path.baseline_tangent
 
 
 def plane_range(
     line: Float[Array, "2"], midpoint: Float[Array, "2"], half_baseline: Float[Array, "2"]
 ) -> Float[Array, ""]:
     """Range of a plane (rho, theta) with rho of either sign, metres; arguments as ``EchoPaths``."""
-    return image_source(plane_coordinates(line, midpoint, half_baseline))[0]
+    return safe_sqrt(_squared_range(plane_coordinates(line, midpoint, half_baseline)))
 
 
 def corner_range(corner: Float[Array, "2"], midpoint: Float[Array, "2"]) -> Float[Array, ""]:

@@ -39,6 +39,7 @@ class RobustFitSettings:
 
 
 SETTINGS = RobustFitSettings()
+_MIN_HEIGHT = 1e-9  # m; avoids a division by zero if the virtual sensor is on the plane
 
 
 class ReflectorRange(NamedTuple):
@@ -141,8 +142,9 @@ def fit_reflector(
 def plane(line: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:
     """A wall (rho, theta), visible from both of its sides: during a window the robot may drive past its line."""
     here = plane_coordinates(line, path.midpoint, path.half_baseline)
-    distance, gradient, _, _ = image_source(here)
-    return ReflectorRange(distance, gradient, jnp.where(here.height >= 0, here.normal, -here.normal))
+    height = jnp.where(jnp.abs(here.height) < _MIN_HEIGHT, _MIN_HEIGHT, here.height)
+    distance, gradient, _, _ = image_source(here._replace(height=height))
+    return ReflectorRange(distance, gradient, jnp.where(height >= 0, here.normal, -here.normal))
 
 
 def corner(point: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:

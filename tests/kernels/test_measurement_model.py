@@ -111,7 +111,7 @@ def test_the_echo_of_a_plane_comes_from_its_image_source(seed):
     assert (oracle[0] | ~before).all()
     oracle = (before, *oracle[1:])
     assert_agree(echo, oracle)
-    np.testing.assert_allclose(echo.foot[before], (oracle[-1] @ unit(theta + math.pi / 2))[before], atol=1e-4)
+    np.testing.assert_allclose(echo.footpoint[before], (oracle[-1] @ unit(theta + math.pi / 2))[before], atol=1e-4)
 
 
 @settings(max_examples=30)
@@ -209,7 +209,7 @@ def test_exchanging_transmitter_and_receiver_exchanges_the_directions(model, see
     np.testing.assert_array_equal(there.exists, back.exists)
     np.testing.assert_allclose(there.departure[there.exists], back.arrival[there.exists], atol=2e-5)
     np.testing.assert_allclose(there.arrival[there.exists], back.departure[there.exists], atol=2e-5)
-    np.testing.assert_allclose(there.foot[there.exists], back.foot[there.exists], atol=1e-4)
+    np.testing.assert_allclose(there.footpoint[there.exists], back.footpoint[there.exists], atol=1e-4)
 
 
 @models
@@ -225,7 +225,7 @@ def test_mirroring_the_scene_mirrors_directions_and_keeps_ranges(model, seed):
     np.testing.assert_allclose(here.range, there.range, atol=1e-5)
     np.testing.assert_array_equal(here.exists, there.exists)
     np.testing.assert_allclose(here.departure[here.exists], (mirror * there.departure)[here.exists], atol=2e-5)
-    np.testing.assert_allclose(here.foot[here.exists], -there.foot[here.exists], atol=1e-4)
+    np.testing.assert_allclose(here.footpoint[here.exists], -there.footpoint[here.exists], atol=1e-4)
 
 
 # gradients
@@ -270,7 +270,7 @@ def test_gradients_are_finite_if_a_sensor_is_on_the_reflector(model, place):
 
     def all_of_it(x):
         echo = kernel(*(x[2 * k : 2 * k + 2] for k in range(count)), path)
-        return echo.range.sum() + echo.foot.sum() + visibilities(echo, path).sum()
+        return echo.range.sum() + echo.footpoint.sum() + visibilities(echo, path).sum()
 
     at = np.resize(place if model in ("corner", "edge") else (0.3, 0.0), 2 * count)
     value, slope = jax.value_and_grad(all_of_it)(jnp.asarray(at, jnp.float32))

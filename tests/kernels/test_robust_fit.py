@@ -96,7 +96,7 @@ def test_footpoints_are_those_of_the_virtual_sensors(seed):
     t = np.array([-math.sin(fits.theta[0]), math.cos(fits.theta[0])])
     for k, (pose, path, _) in enumerate(echoes):
         middle = oracles.matrix(pose) @ np.append(RING.position[RING.paths[path]].mean(axis=0), 1)
-        assert fits.foot[0, k] == pytest.approx(middle[:2] @ t, abs=1e-5)
+        assert fits.footpoint[0, k] == pytest.approx(middle[:2] @ t, abs=1e-5)
 
 
 @settings(max_examples=25)
@@ -163,7 +163,9 @@ def compare_from(frame, echoes, plane, guess):
     assert there.plane_score[0] == pytest.approx(here.plane_score[0], rel=1e-3)
     assert there.point_score[0] == pytest.approx(here.point_score[0], rel=0.02, abs=0.2)
     assert max(error(there, transform_line(frame, plane))) < 1e-4
-    assert np.ptp(there.foot[0, : len(echoes)]) == pytest.approx(np.ptp(here.foot[0, : len(echoes)]), abs=1e-3)
+    assert np.ptp(there.footpoint[0, : len(echoes)]) == pytest.approx(
+        np.ptp(here.footpoint[0, : len(echoes)]), abs=1e-3
+    )
 
 
 def test_an_echo_from_the_front_is_not_explained_by_a_plane_behind():
