@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .array_geometry import SensorArray
-from .geometry import normal, tangent, wrap_angle
+from .geometry import rotate_back, wrap_angle
 from .landmarks import Landmarks, Reflection, landmark_in_robot_frame
 from .measurement_model import expected_range, reported_range
 
@@ -239,8 +239,7 @@ def odometry_residual(
         odometry: the measured step.
         scale: logarithms of the scale of measured displacements and rotations.
     """
-    displacement = there[:2] - here[:2]
-    step = jnp.stack([normal(here[2]) @ displacement, tangent(here[2]) @ displacement])
+    step = rotate_back(there[:2] - here[:2], here[2])
     unscale = jnp.exp(-scale)
     rotation = there[2:] - here[2:] - unscale[1:] * wrap_angle(odometry[2:])
     return jnp.concatenate([step - unscale[0] * odometry[:2], wrap_angle(rotation)])

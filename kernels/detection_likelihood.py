@@ -25,7 +25,7 @@ def _second_order_density(scan: ScanData, scene: SceneEstimate, settings: Detect
     def pair(first: Float[Array, "2"], second: Float[Array, "2"], known: Bool[Array, ""]) -> Float[Array, " echoes"]:
         def one(path: EchoPaths, measured: Float[Array, ""]) -> Float[Array, ""]:
             echo = second_order_echo(first, second, path)
-            sd = 2 * scene.sigma + 0.002
+            sd = 2 * scene.sigma + settings.second_order_sd
             return visibility(echo, path) * jnp.exp(log_normal(measured - echo.range, sd))
 
         each_echo = jax.vmap(one, in_axes=-1)
@@ -134,7 +134,7 @@ def point_missed_log_likelihood(
     """Log likelihood of the missed detections of ONE corner (0) or edge (1), at most 0 nats."""
     missed = missed_detections(scan, model, point, scene, settings)
     # A faint edge is received near the axes only: up to the farthest of its echoes.
-    border = jnp.where(point.log_ratio > 0, missed.echo_off_axis, 0).max() + 1e-3
+    border = jnp.where(point.log_ratio > 0, missed.echo_off_axis, 0).max() + settings.off_axis_margin
     border = jnp.where(is_edge > 0, border, jnp.inf)
     inside = missed.total(missed.off_axis < border, missed.echo_off_axis < border)
     outside = missed.total(missed.off_axis >= border, missed.echo_off_axis >= border)

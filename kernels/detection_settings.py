@@ -29,6 +29,9 @@ class DetectionSettings:
     second_order_walls: int = 7
     """Reflectors, those with the most evidence, between which second-order echoes are predicted; chosen by hand."""
 
+    second_order_sd: float = 0.002
+    """Standard deviation of predicted second-order ranges, metres, in addition to two sigma; chosen by hand."""
+
     # Candidates and their fit
 
     peak_threshold: float = 0.1
@@ -84,6 +87,8 @@ class DetectionSettings:
     """Mean length of walls, metres: a wall ends within a gap g between two footpoints with probability g / length."""
     min_gap: float = 0.02
     """Smallest gap in which a wall can end, metres; chosen by hand."""
+    off_axis_margin: float = 1e-3
+    """Margin of the off-axis ratio beyond the farthest echo of an edge; a numerical tolerance."""
     footpoint_margin: float = 1e-3
     """Metres within which two footpoints coincide; a numerical tolerance."""
 
