@@ -250,7 +250,9 @@ def main() -> None:
     options.add_argument("--seeds", type=int, help="number of seeds (default: 20, with --quick 3)")
     options.add_argument("--scans", type=int, help="scans of the long run (default: 10000, --quick 1000); 0 = none")
     options.add_argument("--only", metavar="TEXT", help="scenarios whose name contains TEXT")
-    options.add_argument("--way", choices=tuple(VARIANTS), help="one variant (default: both, the long run smoothed)")
+    options.add_argument(
+        "--variant", "--way", choices=tuple(VARIANTS), help="one variant (default: both, the long run smoothed)"
+    )
     options.add_argument("-o", "--output", type=Path, default=Path("benchmark-results/slam.json"))
     options = options.parse_args()
     seeds = options.seeds or (3 if options.quick else 20)
@@ -264,7 +266,7 @@ def main() -> None:
         "corridor": [lambda k=k: corridor(k) for k in range(max(seeds // 4, 1))],
     }
     makers = {name: scenes for name, scenes in makers.items() if wanted(name)}
-    variants = [options.way] if options.way else list(VARIANTS)
+    variants = [options.variant] if options.variant else list(VARIANTS)
     stderr = Console(stderr=True)
 
     def print_progress(line: str) -> None:
@@ -274,7 +276,7 @@ def main() -> None:
     results = run(makers, variants, single_scans=single_scans, progress=print_progress)
     if scans and wanted("long run"):
         makers = {"long run": [lambda: long_run(scans=scans)]}
-        results += run(makers, [options.way or "smoothed"], single_scans=0, progress=print_progress)
+        results += run(makers, [options.variant or "smoothed"], single_scans=0, progress=print_progress)
     settings = {"seeds": seeds, "scans": scans, "sigma": SIGMA, "distance": DISTANCE, "turn": TURN}
     content = without_nan({"versions": versions(), "settings": settings, "scenarios": results})
     make_folder(options.output.parent)

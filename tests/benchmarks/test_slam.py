@@ -56,11 +56,11 @@ def office():
 
 
 def test_trajectories_keep_clear_of_walls(scene):
-    way, walls = LineString(scene.poses[:, :2]), MultiLineString(list(scene.room.walls))
-    assert not way.crosses(walls)
-    assert clearance(scene) == way.distance(walls) >= CLEARANCE
+    route, walls = LineString(scene.poses[:, :2]), MultiLineString(list(scene.room.walls))
+    assert not route.crosses(walls)
+    assert clearance(scene) == route.distance(walls) >= CLEARANCE
     # The walls enclose the trajectory: one piece of floor contains all of it.
-    floor = [piece for piece in shapely.polygonize(list(walls.geoms)).geoms if piece.intersects(way)]
+    floor = [piece for piece in shapely.polygonize(list(walls.geoms)).geoms if piece.intersects(route)]
     assert len(floor) == 1 or scene.name == "office"
 
 
@@ -68,10 +68,10 @@ def test_steps_and_rotations_are_bounded(scene):
     if scene.name == "office":
         return
     step = relative(scene.poses[:-1], scene.poses[1:])
-    way, turn = np.linalg.norm(step[:, :2], axis=-1), np.abs(step[:, 2])
-    assert way.max() <= SCAN_DISTANCE[1] + 1e-9
+    route, turn = np.linalg.norm(step[:, :2], axis=-1), np.abs(step[:, 2])
+    assert route.max() <= SCAN_DISTANCE[1] + 1e-9
     assert turn.max() <= SCAN_ROTATION + 0.06
-    moving = way > 1e-9
+    moving = route > 1e-9
     assert (turn[~moving] > 0).all(), "it turns in place"
     ahead = np.abs(np.arctan2(step[:, 1], step[:, 0]))[moving]
     assert ahead.max() < np.radians(15), "it faces its direction of travel"
@@ -164,8 +164,8 @@ def test_along_a_bare_corridor_the_bound_is_that_of_odometry():
     along = np.append(np.cos(scene.poses[3, 2]), np.sin(scene.poses[3, 2]))
     middle = out // 2
     sd = np.sqrt(along @ bound(scene).poses[middle, :2, :2] @ along)
-    way = np.linalg.norm(scene.poses[middle, :2] - scene.poses[0, :2])
-    assert 0.5 < sd / (DISTANCE * np.sqrt(way)) < 1.01
+    route = np.linalg.norm(scene.poses[middle, :2] - scene.poses[0, :2])
+    assert 0.5 < sd / (DISTANCE * np.sqrt(route)) < 1.01
 
 
 # The measures

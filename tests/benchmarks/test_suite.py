@@ -33,9 +33,9 @@ def walls(ring, rho, theta):
     middle, half = (tx + rx) / 2, (rx - tx) / 2
     n, t = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
     first, last = np.asarray(ring.detection_ranges, dtype=np.float64).T[..., None]
-    away = rho - middle @ n
-    heard = (away > 0) & ((theta - first) % (2 * np.pi) < last - first)
-    return np.where(heard, np.hypot(away, half @ t), np.nan).astype(np.float32)
+    distance = rho - middle @ n
+    received = (distance > 0) & ((theta - first) % (2 * np.pi) < last - first)
+    return np.where(received, np.hypot(distance, half @ t), np.nan).astype(np.float32)
 
 
 @pytest.fixture(scope="module", params=["outward", "inward"])
@@ -186,8 +186,8 @@ def results(**values):
 
 
 def test_results_come_back_and_say_where_they_are_from(tmp_path):
-    told = results()
-    told.save(tmp_path / "suite.json")
+    saved_results = results()
+    saved_results.save(tmp_path / "suite.json")
     raw = json.loads((tmp_path / "suite.json").read_text(), parse_constant=pytest.fail)
     assert {"device", "platform", "processor", "cores", "python", "jax", "jaxlib", "numpy", "commit", "time"} <= set(
         raw["environment"]
@@ -195,10 +195,10 @@ def test_results_come_back_and_say_where_they_are_from(tmp_path):
     assert raw["environment"]["opencv-python-headless"]
     assert raw["options"] == {"size": "quick", "seed": 0}
     again = Results.load(tmp_path / "suite.json")
-    assert list(again.metrics) == list(told.metrics)
-    assert all(repr(again.metrics[key]) == repr(one) for key, one in told.metrics.items())
+    assert list(again.metrics) == list(saved_results.metrics)
+    assert all(repr(again.metrics[key]) == repr(one) for key, one in saved_results.metrics.items())
     assert math.isnan(again.value("throughput.ml.two:one.processes"))
-    assert again.environment == told.environment
+    assert again.environment == saved_results.environment
 
 
 def test_the_gate_passes_on_itself_and_fails_on_worse(tmp_path):
