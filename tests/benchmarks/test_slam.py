@@ -68,10 +68,10 @@ def test_steps_and_rotations_are_bounded(scene):
     if scene.name == "office":
         return
     step = relative(scene.poses[:-1], scene.poses[1:])
-    route, turn = np.linalg.norm(step[:, :2], axis=-1), np.abs(step[:, 2])
-    assert route.max() <= SCAN_DISTANCE[1] + 1e-9
+    length, turn = np.linalg.norm(step[:, :2], axis=-1), np.abs(step[:, 2])
+    assert length.max() <= SCAN_DISTANCE[1] + 1e-9
     assert turn.max() <= SCAN_ROTATION + 0.06
-    moving = route > 1e-9
+    moving = length > 1e-9
     assert (turn[~moving] > 0).all(), "it turns in place"
     ahead = np.abs(np.arctan2(step[:, 1], step[:, 0]))[moving]
     assert ahead.max() < np.radians(15), "it faces its direction of travel"
@@ -164,8 +164,8 @@ def test_along_a_bare_corridor_the_bound_is_that_of_odometry():
     along = np.append(np.cos(scene.poses[3, 2]), np.sin(scene.poses[3, 2]))
     middle = out // 2
     sd = np.sqrt(along @ bound(scene).poses[middle, :2, :2] @ along)
-    route = np.linalg.norm(scene.poses[middle, :2] - scene.poses[0, :2])
-    assert 0.5 < sd / (DISTANCE * np.sqrt(route)) < 1.01
+    distance = np.linalg.norm(scene.poses[middle, :2] - scene.poses[0, :2])
+    assert 0.5 < sd / (DISTANCE * np.sqrt(distance)) < 1.01
 
 
 # The measures
