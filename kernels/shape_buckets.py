@@ -4,11 +4,14 @@ import numpy as np
 
 
 def bucket_size(count: int, *, least: int) -> int:
-    """Smallest of the sizes ``least``, 3/2 of it, 2, 3, 4, 6, ... times it that holds this many rows.
+    """Smallest of a few sizes that holds this many rows.
+
+    The sizes are 1, 3/2, 2, 3, 4, 6, ... times ``least`` if that is a power of two. Otherwise each size is 4/3 of the
+    previous one.
 
     Args:
         count: number of rows that must fit.
-        least: smallest size, a power of two.
+        least: smallest size, at least 2.
     """
     size = least
     while size < count:

@@ -127,6 +127,20 @@ def test_replacing_one_field_keeps_the_others():
         dataclasses.replace(ring, neighbors=4)
 
 
+def test_exact_paths_are_computed_once_and_not_copied_to_changed_rings(faw_ring):
+    ring = dataclasses.replace(faw_ring, name="first")
+    ring.cache["key"] = 1
+    assert ring.exact_paths is ring.exact_paths
+    for exact, single in zip(jax.tree.leaves(ring.exact_paths), jax.tree.leaves(ring.echo_paths), strict=True):
+        assert exact.dtype == np.float64
+        assert not exact.flags.writeable
+        np.testing.assert_array_equal(exact, single)
+    for other in (dataclasses.replace(ring, neighbors=1), jax.tree.map(lambda leaf: leaf, ring)):
+        assert other.cache == {}
+        assert other.exact_paths is not ring.exact_paths
+    assert len(jax.tree.leaves(ring)) == 5
+
+
 def test_the_leaves_of_a_ring_are_the_calibration_parameters(faw_ring):
     leaves, tree = jax.tree.flatten(faw_ring)
     assert [leaf.shape for leaf in leaves] == [(24, 2), (24,), (24,), (24,), ()]
