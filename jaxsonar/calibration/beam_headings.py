@@ -27,8 +27,8 @@ class HeadingSettings:
     initial_log_odds: float = 2.0
     """Initial log odds of a detection at the centre of the beam."""
     gradient_tolerance: float = 1e-3
-    """Convergence: largest component of the gradient, nats per radian. Headings are then within 1e-3 of their standard
-    deviation, since a standard deviation of 1 deg or less means a curvature of 3000 or more."""
+    """Convergence: largest component of the gradient, nats per radian. A heading with a standard deviation of 3 deg
+    (a curvature of 365 nats per square radian) is then within 1e-4 standard deviations of the optimum."""
     min_observations: int = 1024
     """Observations are padded to a bucket of at least this size, so that few shapes are compiled."""
 
