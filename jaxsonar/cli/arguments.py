@@ -15,7 +15,7 @@ RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24,
 
 SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for each scan)"
 
-SETTINGS_HELP = "accumulator and low pass, for hough also threshold, instead of the paper's"
+SETTINGS_HELP = "settings of accumulator and low pass, for hough also threshold (default: the paper's)"
 
 ODOMETRY_HELP = "standard deviation of the odometry after 1 m: %% of the distance and deg (default: 3,1.5)"
 
@@ -75,7 +75,9 @@ def odometry_error(text: str) -> tuple[float, float]:
 
 def add_method(command: argparse.ArgumentParser) -> None:
     """Add ``--method`` and ``--sigma``."""
-    command.add_argument("--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's")
+    command.add_argument(
+        "--method", choices=("ml", "hough"), default="ml", help="ml: maximum likelihood (default); hough: the paper's"
+    )
     command.add_argument(
         "--sigma",
         type=finite(1e-4, 1),

@@ -11,7 +11,7 @@ SUMMARY = "The embedded office, 17 scans: figures and a table of deviations."
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar demo``."""
-    parser.add_argument("-o", "--output", metavar="DIR", default="demo", help="where to write (default: demo)")
+    parser.add_argument("-o", "--output", metavar="DIR", default="demo", help="output folder (default: demo)")
     parser.add_argument(
         "--seed", type=number(int, 0, 2**32 - 1), default=1, help="seed of the simulated noise (default: 1)"
     )

@@ -43,7 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--ring", required=True, help=RING_HELP)
     parser.add_argument(
-        "--method", choices=("ml", "hough"), default="ml", help="default: ml; hough: the paper's, faster"
+        "--method",
+        choices=("ml", "hough"),
+        default="ml",
+        help="ml: maximum likelihood (default); hough: the paper's, faster",
     )
     parser.add_argument("--sigma", type=finite(1e-4, 1), metavar="METRES", help=SIGMA_HELP)
     parser.add_argument("--settings", metavar="TOML", help=SETTINGS_HELP)
