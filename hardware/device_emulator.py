@@ -77,7 +77,7 @@ class _EmulatedDevice:
 
     def __init__(self, sink: Sink, speed: float, link: FaultInjector, stop: threading.Event):
         self.sink, self.speed, self.link, self.stop = sink, speed, link, stop
-        self.done = EmulationReport()
+        self.report = EmulationReport()
         self.first_sent = 0.0  # host clock when the first message was sent
         self.start, self.start_us = 0.0, 0  # a message is due at start + (its time - start_us) / speed
         self.sequence = self.time_us = 0
@@ -86,7 +86,7 @@ class _EmulatedDevice:
         """Send a message at its due time. False if stopped."""
         frames = self.link.transmit(encode(message))
         self.time_us = message.time_us
-        if not self.done.clients and not self.next_client():
+        if not self.report.clients and not self.next_client():
             return False
         stall = self.link.stall_duration(time.monotonic() - self.first_sent)
         if self.stop.wait(max(stall, self.time_left())):
@@ -94,7 +94,7 @@ class _EmulatedDevice:
         if not all([self.deliver(frame) for frame in frames]):
             return False
         self.sequence = message.sequence
-        self.done.messages += 1
+        self.report.messages += 1
         return True
 
     def time_left(self) -> float:
@@ -102,7 +102,7 @@ class _EmulatedDevice:
         if not self.speed:
             return 0.0
         left = self.start + (self.time_us - self.start_us) / 1e6 / self.speed - time.monotonic()
-        self.done.max_delay = max(self.done.max_delay, -left)
+        self.report.max_delay = max(self.report.max_delay, -left)
         return max(left, 0.0)
 
     def deliver(self, frame: bytes) -> bool:
@@ -111,8 +111,8 @@ class _EmulatedDevice:
             if not self.next_client():
                 return False
             frame = b"\0" + frame.lstrip(b"\0")  # separates it from a partial frame
-        self.done.frames += 1
-        self.done.sent_bytes += len(frame)
+        self.report.frames += 1
+        self.report.sent_bytes += len(frame)
         return True
 
     def next_client(self) -> bool:
@@ -121,21 +121,22 @@ class _EmulatedDevice:
             return False
         self.start, self.start_us = time.monotonic(), self.time_us
         self.first_sent = self.first_sent or self.start
-        self.done.clients += 1
+        self.report.clients += 1
         return True
 
     def end(self) -> EmulationReport:
         """Send the held-back frames and the end frame to the client, if there is one."""
-        done, link = self.done, self.link
+        report, link = self.report, self.link
         timed_out = threading.Event()
         timer = threading.Timer(SETTINGS.linger_time, timed_out.set)
         timer.start()
         end_frame = encode_end((self.sequence + 1) % (1 << 32), self.time_us)
         for frame in [*link.flush(), *[end_frame] * END_FRAMES]:
-            if not done.clients or not self.sink.send(frame, timed_out):
+            if not report.clients or not self.sink.send(frame, timed_out):
                 break
-            done.frames += frame is not end_frame
+            report.frames += frame is not end_frame
         timer.cancel()
         timer.join()
-        done.damaged, done.dropped, done.swapped, done.stalls = link.damaged, link.dropped, link.swapped, link.stalls
-        return done
+        report.damaged, report.dropped = link.damaged, link.dropped
+        report.swapped, report.stalls = link.swapped, link.stalls
+        return report
