@@ -111,7 +111,7 @@ common = {"max_range": st.floats(0.1, 50), "speed_of_sound": st.floats(1, 5000),
 @pytest.mark.slow
 @given(
     st.fixed_dictionaries(
-        {"count": st.integers(4, 40), "radius": st.floats(0, 3), "beam": beams, "first_heading": st.floats(-7, 7)}
+        {"count": st.integers(4, 40), "radius": st.floats(0, 3), "beam": beams, "first_heading": st.floats(-6, 6)}
         | {"neighbors": st.integers(0, 3), **common}
     )
 )

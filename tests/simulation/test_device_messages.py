@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from support.emulated_devices import assert_same_log, log_from_messages
+from support.emulated_devices import assert_same_log, echo_order, log_from_messages
 
 from jaxsonar import Log, Ring, simulate
 from jaxsonar.geometry.se2 import relative
