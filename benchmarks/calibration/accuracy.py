@@ -37,7 +37,7 @@ from benchmarks.calibration.trials import (
     trajectory_in,
     trial,
 )
-from benchmarks.result_files import versions, without_nan
+from benchmarks.metrics import environment, without_nan
 from jaxsonar import Ring, SonarError, calibrate, random_room, simulate
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder
 
@@ -176,7 +176,7 @@ def _outcome_text(result: Outcome) -> str:
 def write(results: dict[str, Any], output: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """Write calibration.json into a folder; returns its content."""
     make_folder(output)
-    content = without_nan({"versions": versions(), "settings": settings, **results})
+    content = without_nan({"versions": environment(), "settings": settings, **results})
     with atomic_write(output / "calibration.json") as file:
         json.dump(content, file, indent=1, allow_nan=False)
     return content

@@ -115,7 +115,7 @@ def tables(content: dict[str, Any]) -> list[Table]:
         "and the worst; whitened: error whitened with the bound, including speed; 1 sd: errors within one standard "
         "deviation, 68 is consistent; NEES: per degree of freedom, mean, median and worst, 1 is consistent; "
         f"conv.: RMS and whitened error below {CONVERGED:g} CRB; mean: % of seeds with an estimated mean offset. "
-        f"jax {v['jax']} on {v['device']}, {v['commit'][:10]}",
+        f"jax {v['jax']} on {v['device']}, {(v['commit'] or 'no commit')[:10]}",
     )
     columns = ["seeds", "failed", "conv. (%)", "RMS (mm)", "CRB", "/CRB", "worst", "whitened", "1 sd (%)"]
     columns += ["NEES", "med.", "worst", "speed (%)", "/CRB", "/sd", "placed (%)", "echoes (%)", "mean", "s"]

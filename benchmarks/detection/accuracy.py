@@ -37,7 +37,7 @@ from benchmarks.detection.scoring import (
     score,
     worst_of_three,
 )
-from benchmarks.result_files import versions, without_nan
+from benchmarks.metrics import environment, without_nan
 from jaxsonar.evaluation.settings import SETTINGS as EVALUATION
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder
 from jaxsonar.reports import plot_style
@@ -128,7 +128,7 @@ def write(found: dict[str, Any], output: Path, settings: dict[str, Any]) -> dict
     """Write accuracy.json and the figures into a folder; returns the content of the file."""
     make_folder(output)
     counts = {"clear_echoes": EVALUATION.lines.min_echoes, "clear_reflector": CLEAR_REFLECTOR, "ranges_m": RANGES}
-    content = {"versions": versions(), "settings": settings | counts, "paper": PAPER, **summary(found)}
+    content = {"versions": environment(), "settings": settings | counts, "paper": PAPER, **summary(found)}
     with atomic_write(output / "accuracy.json") as file:
         json.dump(without_nan(content), file, indent=1, allow_nan=False)
     for name, figure in figures_of(found).items():

@@ -124,7 +124,7 @@ def tables(content: dict[str, Any]) -> Iterator[Table]:
         f"{s['rooms']} random rooms, {s['poses']} poses each, seed {s['seed']}",
         caption=f"base: {_condition_text(base)}; undec.: % of the walls that are undecided; ± standard error; "
         "/CRB: ratio of root mean squares; 99 %: quantile of |error| / CRB; NEES: mean, 2 is consistent. "
-        f"numpy {v['numpy']}, jax {v['jax']} on {v['device']}, OpenCV {v['cv2']}",
+        f"numpy {v['numpy']}, jax {v['jax']} on {v['device']}, OpenCV {v['opencv-python-headless']}",
     )
     columns = ("", "walls", "recall (%)", "undec.", "false/scan", "RMSE (mm)", "(deg)", "median (mm)", "(deg)")
     for column in (*columns, "ρ/CRB", "θ/CRB", "99 % ρ", "99 % θ", "NEES"):

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import Console
 
-from benchmarks.result_files import versions, without_nan
+from benchmarks.metrics import environment, without_nan
 from benchmarks.slam.cramer_rao import Bound, bound, pose_bound
 from benchmarks.slam.scenarios import (
     DISTANCE,
@@ -278,7 +278,7 @@ def main() -> None:
         makers = {"long run": [lambda: long_run(scans=scans)]}
         results += run(makers, [options.variant or "smoothed"], single_scans=0, progress=print_progress)
     settings = {"seeds": seeds, "scans": scans, "sigma": SIGMA, "distance": DISTANCE, "turn": TURN}
-    content = without_nan({"versions": versions(), "settings": settings, "scenarios": results})
+    content = without_nan({"versions": environment(), "settings": settings, "scenarios": results})
     make_folder(options.output.parent)
     with atomic_write(options.output) as file:
         json.dump(content, file, indent=1, allow_nan=False)

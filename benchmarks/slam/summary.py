@@ -175,7 +175,7 @@ def table(content: dict[str, Any]) -> Table:
         "map's walls from the true ones; missed: of the walls with echoes; false: of the map's length; p99: of the "
         "slowest run; grows: last tenth of the steps divided by the second. Echoes alone: sigma 5 mm, no odometry, "
         "walls after the best alignment. "
-        f"jax {v['jax']} on {v['device']}, {v['commit'][:10]}",
+        f"jax {v['jax']} on {v['device']}, {(v['commit'] or 'no commit')[:10]}",
     )
     for column in ["", *COLUMNS]:
         shown.add_column(column.rstrip(), justify="right" if column else "left", no_wrap=True)
