@@ -6,6 +6,7 @@ ratios have a tolerance and are in the baseline.
 
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import subprocess
@@ -139,12 +140,12 @@ def environment() -> dict[str, Any]:
 
 
 def without_nan(value: Any) -> Any:
-    """Replace NaN by None, because JSON has no NaN."""
+    """Replace NaN and infinity by None, because JSON has neither."""
     if isinstance(value, dict):
         return {key: without_nan(one) for key, one in value.items()}
     if isinstance(value, list):
         return [without_nan(one) for one in value]
-    return None if isinstance(value, float) and value != value else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def available_cores() -> int:
