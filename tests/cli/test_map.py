@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import HEADER, OFFICE, SIMULATE, call, contents, interrupted_after, script
-from support.invalid_map_calls import EVALUATE, INVALID_CALLS, INVALID_MAPS, MAP, REFERENCE
+from support.invalid_map_calls import EVALUATE, INVALID_CALLS, INVALID_MAPS, MAP, REFERENCE, lines_geojson
 from support.recordings import recorded, write_corridor8_laser
 
 from jaxsonar import load_log
@@ -349,7 +349,12 @@ def test_an_invalid_map_is_named(here, capsys, place, text, said):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
-    [lines(), lines([[0, 0, 5], [1, 0, 5]]), lines([[0, 0], [0, 0]]), lines([[0, 0], [9e11, 1e-300]])],
+    [
+        lines_geojson(),
+        lines_geojson([[0, 0, 5], [1, 0, 5]]),
+        lines_geojson([[0, 0], [0, 0]]),
+        lines_geojson([[0, 0], [9e11, 1e-300]]),
+    ],
     ids=["no feature", "three coordinates", "no length", "very long"],
 )
 def test_unusual_maps_are_valid(here, capsys, text):

@@ -205,7 +205,7 @@ def test_invalid_groups_take_no_memory():
     for k in range(3000):  # a new scan with every group
         assembler.push(Group(3000 + k, 3000 + k, k * 1000, 0, 8, float("nan"), echoes), 0.0)
     assert len(assembler.flush()) <= 3
-    assert len(assembler._seen) <= 256
+    assert len(assembler._history) <= 256
 
 
 def test_a_scan_of_too_many_echoes_keeps_those_that_came_first():

@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from support.emulated_devices import EmulatedDevice
 from support.maps import assert_same_map
 
 from jaxsonar import (

@@ -1,9 +1,12 @@
 """Invalid calls of the commands map, reference and evaluate: call, files to write first, words of the answer."""
 
 import json
+import math
 from pathlib import Path
 
 from support.commands import HEADER, RING
+
+from jaxsonar.fileio.geojson import feature
 
 MAP = "map log.csv --ring faw -o out.geojson"
 REFERENCE = "reference rec -o out.geojson"
@@ -179,7 +182,7 @@ INVALID_CALLS = {
 }
 
 
-def lines(*coordinates, form="LineString"):
+def lines_geojson(*coordinates, form="LineString"):
     return json.dumps({"type": "FeatureCollection", "features": [feature(form, ends) for ends in coordinates]})
 
 
@@ -191,15 +194,15 @@ INVALID_MAPS = {
     "a list": ("[]", "no FeatureCollection came"),
     "no features": ('{"type": "FeatureCollection"}', "no FeatureCollection came"),
     "a Feature alone": (json.dumps(feature("LineString", GOOD)), "no FeatureCollection came"),
-    "NaN": (lines(GOOD, [[math.nan, 0], [1, 0]]), "feature 1: position [nan, 0]"),
-    "too large to be a number": (lines(GOOD).replace("[1, 0]", "[1e999, 0]"), "feature 0: position [inf, 0]"),
-    "huge": (lines(GOOD, GOOD, [[0, 0], [1e300, 0]]), "feature 2: position [1e+300, 0]"),
-    "a huge integer": (lines([[0, 0], [10**400, 0]]), "feature 0: position [1000"),
-    "text": (lines([["0", 0], [1, 0]]), "feature 0: position ['0', 0]"),
-    "null": (lines([[None, 0], [1, 0]]), "feature 0: position [None, 0]"),
-    "truth": (lines([[True, 0], [1, 0]]), "feature 0: position [True, 0]"),
-    "one coordinate": (lines([[0], [1]]), "feature 0: position [0]"),
-    "no lists": (lines(7), "feature 0: 7 instead of a list"),
-    "a circle": (lines([0, 0], form="Circle"), "feature 0: geometry 'Circle'"),
+    "NaN": (lines_geojson(GOOD, [[math.nan, 0], [1, 0]]), "feature 1: position [nan, 0]"),
+    "too large to be a number": (lines_geojson(GOOD).replace("[1, 0]", "[1e999, 0]"), "feature 0: position [inf, 0]"),
+    "huge": (lines_geojson(GOOD, GOOD, [[0, 0], [1e300, 0]]), "feature 2: position [1e+300, 0]"),
+    "a huge integer": (lines_geojson([[0, 0], [10**400, 0]]), "feature 0: position [1000"),
+    "text": (lines_geojson([["0", 0], [1, 0]]), "feature 0: position ['0', 0]"),
+    "null": (lines_geojson([[None, 0], [1, 0]]), "feature 0: position [None, 0]"),
+    "truth": (lines_geojson([[True, 0], [1, 0]]), "feature 0: position [True, 0]"),
+    "one coordinate": (lines_geojson([[0], [1]]), "feature 0: position [0]"),
+    "no lists": (lines_geojson(7), "feature 0: 7 instead of a list"),
+    "a circle": (lines_geojson([0, 0], form="Circle"), "feature 0: geometry 'Circle'"),
     "nested too deeply": ("[" * 100_000, "no JSON"),
 }
