@@ -46,9 +46,9 @@ def write_json(value: Any, filename: str) -> None:
         file.write(text + "\n")
 
 
-def write_figure(figure: "Figure | None", filename: str) -> None:
+def write_figure(figure: "Figure | None", filename: str | None) -> None:
     """Write a figure; None (no figure was requested) writes nothing."""
-    if figure is not None:
+    if figure is not None and filename is not None:
         from jaxsonar.reports.plot_style import save_figure
 
         save_figure(figure, filename)
