@@ -7,29 +7,27 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.batches import JOB, RING, office_scans, one_shard
+from support.commands import HEADER
 
-import jaxsonar
-from jaxsonar import Log, SonarError, batch, load_ring, local_models, save_log
+from jaxsonar import Log, SonarError, batch, local_models, save_log
 from jaxsonar.batch_jobs import process_pool, worker_environment
 from jaxsonar.batch_jobs.inputs import find_inputs
 from jaxsonar.batch_jobs.manifest import open_manifest
 from jaxsonar.batch_jobs.parquet_tables import TABLES, encode_parquet
 from jaxsonar.batch_jobs.scan_tables import scan_tables
 from jaxsonar.batch_jobs.shards import split_input
-from jaxsonar.batch_jobs.worker import job_spec, run_shard
+from jaxsonar.batch_jobs.worker import run_shard
 from jaxsonar.detection.settings import hough_settings
-from jaxsonar.simulation.poses_csv import load_poses
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 dataset = pytest.importorskip("pyarrow.dataset")
 
-RING = load_ring("faw")
 HOUGH: dict[str, Any] = {"method": "hough", "workers": 1, "shard_scans": 8}
 
 
@@ -37,30 +35,12 @@ def with_(**others: Any) -> dict[str, Any]:
     return HOUGH | others
 
 
-HEADER = "scan,stamp,x,y,theta,tx,rx,range\n"
-
-
-def office(scans, *, first=0):
-    """Repeated scans of the office; one has no echoes, one has no pose and no stamp."""
-    data = Path(jaxsonar.__file__).with_name("data")
-    poses, stamps = load_poses(data / "office-path.csv")
-    room = jaxsonar.load_room(data / "office.geojson")
-    seen = jaxsonar.simulate(RING, room, poses, sigma=0.003, seed=first, stamps=stamps).as_log(RING, poses)
-    rows = [seen[k % len(seen)] for k in range(scans)]
-    rows = [replace(scan, scan=first + k, stamp=0.5 * k) for k, scan in enumerate(rows)]
-    rows[3] = replace(
-        rows[3], **{name: rows[3].tx[:0] for name in ("tx", "rx")}, range=np.zeros(0), amplitude=np.zeros(0)
-    )
-    rows[4] = replace(rows[4], pose=np.full(3, np.nan), stamp=np.nan)
-    return Log.from_scans(rows)
-
-
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     """A folder with two logs."""
     folder = tmp_path_factory.mktemp("logs")
-    save_log(office(36), folder / "a.csv")
-    save_log(office(20, first=100), folder / "b.parquet")
+    save_log(office_scans(36), folder / "a.csv")
+    save_log(office_scans(20, first=100), folder / "b.parquet")
     return folder
 
 
@@ -99,7 +79,7 @@ def as_rows(name, columns):
 
 @pytest.mark.parametrize("method", ["ml", "hough"])
 def test_the_numbers_are_those_of_local_models(method):
-    log = office(17)
+    log = office_scans(17)
     columns = found(log, method=method)
     scans, lines, points = (as_rows(name, columns[name]) for name in TABLES)
     models = list(local_models(RING, log, method=method))
@@ -154,7 +134,7 @@ def test_each_table_opens_as_one_data_set_with_units(done):
 @pytest.mark.parametrize(("method", "sizes"), [("hough", (1, 5, 16)), ("ml", (5,))])
 def test_shards_of_any_size_give_the_same_rows(method, sizes):
     """The result of a scan does not depend on the other scans, bit by bit."""
-    log = office(17)
+    log = office_scans(17)
     whole = found(log, method=method)
     for size in sizes:
         cuts = [np.arange(k, min(k + size, 17)) for k in range(0, 17, size)]
@@ -271,13 +251,6 @@ worker.worker_loop(int(sys.argv[1]))
 # Faulty inputs are set aside
 
 
-def shard(path, *, scans=100, part=0):
-    (log,) = find_inputs([path])
-    return split_input(log, staging=Path(path).parent / "copies", sensors=RING.count, scans=scans)[part]
-
-
-JOB = job_spec(RING, method="hough", settings=hough_settings(RING, None), sigma=None)
-
 BAD_ROWS = {
     "5,0.0,0,0,0,24,3,1.0\n": "scan 5: echo of sensors tx 24, rx 3; allowed are 0 to 23, the sensors of 'FAW ring'",
     "5,0.0,0,0,0,3,3,-1.0\n": "row 6, column range: '-1.0' came; allowed is a finite number of metres above 0",
@@ -309,7 +282,7 @@ def test_a_bad_row_sets_its_scan_aside_and_nothing_else(tmp_path, bad, why, scan
 def test_rows_without_a_scan_number_set_the_adjacent_scans_aside(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(HEADER + "0,,,,,1,1,1.0\n1,,,,,1,1,1.0\nrubbish\n2,,,,,1,1,1.0\n3,,,,,1,1,1.0\n4,,,,,1,1")
-    came = run_shard(JOB, shard(path))
+    came = run_shard(JOB, one_shard(path))
     assert came.bad_scans == 2
     assert came.reasons[0].startswith("log.csv: row 4: 1 columns came")
     assert came.reasons[1].startswith("log.csv: row 7: 7 columns came")
@@ -317,7 +290,7 @@ def test_rows_without_a_scan_number_set_the_adjacent_scans_aside(tmp_path):
 
 
 def test_bad_scans_of_parquet_are_set_aside(tmp_path):
-    log = office(12)
+    log = office_scans(12)
     save_log(log, tmp_path / "log.parquet")
     rows = pq.read_table(tmp_path / "log.parquet").to_pylist()
     rows[2]["echoes"][5]["range"] = -1.0
@@ -365,8 +338,8 @@ def test_logs_that_cannot_be_read_are_set_aside_and_the_others_done(logs, done, 
 
 
 def test_a_log_that_changes_during_the_batch_is_set_aside(tmp_path):
-    save_log(office(8), tmp_path / "log.csv")
-    one = shard(tmp_path / "log.csv")
+    save_log(office_scans(8), tmp_path / "log.csv")
+    one = one_shard(tmp_path / "log.csv")
     with open(tmp_path / "log.csv", "a") as file:
         file.write("99,,,,,,,\n")
     assert run_shard(JOB, one).failure.startswith("log.csv: changed during the batch")
@@ -392,7 +365,7 @@ def test_other_parameters_are_rejected(logs, done):
 
 @pytest.mark.slow
 def test_a_changed_log_is_rejected(logs, done, tmp_path):
-    save_log(office(36, first=1000), tmp_path / "a.csv")
+    save_log(office_scans(36, first=1000), tmp_path / "a.csv")
     with pytest.raises(SonarError, match=r"a.csv: changed since .* was begun; allowed is the log as it was"):
         batch([tmp_path / "a.csv", logs / "b.parquet"], RING, done, **HOUGH)
     with pytest.raises(SonarError, match="two logs of one name came"):

@@ -1,21 +1,17 @@
 """Shards: chunks of logs give the same rows as the whole log, in bounded memory."""
 
 import tracemalloc
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from support.batches import JOB, office_scans, one_shard
 
-import jaxsonar
-from jaxsonar import Log, load_log, load_ring, save_log
+from jaxsonar import Log, load_log, save_log
 from jaxsonar.batch_jobs.inputs import Input, find_inputs
 from jaxsonar.batch_jobs.parquet_tables import TABLES
 from jaxsonar.batch_jobs.shards import split_input
-from jaxsonar.batch_jobs.worker import job_spec, run_shard
-from jaxsonar.detection.settings import hough_settings
+from jaxsonar.batch_jobs.worker import run_shard
 from jaxsonar.scans.log_chunks import csv_chunk_reader, csv_chunks, parquet_chunk_reader, parquet_chunks
-from jaxsonar.simulation.poses_csv import load_poses
 
 pa = pytest.importorskip("pyarrow")
 
@@ -23,39 +19,10 @@ pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 
-RING = load_ring("faw")
-
-
-HEADER = "scan,stamp,x,y,theta,tx,rx,range\n"
-
-
-def office(scans, *, first=0):
-    """Repeated scans of the office; one has no echoes, one has no pose and no stamp."""
-    data = Path(jaxsonar.__file__).with_name("data")
-    poses, stamps = load_poses(data / "office-path.csv")
-    room = jaxsonar.load_room(data / "office.geojson")
-    seen = jaxsonar.simulate(RING, room, poses, sigma=0.003, seed=first, stamps=stamps).as_log(RING, poses)
-    rows = [seen[k % len(seen)] for k in range(scans)]
-    rows = [replace(scan, scan=first + k, stamp=0.5 * k) for k, scan in enumerate(rows)]
-    rows[3] = replace(
-        rows[3], **{name: rows[3].tx[:0] for name in ("tx", "rx")}, range=np.zeros(0), amplitude=np.zeros(0)
-    )
-    rows[4] = replace(rows[4], pose=np.full(3, np.nan), stamp=np.nan)
-    return Log.from_scans(rows)
-
-
-def shard(path, *, scans=100, part=0):
-    (log,) = find_inputs([path])
-    return split_input(log, staging=Path(path).parent / "copies", sensors=RING.count, scans=scans)[part]
-
-
-JOB = job_spec(RING, method="hough", settings=hough_settings(RING, None), sigma=None)
-
-
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 @pytest.mark.parametrize("scans", [1, 7, 50])
 def test_chunks_concatenate_to_the_log(tmp_path, suffix, scans):
-    log, path = office(40), tmp_path / f"log.{suffix}"
+    log, path = office_scans(40), tmp_path / f"log.{suffix}"
     save_log(log, path)
     plan, reader = (csv_chunks, csv_chunk_reader) if suffix == "csv" else (parquet_chunks, parquet_chunk_reader)
     parts = plan(path, name="log", scans=scans)
@@ -65,23 +32,23 @@ def test_chunks_concatenate_to_the_log(tmp_path, suffix, scans):
 
 
 def test_csv_and_parquet_give_the_same_rows(tmp_path):
-    log = office(10)
+    log = office_scans(10)
     save_log(log, tmp_path / "log.csv")
     save_log(log, tmp_path / "log.parquet")
     text = (tmp_path / "log.csv").read_bytes()
     (tmp_path / "log.windows.csv").write_bytes(b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n").removesuffix(b"\r\n"))
-    came = [run_shard(JOB, shard(tmp_path / name)) for name in ("log.csv", "log.parquet", "log.windows.csv")]
+    came = [run_shard(JOB, one_shard(tmp_path / name)) for name in ("log.csv", "log.parquet", "log.windows.csv")]
     for name in TABLES:
         rows = [pq.read_table(pa.BufferReader(one.tables[name])).drop_columns("source").to_pylist() for one in came]
         assert rows[0] == rows[1] == rows[2]
 
 
 def test_scans_may_come_in_any_order(tmp_path):
-    log = office(9)
+    log = office_scans(9)
     mixed = Log.from_scans([log[k] for k in (5, 2, 8, 0, 1, 7, 3, 6, 4)])
     save_log(mixed, tmp_path / "log.csv")
     assert not any(part.repeated for part in csv_chunks(tmp_path / "log.csv", name="log", scans=4))
-    rows = pq.read_table(pa.BufferReader(run_shard(JOB, shard(tmp_path / "log.csv")).tables["scans"]))
+    rows = pq.read_table(pa.BufferReader(run_shard(JOB, one_shard(tmp_path / "log.csv")).tables["scans"]))
     assert rows["scan"].to_pylist() == mixed.scan.tolist()
 
 
@@ -116,7 +83,7 @@ def test_planning_takes_bounded_memory(tmp_path, suffix, monkeypatch):
 
 def test_large_row_groups_are_staged(tmp_path, monkeypatch):
     monkeypatch.setattr("jaxsonar.batch_jobs.shards.MAX_ROW_GROUP", 8)
-    save_log(office(20), tmp_path / "log.parquet")
+    save_log(office_scans(20), tmp_path / "log.parquet")
     parts = split_input(*find_inputs([tmp_path / "log.parquet"]), staging=tmp_path / "copies", sensors=24, scans=4)
     assert parts[0].filename == str(tmp_path / "copies" / "log.parquet.parquet")
     assert pq.ParquetFile(parts[0].filename).metadata.num_row_groups == 5

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.emulated_devices import office_log
 from support.maps import assert_same_map
 
 from jaxsonar import (
@@ -17,7 +18,6 @@ from jaxsonar import (
     load_log,
     load_map,
     save_log,
-    simulate,
 )
 from jaxsonar.cli.app import main
 from jaxsonar.live.status import Status
@@ -27,8 +27,7 @@ from jaxsonar.scans.recording_journal import open_log_recorder
 
 @pytest.fixture(scope="module")
 def log(office):
-    heard = simulate(office.ring, office.room, office.poses, sigma=0.002, seed=3, stamps=office.stamps)
-    return heard.as_log(office.ring, office.poses)
+    return office_log(office, sigma=0.002)
 
 
 @pytest.fixture(scope="module")

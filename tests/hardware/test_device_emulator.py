@@ -5,9 +5,8 @@ import time
 
 import numpy as np
 import pytest
-from support.emulated_devices import EmulatedDevice, assert_same_log, log_from_messages, receive
+from support.emulated_devices import EmulatedDevice, assert_same_log, log_from_messages, office_log, receive
 
-from jaxsonar import simulate
 from jaxsonar.hardware import SonarError
 from jaxsonar.hardware.device_emulator import emulate
 from jaxsonar.hardware.messages import Pose
@@ -19,8 +18,7 @@ from jaxsonar.simulation.device_messages import log_messages
 
 @pytest.fixture(scope="module")
 def log(office):
-    heard = simulate(office.ring, office.room, office.poses, sigma=0.003, clutter=0.1, seed=3, stamps=office.stamps)
-    return heard.as_log(office.ring, office.poses)
+    return office_log(office, sigma=0.003, clutter=0.1)
 
 
 URLS = {"tcp": "tcp://127.0.0.1:0", "udp": "udp://127.0.0.1:0", "pty": "pty:"}

@@ -5,9 +5,8 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from support.emulated_devices import EmulatedDevice, receive
+from support.emulated_devices import EmulatedDevice, office_log, receive
 
-from jaxsonar import simulate
 from jaxsonar.hardware import SonarError
 from jaxsonar.hardware import device_emulator as emulator
 from jaxsonar.hardware.fault_injection import FaultInjector, FaultSettings, corrupt_frame, parse_stall
@@ -17,8 +16,7 @@ from jaxsonar.simulation.device_messages import log_messages
 
 @pytest.fixture(scope="module")
 def log(office):
-    heard = simulate(office.ring, office.room, office.poses, sigma=0.003, clutter=0.1, seed=3, stamps=office.stamps)
-    return heard.as_log(office.ring, office.poses)
+    return office_log(office, sigma=0.003, clutter=0.1)
 
 
 def test_injected_faults_never_become_echoes(office, log):

@@ -5,6 +5,7 @@ import time
 import jax
 import numpy as np
 import pytest
+from support.emulated_devices import office_log
 
 from jaxsonar import (
     Ring,
@@ -27,8 +28,7 @@ RING = Ring.circular()
 
 @pytest.fixture(scope="module")
 def log(office):
-    heard = simulate(office.ring, office.room, office.poses, sigma=0.002, seed=3, stamps=office.stamps)
-    return heard.as_log(office.ring, office.poses)
+    return office_log(office, sigma=0.002)
 
 
 def raw_scans(messages):

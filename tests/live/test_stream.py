@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from support.emulated_devices import EmulatedDevice
+from support.emulated_devices import EmulatedDevice, office_log
 from support.maps import assert_same_map
 
 from jaxsonar import (
@@ -16,7 +16,6 @@ from jaxsonar import (
     load_log,
     load_map,
     save_log,
-    simulate,
 )
 from jaxsonar.hardware.device_emulator import emulate
 from jaxsonar.hardware.fault_injection import FaultSettings
@@ -31,8 +30,7 @@ LINKS = ("tcp://127.0.0.1:0", "udp://127.0.0.1:0", "pty:")
 
 @pytest.fixture(scope="module")
 def log(office):
-    heard = simulate(office.ring, office.room, office.poses, sigma=0.002, seed=3, stamps=office.stamps)
-    return heard.as_log(office.ring, office.poses)
+    return office_log(office, sigma=0.002)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from support.emulated_devices import assert_same_log, echo_order, log_from_messages
+from support.emulated_devices import assert_same_log, echo_order, log_from_messages, office_log
 
 from jaxsonar import Log, Ring, simulate
 from jaxsonar.geometry.se2 import relative
@@ -16,8 +16,7 @@ from jaxsonar.simulation.device_messages import log_messages, room_messages
 
 @pytest.fixture(scope="module")
 def log(office):
-    heard = simulate(office.ring, office.room, office.poses, sigma=0.003, clutter=0.1, seed=3, stamps=office.stamps)
-    return heard.as_log(office.ring, office.poses)
+    return office_log(office, sigma=0.003, clutter=0.1)
 
 
 def test_a_log_comes_back_from_its_messages(office, log):

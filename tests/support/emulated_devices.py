@@ -5,12 +5,20 @@ import time
 
 import numpy as np
 
-from jaxsonar import Log
+from jaxsonar import Log, simulate
 from jaxsonar.hardware.device_emulator import emulate
 from jaxsonar.hardware.messages import Pose
 from jaxsonar.hardware.protocol import Decoder
 from jaxsonar.hardware.transport_base import EndOfStream, open_source
 from jaxsonar.hardware.transport_servers import listen
+
+
+def office_log(office, *, sigma, clutter=0.0):
+    """A simulated log of the office."""
+    simulation = simulate(
+        office.ring, office.room, office.poses, sigma=sigma, clutter=clutter, seed=3, stamps=office.stamps
+    )
+    return simulation.as_log(office.ring, office.poses)
 
 
 def log_from_messages(messages):
