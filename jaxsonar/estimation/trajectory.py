@@ -17,11 +17,20 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.scan_log import Log
 
 COLUMNS = "stamp x y z qx qy qz qw"
-MAX_TILT = float(np.radians(1.0))
-"""Largest tilt of a pose in a file, radians: the robot moves on a floor. Chosen by hand."""
-NORM_TOLERANCE = 1e-3
-"""Largest deviation of the norm of a quaternion from 1: files with three digits are accepted."""
 _NUMBER = re.compile(DECIMAL)
+
+
+@dataclass(frozen=True)
+class TumFileSettings:
+    """Tolerances for TUM files. Both were chosen by hand."""
+
+    max_tilt: float = float(np.radians(1.0))
+    """Largest tilt of a pose, radians: the robot moves on a floor."""
+    norm_tolerance: float = 1e-3
+    """Largest deviation of the norm of a quaternion from 1: files with three digits are accepted."""
+
+
+SETTINGS = TumFileSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +132,12 @@ def load_trajectory(filename: str | os.PathLike[str]) -> Trajectory:
     norm = np.linalg.norm(quaternion, axis=-1)
     tilt = 2 * np.arctan2(np.hypot(*quaternion[:, :2].T), np.hypot(*quaternion[:, 2:].T))
     for bad, came, allowed in (
-        (np.abs(norm - 1) > NORM_TOLERANCE, norm, f"a quaternion of length 1, within {NORM_TOLERANCE:g}"),
-        (tilt > MAX_TILT, np.degrees(tilt), "a pose on the floor, tilted by at most 1 deg"),
+        (
+            np.abs(norm - 1) > SETTINGS.norm_tolerance,
+            norm,
+            f"a quaternion of length 1, within {SETTINGS.norm_tolerance:g}",
+        ),
+        (tilt > SETTINGS.max_tilt, np.degrees(tilt), "a pose on the floor, tilted by at most 1 deg"),
     ):
         if bad.any():
             row = int(np.argmax(bad))
