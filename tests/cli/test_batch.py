@@ -53,7 +53,7 @@ WRONG = {
     "notes.txt --ring faw -o out": "notes.txt: suffix '.txt' came; allowed for a log is .csv, .parquet, .mcap",
     "empty --ring faw -o out": "empty: no log in this folder; allowed are .csv, .parquet, .mcap, .bag, .db3",
     "log.csv --ring faw -o -": "-o - came; allowed is a folder",
-    "pipe.csv --ring faw -o out": "pipe.csv: this is no file, and would be read more than once; needed is a log",
+    "pipe.csv --ring faw -o out": "pipe.csv: not a regular file, but a log is read more than once; needed is a log",
     "log.csv --ring faw -o notes.txt": "notes.txt: File exists; allowed is a folder that can be written to",
     "log.csv --ring faw -o out --engine ray": "invalid choice: 'ray'",
     "log.csv --ring faw -o out --workers 0": "'0' came; allowed is a whole number from 1 to 1024",
@@ -88,7 +88,7 @@ def test_set_aside_is_exit_code_1_and_one_more_line(here, capsys):
         assert out == ""
         told, aside = error.splitlines()
         assert told.startswith("40 scans, 0 lines, 2 shards")
-        assert aside.startswith("set aside: 1 scan; out/manifest.jsonl says why; the first: bad.csv: scan 20: echo of")
+        assert aside.startswith("set aside: 1 scan; the reasons are in out/manifest.jsonl; the first: bad.csv: scan 20: echo of")
     lines = [json.loads(line) for line in (here / "out" / "manifest.jsonl").read_text().splitlines()]
     assert [line["bad_scans"] for line in lines if "bad_scans" in line] == [1]
     assert pq.read_table("out/scans")["empty"].to_pylist() == ["fewer than 3 echoes within the maximum range"] * 40

@@ -64,7 +64,7 @@ def test_errors_are_printed_and_the_trajectory_may_go_to_standard_output(here, c
     assert call("slam", "log.csv", "--ring", "faw", "-o", "again.geojson", *arguments) == 0
     out, said = capsys.readouterr()
     assert len([line for line in out.splitlines() if not line.startswith("#")]) == COUNT
-    assert f"{COUNT} scans, {COUNT} of them placed" in said
+    assert f"{COUNT} scans, {COUNT} of them with a pose" in said
     assert "error, first pose on the truth: " in said
     assert "error, best alignment: " in said
     assert "odometry's error, first pose on the truth: " in said

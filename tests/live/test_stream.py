@@ -204,7 +204,7 @@ def test_stopping_waits_for_the_compiler_only_if_a_map_is_requested(mapping, off
     if mapping:
         ((scans, files, line),) = ending
         assert (scans, files) == (len(log), ["r.csv"])
-        assert "17 waiting; ending once the map has them" in line
+        assert "17 waiting; ending when these are in the map" in line
         assert len(load_map(map_path)) > 0
 
 
