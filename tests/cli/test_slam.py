@@ -67,7 +67,7 @@ def test_errors_are_printed_and_the_trajectory_may_go_to_standard_output(here, c
     assert f"{COUNT} scans, {COUNT} of them with a pose" in said
     assert "error, first pose on the truth: " in said
     assert "error, best alignment: " in said
-    assert "odometry's error, first pose on the truth: " in said
+    assert "error of the odometry, first pose on the truth: " in said
     assert "mm" in said
 
 
