@@ -73,17 +73,17 @@ def odometry_error(text: str) -> tuple[float, float]:
     return percent, degrees
 
 
-def add_method(command: argparse.ArgumentParser) -> None:
-    """Add ``--method`` and ``--sigma``."""
+def add_detection_arguments(command: argparse.ArgumentParser) -> None:
+    """Add ``--ring``, ``--method``, ``--sigma`` and ``--settings`` of commands that detect lines."""
+    command.add_argument("--ring", type=filename, required=True, help=RING_HELP)
     command.add_argument(
-        "--method", choices=("ml", "hough"), default="ml", help="ml: maximum likelihood (default); hough: the paper's"
+        "--method",
+        choices=("ml", "hough"),
+        default="ml",
+        help="ml: maximum likelihood (default); hough: the paper's, faster",
     )
-    command.add_argument(
-        "--sigma",
-        type=finite(1e-4, 1),
-        metavar="METRES",
-        help=SIGMA_HELP,
-    )
+    command.add_argument("--sigma", type=finite(1e-4, 1), metavar="METRES", help=SIGMA_HELP)
+    command.add_argument("--settings", type=filename, metavar="TOML", help=SETTINGS_HELP)
 
 
 def add_slam_arguments(command: argparse.ArgumentParser) -> None:

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 from contextlib import ExitStack
 
-from jaxsonar.cli.arguments import RING_HELP, SETTINGS_HELP, add_method, filename, number
+from jaxsonar.cli.arguments import add_detection_arguments, filename, number
 from jaxsonar.cli.console import check_sigma_is_used, print_left_out, print_status, progress_bar
 from jaxsonar.reports.text import plural
 
@@ -20,9 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="IN",
         help="logs (.csv, .parquet, .mcap; .bag, .db3: extra ros), and folders of logs",
     )
-    parser.add_argument("--ring", type=filename, required=True, help=RING_HELP)
-    add_method(parser)
-    parser.add_argument("--settings", type=filename, metavar="TOML", help=SETTINGS_HELP)
+    add_detection_arguments(parser)
     parser.add_argument(
         "-o", "--output", type=filename, metavar="DIR", required=True, help="scans/, lines/, points/, manifest.jsonl"
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from jaxsonar.detection.local_map import LocalModel
 
-from jaxsonar.cli.arguments import RING_HELP, SETTINGS_HELP, add_method, figure_filename, number
+from jaxsonar.cli.arguments import add_detection_arguments, figure_filename, number
 from jaxsonar.cli.console import (
     check_sigma_is_used,
     errors_in,
@@ -26,9 +26,7 @@ SUMMARY = "Detect lines around the robot, in every scan of a log."
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar lines``."""
     parser.add_argument("log", metavar="LOG", help="scan log, .csv or .parquet")
-    parser.add_argument("--ring", required=True, help=RING_HELP)
-    add_method(parser)
-    parser.add_argument("--settings", metavar="TOML", help=SETTINGS_HELP)
+    add_detection_arguments(parser)
     parser.add_argument(
         "-o", "--output", metavar="LINES", required=True, help="JSON Lines, one object per scan; - = stdout"
     )

@@ -10,9 +10,7 @@ if TYPE_CHECKING:
     from jaxsonar.kernels import HoughSettings
 
 from jaxsonar.cli.arguments import (
-    RING_HELP,
-    SETTINGS_HELP,
-    add_method,
+    add_detection_arguments,
     figure_filename,
     filename,
     filename_ending_in,
@@ -37,14 +35,7 @@ SUMMARY = "Build a map of walls, from a log of scans with poses."
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar map``."""
     parser.add_argument("log", type=filename, metavar="LOG", help="scan log with poses, .csv or .parquet")
-    parser.add_argument("--ring", type=filename, required=True, help=RING_HELP)
-    add_method(parser)
-    parser.add_argument(
-        "--settings",
-        type=filename,
-        metavar="TOML",
-        help=SETTINGS_HELP,
-    )
+    add_detection_arguments(parser)
     parser.add_argument(
         "--window",
         type=finite(0.01, 100),

@@ -17,11 +17,8 @@ if TYPE_CHECKING:
 
 from jaxsonar.cli.arguments import (
     ODOMETRY_HELP,
-    RING_HELP,
-    SETTINGS_HELP,
-    SIGMA_HELP,
+    add_detection_arguments,
     filename_ending_in,
-    finite,
     number,
     odometry_error,
     odometry_noise,
@@ -41,15 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="URL",
         help="serial:///dev/ttyUSB0?baud=921600, tcp://HOST:PORT, udp://HOST:PORT, pty:PATH or file:LOG?speed=1",
     )
-    parser.add_argument("--ring", required=True, help=RING_HELP)
-    parser.add_argument(
-        "--method",
-        choices=("ml", "hough"),
-        default="ml",
-        help="ml: maximum likelihood (default); hough: the paper's, faster",
-    )
-    parser.add_argument("--sigma", type=finite(1e-4, 1), metavar="METRES", help=SIGMA_HELP)
-    parser.add_argument("--settings", metavar="TOML", help=SETTINGS_HELP)
+    add_detection_arguments(parser)
     parser.add_argument(
         "--record",
         type=filename_ending_in(".csv", ".parquet", ".mcap"),

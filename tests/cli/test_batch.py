@@ -88,7 +88,7 @@ def test_set_aside_is_exit_code_1_and_one_more_line(here, capsys):
         assert out == ""
         told, aside = error.splitlines()
         assert told.startswith("40 scans, 0 lines, 2 shards")
-        assert aside.startswith("set aside: 1 scan; the reasons are in out/manifest.jsonl; the first: bad.csv: scan 20:")
+        assert aside.startswith("set aside: 1 scan; the reasons are in out/manifest.jsonl; the first: bad.csv: scan")
         assert "echo of sensors" in aside
     lines = [json.loads(line) for line in (here / "out" / "manifest.jsonl").read_text().splitlines()]
     assert [line["bad_scans"] for line in lines if "bad_scans" in line] == [1]
