@@ -23,7 +23,7 @@ from jaxsonar.estimation.robust_adjustment import gnc_adjust
 from jaxsonar.estimation.sparse_adjustment import adjust, marginal_covariances
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.registration.sequential import register_scans
+from jaxsonar.registration.sequential_registration import register_scans
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import ParameterBasis

@@ -14,8 +14,8 @@ from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.graph_slam.tracker import Tracker, TrackerState
 from jaxsonar.loop_closure.closure_candidate import ACCEPTED
 from jaxsonar.loop_closure.submap_graph import SubmapGraph
-from jaxsonar.registration.agglomerative import register_by_ranges
-from jaxsonar.registration.sequential import register_scans
+from jaxsonar.registration.agglomerative_registration import register_by_ranges
+from jaxsonar.registration.sequential_registration import register_scans
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.smoothing.covisibility import Traversals

@@ -22,7 +22,7 @@ from jaxsonar.localization.hypothesis_tracking import HypothesisTracker
 from jaxsonar.localization.known_map import KnownMap
 from jaxsonar.localization.settings import SETTINGS, AcceptanceSettings
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.registration.sequential import register_scans
+from jaxsonar.registration.sequential_registration import register_scans
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 

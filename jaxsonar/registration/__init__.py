@@ -1,6 +1,7 @@
 """Registration: poses of scans from the scans alone, or with drifting odometry, in a place without a map.
 
-Entry points: ``sequential.register_scans`` and ``register_remaining``, ``agglomerative.register_by_ranges``.
+Entry points: ``sequential_registration.register_scans`` and ``register_remaining``,
+``agglomerative_registration.register_by_ranges``.
 Localization and loop closure use the parts: ``features`` (the container of walls and points), ``pose_hypotheses``,
 ``pose_likelihood``.
 

@@ -15,7 +15,7 @@ from jaxsonar.estimation.sparse_adjustment import marginal_covariances
 from jaxsonar.geometry.se2 import compose, relative
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.global_map import GlobalMap
-from jaxsonar.registration.sequential import register_remaining
+from jaxsonar.registration.sequential_registration import register_remaining
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import check_window
 from jaxsonar.sensors.ring import Ring

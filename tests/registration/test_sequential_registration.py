@@ -6,7 +6,7 @@ import pytest
 from jaxsonar import LocalModel, SonarError, local_models, simulate
 from jaxsonar.detection.local_map import Line, Point
 from jaxsonar.geometry.se2 import compose, inverse, relative, transform_points, wrap_angle
-from jaxsonar.registration.sequential import register_scans
+from jaxsonar.registration.sequential_registration import register_scans
 from jaxsonar.simulation.office import load_office
 
 CORNERS = np.array([[0.0, 0.0], [4.1, 0.0], [4.6, 2.2], [2.6, 3.9], [-0.5, 2.9]])

@@ -5,7 +5,7 @@ import pytest
 
 from jaxsonar import Ring, Room, kernels, local_models, simulate
 from jaxsonar.geometry.se2 import compose, inverse, relative, wrap_angle
-from jaxsonar.registration.agglomerative import register_by_ranges
+from jaxsonar.registration.agglomerative_registration import register_by_ranges
 from jaxsonar.registration.cluster_adjustment import adjust, single_scan
 from jaxsonar.registration.cluster_negative_evidence import cluster_negative_evidence
 from jaxsonar.registration.echo_clusters import ScanObservations
