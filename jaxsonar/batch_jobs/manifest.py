@@ -89,7 +89,7 @@ class Manifest:
 
     def add_shard(self, shard: Shard, result: ShardResult) -> Record:
         """Write the tables of a shard, then record it. Returns the record."""
-        scans = {"source": shard.source, "first_row": shard.part.first, "scans": shard.part.scans}
+        scans = {"source": shard.source, "first_row": shard.chunk.first, "scans": shard.chunk.scans}
         if result.failure:
             record = {"shard": shard.key, "state": "set aside", **scans, "reason": result.failure}
         else:

@@ -113,12 +113,12 @@ def batch(
         shards = [shard for log in logs for shard in _plan(log, manifest, ring, shard_scans)]
         pending = [shard for shard in shards if not manifest.is_done(shard)]
         if on_planned is not None:
-            on_planned(sum(shard.part.scans for shard in pending))
+            on_planned(sum(shard.chunk.scans for shard in pending))
         # 5. Run the shards in any order. Write the tables of each completely, then record it.
         done = 0
         for shard, result in _run_shards(job, pending, engine, scheduler, workers):
             manifest.add_shard(shard, result)
-            done += shard.part.scans
+            done += shard.chunk.scans
             if on_done is not None:
                 on_done(done)
         # 6. Sort the manifest and summarize it.
@@ -149,7 +149,7 @@ def _plan(log: Input, manifest: Manifest, ring: Ring, scans: int) -> list[Shard]
     except SonarError as error:
         manifest.add_input(log.source, record | {"reason": str(error)})
         return []
-    record |= {"scans": sum(shard.part.scans for shard in shards), "shards": len(shards)}
+    record |= {"scans": sum(shard.chunk.scans for shard in shards), "shards": len(shards)}
     manifest.add_input(log.source, record)
     return shards
 

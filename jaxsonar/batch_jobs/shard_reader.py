@@ -34,9 +34,9 @@ def read_shard(shard: Shard, ring: Ring) -> tuple[Log, Int[np.ndarray, " scans"]
     if (status.st_size, status.st_mtime_ns) != (shard.size, shard.modified_ns):
         raise SonarError(f"{shown(shard.source)}: changed during the batch; needed is a log that does not change")
     reader = csv_chunk_reader if shard.format == "csv" else parquet_chunk_reader
-    read = reader(shard.filename, shard.part, name=shard.source)
+    read = reader(shard.filename, shard.chunk, name=shard.source)
 
-    runs, reasons = _readable_runs(read, shard.part.scans)
+    runs, reasons = _readable_runs(read, shard.chunk.scans)
     logs, rows = [], [np.zeros(0, np.int64)]
     for first_row, log in runs:
         unusable = _unusable_scans(shard, ring, first_row, log)
@@ -79,7 +79,7 @@ def _unusable_scans(shard: Shard, ring: Ring, first_row: int, log: Log) -> dict[
             f"tx {log.tx[echo]}, rx {log.rx[echo]}; allowed are 0 to {ring.count - 1}, the sensors of {ring.name!r}"
         )
         reasons[int(scan[echo])] = f"{name}: scan {log.scan[scan[echo]]}: echo of sensors {sensors}"
-    for row in shard.part.repeated:
+    for row in shard.chunk.repeated:
         if first_row <= row < first_row + len(log):
             number = log.scan[row - first_row]
             reasons[row - first_row] = f"{name}: scan {number} came again; allowed is each scan number once"

@@ -32,7 +32,7 @@ class Shard:
     """Size of that file when the shard was planned, bytes."""
     modified_ns: int
     """Modification time of that file when the shard was planned, nanoseconds."""
-    part: LogChunk
+    chunk: LogChunk
     """The scans in that file."""
 
 
@@ -59,10 +59,10 @@ def split_input(log: Input, *, staging: Path, sensors: int, scans: int = SHARD_S
         status = os.stat(filename)
     except OSError as failure:
         raise SonarError(f"{shown(log.source)}: {reason(failure)}; needed is a readable log") from None
-    parts = (csv_chunks if format_ == "csv" else parquet_chunks)(filename, name=log.source, scans=scans)
+    chunks = (csv_chunks if format_ == "csv" else parquet_chunks)(filename, name=log.source, scans=scans)
     return [
-        Shard(f"{log.key}-{k:06d}", log.source, filename, format_, status.st_size, status.st_mtime_ns, part)
-        for k, part in enumerate(parts)
+        Shard(f"{log.key}-{k:06d}", log.source, filename, format_, status.st_size, status.st_mtime_ns, chunk)
+        for k, chunk in enumerate(chunks)
     ]
 
 

@@ -77,7 +77,7 @@ def _shard_tables(job: str, shard: Shard) -> ShardResult:
     ring, method, settings, sigma = _decode_job(job)
     log, rows, reasons = read_shard(shard, ring)
     tables = scan_tables(
-        ring, log, rows + shard.part.first, source=shard.source, method=method, settings=settings, sigma=sigma
+        ring, log, rows + shard.chunk.first, source=shard.source, method=method, settings=settings, sigma=sigma
     )
     counts = {name: int(np.sum(tables["scans"][name])) for name in ("lines", "points", "undecided", "left_out")}
     encoded = {name: encode_parquet(name, columns) for name, columns in tables.items()}

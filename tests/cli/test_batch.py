@@ -119,7 +119,7 @@ sys.exit(main({arguments}))
 def parts_of(path, tmp_path):
     shards = split_input(*find_inputs([path]), staging=tmp_path / "copies", sensors=RING.count, scans=4)
     assert {one.format for one in shards} == {"parquet"}
-    assert sum(one.part.scans for one in shards) == len(load_log(shards[0].filename))
+    assert sum(one.chunk.scans for one in shards) == len(load_log(shards[0].filename))
     return load_log(shards[0].filename)
 
 
