@@ -1,8 +1,8 @@
 from .batch_jobs.run_batch import BatchReport as BatchReport
 from .batch_jobs.run_batch import batch as batch
 from .calibration.autofocus import autofocus_ring as autofocus_ring
-from .calibration.calibration_result import Calibration as Calibration
 from .calibration.calibrate import calibrate as calibrate
+from .calibration.calibration_result import Calibration as Calibration
 from .calibration.calibration_toml import save_calibration as save_calibration
 from .detection.extract import extract_lines as extract_lines
 from .detection.extract import local_model as local_model

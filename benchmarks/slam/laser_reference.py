@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxsonar import Log, Ring, build_map, evaluate, load_ring, slam
-from jaxsonar.evaluation.laser_map import laser_points, reference_map
+from jaxsonar.evaluation.laser_reference_map import laser_points, reference_map
 from jaxsonar.hardware.laser_datasets import LaserRecording, read_corridor8_laser
 from jaxsonar.scans.convert import read_scans
 

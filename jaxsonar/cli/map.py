@@ -166,7 +166,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _laser_points(recording: str) -> "np.ndarray":
-    from jaxsonar.evaluation.laser_map import laser_points
+    from jaxsonar.evaluation.laser_reference_map import laser_points
     from jaxsonar.hardware.laser_datasets import read_corridor8_laser
 
     return laser_points(read_corridor8_laser(recording), reach=5.0, every=4)

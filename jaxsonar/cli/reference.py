@@ -29,8 +29,8 @@ def run(options: argparse.Namespace) -> None:
     """Run ``jaxsonar reference``."""
     import numpy as np
 
-    from jaxsonar.evaluation.laser_map import laser_points, reference_map, save_reference
-    from jaxsonar.evaluation.laser_segments import polygonal_model
+    from jaxsonar.evaluation.laser_polygonal_model import polygonal_model
+    from jaxsonar.evaluation.laser_reference_map import laser_points, reference_map, save_reference
     from jaxsonar.fileio.atomic_files import check_outputs, shown
     from jaxsonar.geometry.se2 import unit
     from jaxsonar.hardware.errors import SonarError

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxsonar.detection.local_map import LocalModel
-from jaxsonar.evaluation.laser_segments import polygonal_model
+from jaxsonar.evaluation.laser_polygonal_model import polygonal_model
 from jaxsonar.floor_plans.room import laser_ranges
 from jaxsonar.geometry.se2 import transform_points, unit
 from jaxsonar.mapping.global_map import GlobalMap

@@ -2,7 +2,7 @@
 
 Entry points: ``map_accuracy.evaluate`` (a map against true walls), ``line_accuracy.line_accuracy`` (lines of single
 scans against a simulated room), ``trajectory_errors`` (absolute trajectory error and consistency of covariances),
-``laser_map.reference_map`` and ``laser_segments.polygonal_model`` (references from a laser).
+``laser_reference_map.reference_map`` and ``laser_polygonal_model.polygonal_model`` (references from a laser).
 
 Design decisions:
 

@@ -12,7 +12,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 
 from jaxsonar.detection.local_map import Line, LocalModel
-from jaxsonar.evaluation.laser_segments import PolygonalModel
+from jaxsonar.evaluation.laser_polygonal_model import PolygonalModel
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.mapping.global_map import POINT_KINDS, GlobalMap

@@ -256,7 +256,7 @@ def test_updating_a_page_is_idempotent(tmp_path):
     markdown_tables.write(path, results())
     made = path.read_text()
     assert "| hough, batch, one core : plain NumPy + OpenCV | 12 x | at least 10 x | yes |" in made
-    assert "| ml, two cores : one | not measured here | at least 1.8 x |  |" in made
+    assert "| ml, two cores : one core | not measured here | at least 1.8 x |  |" in made
     assert "old" not in made
     assert "kept" in made
     markdown_tables.write(path, results())

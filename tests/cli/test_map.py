@@ -18,7 +18,7 @@ from support.recordings import recorded, write_corridor8_laser
 
 from jaxsonar import load_log
 from jaxsonar.detection import extract as local
-from jaxsonar.evaluation import laser_map as reference
+from jaxsonar.evaluation import laser_reference_map as reference
 from jaxsonar.fileio.geojson import feature
 
 NUMBERS = ("rho", "theta", "sigma_rho", "sigma_theta")

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsonar.evaluation.laser_map import save_reference
-from jaxsonar.evaluation.laser_segments import PolygonalModel
+from jaxsonar.evaluation.laser_polygonal_model import PolygonalModel
+from jaxsonar.evaluation.laser_reference_map import save_reference
 from jaxsonar.fileio.geojson import feature
 from jaxsonar.floor_plans.room_geojson import save_room
 from jaxsonar.hardware.errors import SonarError

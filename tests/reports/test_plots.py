@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from support.rings import bumper_ring
 
 from jaxsonar import LocalModel, Log, Ring, Room, Scan, SonarError, local_model, local_models, simulate
-from jaxsonar.evaluation.laser_segments import PolygonalModel
+from jaxsonar.evaluation.laser_polygonal_model import PolygonalModel
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.occupancy.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from jaxsonar.reports import plot_map, plot_scan, plot_style

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 
-from jaxsonar.evaluation.laser_segments import (
+from jaxsonar.evaluation.laser_polygonal_model import (
     PolygonalModel,
     check_laser_scan,
     fit_segment,

@@ -7,8 +7,8 @@ import pytest
 from support.recordings import recorded
 
 from jaxsonar import random_pose, random_room
-from jaxsonar.evaluation.laser_map import reference_map
-from jaxsonar.evaluation.laser_segments import fit_segment, polygonal_model
+from jaxsonar.evaluation.laser_polygonal_model import fit_segment, polygonal_model
+from jaxsonar.evaluation.laser_reference_map import reference_map
 from jaxsonar.evaluation.map_accuracy import evaluate
 from jaxsonar.geometry.se2 import rotation, transform_points
 from jaxsonar.hardware.errors import SonarError
