@@ -14,22 +14,22 @@ from jaxsonar.hardware.errors import SonarError
 NOT_MEASURED = "not measured here"
 BLOCK = re.compile(r"<!-- benchmarks: (?P<name>[\w-]+) -->\n(?P<held>.*?)<!-- /benchmarks -->", re.DOTALL)
 TARGETS = {
-    "throughput.hough:numba": "hough, batch, one core : fused Numba loop with components and centres",
-    "stages.votes:numba_votes": "its first step (votes, low pass, threshold) : Numba loop of the same",
+    "throughput.hough:numba": "hough, batch, one core : fused Numba loop with components and centroids",
+    "stages.votes:numba_votes": "first step of hough (votes, low pass, threshold) : the same in a Numba loop",
     "throughput.hough:numpy": "hough, batch, one core : plain NumPy + OpenCV",
     "throughput.hough:pointset": "hough, batch, one core : `cv2.HoughLinesPointSet` on the points of the arcs",
     "throughput.ml:hough": "time of ml : time of hough, batch, one core",
-    "throughput.hough.two:one.processes": "hough, two cores : one",
-    "throughput.ml.two:one.processes": "ml, two cores : one",
+    "throughput.hough.two:one.processes": "hough, two cores : one core",
+    "throughput.ml.two:one.processes": "ml, two cores : one core",
     "latency.hough.p50": "one scan, hough, median",
     "latency.hough.p99": "one scan, hough, 99th percentile",
     "latency.ml.p50": "one scan, ml, median",
     "latency.ml.p99": "one scan, ml, 99th percentile",
-    "startup.hough.again": "`jaxsonar lines`, hough, programs compiled before, to the first result",
-    "startup.ml.again": "`jaxsonar lines`, ml, programs compiled before, to the first result",
+    "startup.hough.again": "`jaxsonar lines`, hough, with compiled programs, time to the first result",
+    "startup.ml.again": "`jaxsonar lines`, ml, with compiled programs, time to the first result",
 }
 PEERS = {
-    "numba": "fused Numba loop, complete: components by flood fill, centres, extents",
+    "numba": "fused Numba loop, complete: components by flood fill, centroids, segments",
     "numba_votes": "fused Numba loop, votes, low pass and threshold only",
     "numpy": "plain NumPy + OpenCV, scan by scan",
     "pointset": "`cv2.HoughLinesPointSet`, the same cells",
@@ -37,11 +37,11 @@ PEERS = {
     "raster": "`skimage.transform.hough_line`, accumulator only",
 }
 GROWTH = {
-    "scans": "scans of a batch, 64 and more",
-    "echoes": "echoes of a scan",
+    "scans": "scans in a batch, from 64",
+    "echoes": "echoes per scan",
     "sensors": "sensors",
     "grid": "cells along each side of the accumulator",
-    "points": "points of an arc",
+    "points": "points per arc",
 }
 
 
@@ -113,7 +113,7 @@ def growth(results: Results) -> str:
         each = [results.metrics.get(f"growth.{axis}.{method}.exponent") for method in ("hough", "ml")]
         if any(each):
             rows.append((what, *(value_text(one) for one in each)))
-    return table(("time grows with n to the, n being", "hough", "ml"), rows)
+    return table(("exponent of the time over the number of", "hough", "ml"), rows)
 
 
 def listed(names: tuple[str, ...]) -> Callable[[Results], str]:
