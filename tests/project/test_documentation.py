@@ -210,5 +210,12 @@ def test_named_modules_exist():
     )
 
 
+def test_the_python_page_lists_all_public_names():
+    import jaxsonar
+
+    table = [line for line in (ROOT / "docs" / "python.md").read_text("utf-8").splitlines() if line.startswith("| ")]
+    assert sorted(re.findall(r"`(\w+)`", "".join(table))) == sorted(vars(jaxsonar)["__all__"])
+
+
 def test_every_page_is_in_the_index():
     assert sorted(file.name for file in INDEX.parent.glob("*.md")) == sorted(page.name for page in PAGES[1:])
