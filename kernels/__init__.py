@@ -2,13 +2,13 @@
 
 Modules, in the order of the data:
 
-- ``array_geometry``: sensors -> echo paths (transmitter-receiver pairs). ``isorange_arcs``: the arc of one echo.
+- ``sensor_array``: sensors -> echo paths (transmitter-receiver pairs). ``isorange_arcs``: the arc of one echo.
 - ``hough_voting``, ``hough_accumulator``: arcs -> tangent lines -> votes -> low pass -> threshold (paper, section 4).
 - ``measurement_model``: the only range model of plane, corner and edge. ``landmarks``: reflectors of the world.
-- ``robust_fit``: one reflector fitted to echoes. ``ml_detection`` with ``detection_*``: all reflectors of a scan.
+- ``robust_fit``: one reflector fitted to echoes. ``ml_detection`` with ``ml_detection_*``: all reflectors of a scan.
 - ``data_association``, ``iterated_ekf``, ``bundle_adjustment``: echoes and landmarks, poses and ring parameters.
-- ``autofocus``, ``beam_pattern``: ring parameters without landmarks, and the detection cones of the sensors.
-- ``geometry``: vectors, poses and lines. ``shape_buckets``: sizes of padded arrays.
+- ``focus_measure``, ``beam_pattern``: ring parameters without landmarks, and the detection cones of the sensors.
+- ``planar_geometry``: vectors, poses and lines. ``shape_buckets``: sizes of padded arrays.
 
 Design decisions:
 
@@ -24,7 +24,7 @@ Design decisions:
   again.
 - Arcs are packed in pieces of 16 points: the arc of a direct path has four times as many points as that of a third
   neighbor.
-- Kernels of the ML detector are written in scalar components (``geometry.dot``) and vmapped with the echoes as the
+- Kernels of the ML detector are written in scalar components (``planar_geometry.dot``) and vmapped with the echoes as the
   last axis: XLA then generates few, vectorized loops.
 - Scans are mapped on a CPU, which keeps the accumulator in its cache and gives the same bits in every batch, and
   vmapped on a GPU.
@@ -34,10 +34,6 @@ Design decisions:
   have common errors.
 """
 
-from .array_geometry import EchoPaths as EchoPaths
-from .array_geometry import SensorArray as SensorArray
-from .array_geometry import echo_paths as echo_paths
-from .array_geometry import transform_path as transform_path
 from .beam_pattern import BeamPattern as BeamPattern
 from .beam_pattern import beam_negative_log_likelihood as beam_negative_log_likelihood
 from .beam_pattern import off_axis_angles as off_axis_angles
@@ -53,12 +49,6 @@ from .bundle_adjustment import residuals as residuals
 from .data_association import CandidateReflections as CandidateReflections
 from .data_association import EchoAssociation as EchoAssociation
 from .data_association import associate as associate
-from .detection_settings import DetectionSettings as DetectionSettings
-from .geometry import fold_line as fold_line
-from .geometry import normal as normal
-from .geometry import segment_endpoints as segment_endpoints
-from .geometry import tangent as tangent
-from .geometry import wrap_angle as wrap_angle
 from .hough_accumulator import HoughSettings as HoughSettings
 from .hough_accumulator import accumulate as accumulate
 from .hough_accumulator import cell_of as cell_of
@@ -103,5 +93,15 @@ from .measurement_model import plane_range as plane_range
 from .measurement_model import reported_range as reported_range
 from .ml_detection import Detections as Detections
 from .ml_detection import detect_ml as detect_ml
+from .ml_detection_settings import DetectionSettings as DetectionSettings
+from .planar_geometry import fold_line as fold_line
+from .planar_geometry import normal as normal
+from .planar_geometry import segment_endpoints as segment_endpoints
+from .planar_geometry import tangent as tangent
+from .planar_geometry import wrap_angle as wrap_angle
 from .robust_fit import CandidateFits as CandidateFits
 from .robust_fit import fit_candidates as fit_candidates
+from .sensor_array import EchoPaths as EchoPaths
+from .sensor_array import SensorArray as SensorArray
+from .sensor_array import echo_paths as echo_paths
+from .sensor_array import transform_path as transform_path

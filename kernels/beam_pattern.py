@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .array_geometry import SensorArray, echo_paths
 from .data_association import CandidateReflections
-from .geometry import signed_angle
 from .landmarks import Landmarks, predict_reflection
+from .planar_geometry import signed_angle
+from .sensor_array import SensorArray, echo_paths
 
 
 @dataclass(frozen=True)

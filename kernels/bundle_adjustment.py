@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .array_geometry import SensorArray
-from .geometry import rotate_back, wrap_angle
 from .landmarks import Landmarks, Reflection, landmark_in_robot_frame
 from .measurement_model import expected_range, reported_range
+from .planar_geometry import rotate_back, wrap_angle
+from .sensor_array import SensorArray
 
 
 class EchoFactors(eqx.Module):

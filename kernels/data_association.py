@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .array_geometry import EchoPaths, SensorArray, echo_paths, widen_cones
 from .landmarks import AnyArray, Landmarks, Reflection, predict_reflection
 from .measurement_model import SETTINGS, reported_range
+from .sensor_array import EchoPaths, SensorArray, echo_paths, widen_cones
 
 
 class CandidateReflections(eqx.Module):

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from .array_geometry import EchoPaths
-from .geometry import fold_line, wrap_angle
+from .planar_geometry import fold_line, wrap_angle
+from .sensor_array import EchoPaths
 
 _DIRECTIONS = 719  # samples of the full turn; a prime number, so that they do not align with cones or cells
 

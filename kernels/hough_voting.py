@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from . import hough_accumulator as hough
 from . import isorange_arcs as arcs
-from .array_geometry import EchoPaths, SensorArray, echo_paths, transform_path
 from .hough_accumulator import HoughSettings
 from .measurement_model import corrected_range
+from .sensor_array import EchoPaths, SensorArray, echo_paths, transform_path
 
 if TYPE_CHECKING:
     AnyArray = Array  # inside the kernels

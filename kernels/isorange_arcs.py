@@ -13,8 +13,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .array_geometry import EchoPaths
-from .geometry import normal, safe_sqrt, tangent
+from .planar_geometry import normal, safe_sqrt, tangent
+from .sensor_array import EchoPaths
 
 
 class Arc(eqx.Module):

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .array_geometry import EchoPaths, widen_cones
-from .geometry import dot, normal, tangent
 from .landmarks import AnyArray, Landmarks, landmark_in_robot_frame
 from .measurement_model import PLANE, SETTINGS, reflector_echo, visibility
+from .planar_geometry import dot, normal, tangent
+from .sensor_array import EchoPaths, widen_cones
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .array_geometry import EchoPaths
-from .geometry import dot, fold_line, normal, rotate_back, tangent
 from .measurement_model import (
     PLANE,
     SETTINGS,
@@ -18,6 +16,8 @@ from .measurement_model import (
     second_order_echo,
     visibility,
 )
+from .planar_geometry import dot, fold_line, normal, rotate_back, tangent
+from .sensor_array import EchoPaths
 
 AnyArray = np.ndarray | jax.Array
 """NumPy where landmarks are collected, JAX where they are used."""

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .array_geometry import EchoPaths
-from .geometry import dot, length, length_and_direction, mirror_point, normal, safe_sqrt, signed_angle, tangent
+from .planar_geometry import dot, length, length_and_direction, mirror_point, normal, safe_sqrt, signed_angle, tangent
+from .sensor_array import EchoPaths
 
 PLANE, CORNER, EDGE = 0, 1, 2
 """Kinds of reflectors: a wall; a right-angled concave corner; an edge or a thin pole."""

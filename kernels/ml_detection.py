@@ -22,21 +22,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from . import hough_accumulator as hough
-from .array_geometry import EchoPaths
-from .detection_likelihood import (
+from .hough_accumulator import HoughSettings
+from .hough_voting import PackedEchoes, RingArcs, map_scans, tangent_lines
+from .measurement_model import PLANE, plane_echo, point_echo, visibility
+from .ml_detection_likelihood import (
     clutter_log_density,
     plane_missed_log_likelihood,
     point_missed_log_likelihood,
     refine,
 )
-from .detection_prior import alignment_ratio, plane_log_prior, point_log_prior
-from .detection_settings import DetectionSettings
-from .detection_state import Hypotheses, ScanData, SceneEstimate, Selection, count, determinant
-from .geometry import fold_line, segment_endpoints, wrap_angle
-from .hough_accumulator import HoughSettings
-from .hough_voting import PackedEchoes, RingArcs, map_scans, tangent_lines
-from .measurement_model import PLANE, plane_echo, point_echo, visibility
+from .ml_detection_prior import alignment_ratio, plane_log_prior, point_log_prior
+from .ml_detection_settings import DetectionSettings
+from .ml_detection_state import Hypotheses, ScanData, SceneEstimate, Selection, count, determinant
+from .planar_geometry import fold_line, segment_endpoints, wrap_angle
 from .robust_fit import edge, fit_reflector, paths_and_ranges, plane, start_of_point
+from .sensor_array import EchoPaths
 
 _IS_EDGE = (0.0, 1.0)  # corner, edge
 

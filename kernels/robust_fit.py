@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .array_geometry import EchoPaths, transform_path
-from .geometry import dot, fold_line, length_and_direction, normal, tangent
 from .hough_voting import PackedEchoes, RingArcs
 from .measurement_model import corner_echo, corrected_range, edge_echo, image_source, plane_coordinates
+from .planar_geometry import dot, fold_line, length_and_direction, normal, tangent
+from .sensor_array import EchoPaths, transform_path
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.kernels.array_geometry import SensorArray
-from jaxsonar.kernels.autofocus import ring_focus_measure
+from jaxsonar.kernels.focus_measure import ring_focus_measure
 from jaxsonar.kernels.hough_accumulator import HoughSettings
+from jaxsonar.kernels.sensor_array import SensorArray
 from jaxsonar.kernels.shape_buckets import bucket_size
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log

@@ -64,12 +64,12 @@ def ml_detections(
         sigma: standard deviation of the ranges, metres; estimated for each scan if None.
         tables: arcs of a ring that moved during the scan; those of the ring at rest if omitted.
     """
-    prior = kernels.DetectionSettings()
+    ml_settings = kernels.DetectionSettings()
     tables = arc_tables(ring, settings) if tables is None else tables
     noise = np.float32(np.nan if sigma is None else sigma)
     for batch in pack(echoes, settings.cells, pieces=tables.pieces, policy=SLOW_SCANS):
         # Candidates from the accumulator; fit each as plane, corner and edge; select by evidence. One compiled call.
-        found = kernels.detect_ml(tables.arcs, batch.packed, noise, hough_settings=settings, settings=prior)
+        found = kernels.detect_ml(tables.arcs, batch.packed, noise, hough_settings=settings, settings=ml_settings)
         rows = slice(0, len(batch.scans))  # without padding
         found = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], found)
         # A kind is decided if its posterior probability suffices and its parameters are those that were fitted.

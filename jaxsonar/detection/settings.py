@@ -15,7 +15,7 @@ METHODS = ("ml", "hough")
 
 @dataclass(frozen=True)
 class DecisionSettings:
-    """Constants of the detectors on the host; those of the kernels are in ``kernels.HoughSettings`` and the prior."""
+    """Constants of decisions on the host. Kernels have ``kernels.HoughSettings`` and ``kernels.DetectionSettings``."""
 
     min_probability: float = 0.7
     """Posterior probability from which on a reflector is reported as a wall, corner or edge. Chosen by hand."""

@@ -9,7 +9,7 @@ import pytest
 
 from jaxsonar import HoughSettings, Ring, SonarError, kernels, random_pose, random_room, simulate
 from jaxsonar.calibration.autofocus import autofocus_ring
-from jaxsonar.kernels.autofocus import blur, ring_focus_measure
+from jaxsonar.kernels.focus_measure import blur, ring_focus_measure
 
 RING = Ring.circular(count=8, neighbors=1)
 COARSE = HoughSettings(theta_cells=60, rho_cells=64, rho_cell=0.08, point_pitch=float(np.radians(3.0)))

@@ -7,9 +7,9 @@ walls are those of the previous pass over the scan.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .detection_settings import DetectionSettings
-from .detection_state import Hypotheses, ScanData, SceneEstimate, count, log_normal
-from .geometry import normal, tangent, wrap_angle
+from .ml_detection_settings import DetectionSettings
+from .ml_detection_state import Hypotheses, ScanData, SceneEstimate, count, log_normal
+from .planar_geometry import normal, tangent, wrap_angle
 
 
 def plane_log_prior(

@@ -17,11 +17,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from . import hough_accumulator as hough
 from . import isorange_arcs as arcs
-from .array_geometry import SensorArray, echo_paths
-from .geometry import rotate_back
 from .hough_accumulator import HoughSettings
 from .hough_voting import PackedEchoes
 from .measurement_model import corrected_range
+from .planar_geometry import rotate_back
+from .sensor_array import SensorArray, echo_paths
 
 
 @dataclass(frozen=True)

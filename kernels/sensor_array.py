@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .geometry import normal, rotate, wrap_angle
+from .planar_geometry import normal, rotate, wrap_angle
 
 
 class SensorArray(eqx.Module):

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .array_geometry import EchoPaths
-from .detection_settings import DetectionSettings
-from .detection_state import Hypotheses, Model, ScanData, SceneEstimate, log_normal, regularized_inverse
 from .measurement_model import off_axis_ratio, plane_echo, second_order_echo, visibility
+from .ml_detection_settings import DetectionSettings
+from .ml_detection_state import Hypotheses, Model, ScanData, SceneEstimate, log_normal, regularized_inverse
+from .sensor_array import EchoPaths
 
 
 def clutter_log_density(scan: ScanData, scene: SceneEstimate, settings: DetectionSettings) -> Float[Array, " echoes"]:

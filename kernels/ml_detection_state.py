@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .array_geometry import EchoPaths
-from .detection_settings import DetectionSettings
 from .measurement_model import PredictedEcho
+from .ml_detection_settings import DetectionSettings
+from .sensor_array import EchoPaths
 
 Model = Callable[[Float[Array, "2"], EchoPaths], PredictedEcho]
 """The measurement model of one kind of reflector."""
