@@ -4,7 +4,8 @@ Modules, in the order of the data:
 
 - ``sensor_array``: sensors -> echo paths (transmitter-receiver pairs). ``isorange_arcs``: the arc of one echo.
 - ``hough_voting``, ``hough_accumulator``: arcs -> tangent lines -> votes -> low pass -> threshold (paper, section 4).
-- ``measurement_model``: the only range model of plane, corner and edge. ``landmarks``: reflectors of the world.
+- ``measurement_model``: the only range model of plane, corner and edge. ``detection_cones``: which echoes are received.
+  ``landmarks``: reflectors of the world.
 - ``robust_fit``: one reflector fitted to echoes. ``ml_detection`` with ``ml_detection_*``: all reflectors of a scan.
 - ``data_association``, ``iterated_ekf``, ``bundle_adjustment``: echoes and landmarks, poses and ring parameters.
 - ``focus_measure``, ``beam_pattern``: ring parameters without landmarks, and the detection cones of the sensors.
@@ -24,8 +25,8 @@ Design decisions:
   again.
 - Arcs are packed in pieces of 16 points: the arc of a direct path has four times as many points as that of a third
   neighbor.
-- Kernels of the ML detector are written in scalar components (``planar_geometry.dot``) and vmapped with the echoes as the
-  last axis: XLA then generates few, vectorized loops.
+- Kernels of the ML detector are written in scalar components (``planar_geometry.dot``) and vmapped with the echoes as
+  the last axis: XLA then generates few, vectorized loops.
 - Scans are mapped on a CPU, which keeps the accumulator in its cache and gives the same bits in every batch, and
   vmapped on a GPU.
 - The ML detector selects reflectors greedily and repeats this in passes over the whole scan. The passes matter more

@@ -5,8 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .detection_cones import SETTINGS
 from .landmarks import AnyArray, Landmarks, Reflection, predict_reflection
-from .measurement_model import SETTINGS, reported_range
+from .measurement_model import reported_range
 from .sensor_array import EchoPaths, SensorArray, echo_paths, widen_cones
 
 

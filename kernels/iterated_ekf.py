@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .detection_cones import SETTINGS, visibility
 from .landmarks import AnyArray, Landmarks, landmark_in_robot_frame
-from .measurement_model import PLANE, SETTINGS, reflector_echo, visibility
+from .measurement_model import PLANE, reflector_echo
 from .planar_geometry import dot, normal, tangent
 from .sensor_array import EchoPaths, widen_cones
 

@@ -6,16 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .measurement_model import (
-    PLANE,
-    SETTINGS,
-    corner_echo,
-    echo_of_kind,
-    edge_echo,
-    plane_echo,
-    second_order_echo,
-    visibility,
-)
+from .detection_cones import SETTINGS, visibility
+from .measurement_model import PLANE, corner_echo, echo_of_kind, edge_echo, plane_echo, second_order_echo
 from .planar_geometry import dot, fold_line, normal, rotate_back, tangent
 from .sensor_array import EchoPaths
 

@@ -7,7 +7,6 @@ A reflector has two parameters: (rho, theta) of a plane, (x, y) of a corner or a
 range is half the length of the path transmitter -> reflector -> receiver.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,30 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .planar_geometry import dot, length, length_and_direction, mirror_point, normal, safe_sqrt, signed_angle, tangent
+from .planar_geometry import dot, length, length_and_direction, mirror_point, normal, safe_sqrt, tangent
 from .sensor_array import EchoPaths
 
 PLANE, CORNER, EDGE = 0, 1, 2
 """Kinds of reflectors: a wall; a right-angled concave corner; an edge or a thin pole."""
 SECOND_ORDER = 3
 """Kind of a reflection only: reflected at one plane, then at another."""
-
-
-@dataclass(frozen=True)
-class VisibilitySettings:
-    """When a path can receive an echo of a reflector."""
-
-    cone_border: float = 0.08
-    """Half width of the soft border of a detection cone, relative to the chord of half the cone; chosen by hand."""
-    association_cone_factor: float = 1.2
-    """Cones are taken this much wider when echoes are associated with landmarks, because the headings of sensors are
-    not exact; chosen by hand."""
-    association_wall_margin: float = 0.3
-    """Metres that a wall of a map may extend beyond its endpoints, which are the outermost observed footpoints; chosen
-    by hand."""
-
-
-SETTINGS = VisibilitySettings()
 
 
 class PredictedEcho(eqx.Module):
@@ -245,59 +227,3 @@ def reflector_echo(kind: Int[Array, ""], reflector: Float[Array, "2"], path: Ech
     """Echo of ONE reflector of kind PLANE, CORNER or EDGE; does not exist for any other kind."""
     models = (plane_echo, corner_echo, edge_echo)
     return echo_of_kind(kind, *(model(reflector, path) for model in models))
-
-
-# Detection cones
-
-
-def visibility(echo: PredictedEcho, path: EchoPaths) -> Float[Array, ""]:
-    """Weight of an echo by both detection cones: 1 inside, 0 outside or if it does not exist, smooth at the border."""
-    border = SETTINGS.cone_border
-    weight = jnp.clip(((1 + border) ** 2 - off_axis_ratio(echo, path)) / (4 * border), 0, 1)
-    return jnp.where(echo.exists, weight * weight * (3 - 2 * weight), 0)
-
-
-def off_axis_ratio(echo: PredictedEcho, path: EchoPaths) -> Float[Array, ""]:
-    """Off-axis angle relative to the cone, the larger one of tx and rx: 0 on the axis, 1 at the border, increasing."""
-    out, back = echo.departure - path.axes[0], echo.arrival - path.axes[1]
-    return jnp.maximum(dot(out, out) / path.cone[0], dot(back, back) / path.cone[1])
-
-
-class PredictionTable(eqx.Module):
-    """Predicted echoes of every path and reflector of a batch of scans: leading axes (scans, reflectors, paths)."""
-
-    range: Float[Array, "*table"]
-    """Half the path length, metres."""
-    d_range_d_landmark: Float[Array, "*table 2"]
-    """Derivatives of the range with respect to the reflector's two parameters."""
-    departure_angle: Float[Array, "*table"]
-    """Direction in which the sound leaves, from the axis of the transmitter, radians, counter-clockwise."""
-    footpoint: Float[Array, "*table"]
-    """As ``PredictedEcho``."""
-    visibility: Float[Array, "*table"]
-    """Weight by both detection cones: 1 inside, 0 outside or where there is no such reflector."""
-    exists: Bool[Array, "*table"]
-    """Whether the path is possible, cones aside."""
-
-
-@jax.jit
-def predict_all_echoes(
-    paths: EchoPaths, kind: Int[Array, "scans reflectors"], reflectors: Float[Array, "scans reflectors 2"]
-) -> PredictionTable:
-    """Predict the echo of every path from every reflector of a batch of scans.
-
-    Args:
-        paths: of the ring.
-        kind: PLANE, CORNER or EDGE; -1 where there is no reflector.
-        reflectors: (rho, theta) of planes, (x, y) of corners and edges; robot frame, metres, radians.
-    """
-
-    def one(kind: Int[Array, ""], reflector: Float[Array, "2"], path: EchoPaths) -> PredictionTable:
-        echo = reflector_echo(kind, reflector, path)
-        angle = signed_angle(path.axes[0], echo.departure)
-        return PredictionTable(
-            echo.range, echo.d_range_d_landmark, angle, echo.footpoint, visibility(echo, path), echo.exists
-        )
-
-    each_path = jax.vmap(one, in_axes=(None, None, 0))
-    return jax.vmap(jax.vmap(each_path, in_axes=(0, 0, None)), in_axes=(0, 0, None))(kind, reflectors, paths)

@@ -22,9 +22,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from . import hough_accumulator as hough
+from .detection_cones import visibility
 from .hough_accumulator import HoughSettings
 from .hough_voting import PackedEchoes, RingArcs, map_scans, tangent_lines
-from .measurement_model import PLANE, plane_echo, point_echo, visibility
+from .measurement_model import PLANE, plane_echo, point_echo
 from .ml_detection_likelihood import (
     clutter_log_density,
     plane_missed_log_likelihood,

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .measurement_model import off_axis_ratio, plane_echo, second_order_echo, visibility
+from .detection_cones import off_axis_ratio, visibility
+from .measurement_model import plane_echo, second_order_echo
 from .ml_detection_settings import DetectionSettings
 from .ml_detection_state import Hypotheses, Model, ScanData, SceneEstimate, log_normal, regularized_inverse
 from .sensor_array import EchoPaths

@@ -12,7 +12,7 @@ from jaxsonar.detection.ml_detector import ml_detections
 from jaxsonar.detection.settings import hough_settings
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.geometry.se2 import tangent_of, unit
-from jaxsonar.kernels.measurement_model import predict_all_echoes
+from jaxsonar.kernels.detection_cones import predict_all_echoes
 from jaxsonar.mapping.build_map import build_map
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log

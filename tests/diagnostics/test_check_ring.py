@@ -14,7 +14,7 @@ from jaxsonar import Log, Ring, SonarError, random_pose, random_room, simulate
 from jaxsonar.diagnostics.beam_width import BIN_CENTRES, detection_probability, fit_cone, fit_each_cone
 from jaxsonar.diagnostics.check_ring import check
 from jaxsonar.diagnostics.range_offsets import remove_gauge_freedom
-from jaxsonar.kernels.measurement_model import predict_all_echoes
+from jaxsonar.kernels.detection_cones import predict_all_echoes
 from jaxsonar.reports import plot_style
 from jaxsonar.reports.plot_health import health_figure
 from jaxsonar.reports.terminal_tables import health_table

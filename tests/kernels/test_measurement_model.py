@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from support.echo_paths import paths_between
 
 from jaxsonar import Room
-from jaxsonar.kernels import measurement_model
+from jaxsonar.kernels import detection_cones, measurement_model
 from jaxsonar.simulation.echo_tracing import trace_between
 from jaxsonar.simulation.traced_echoes import EchoKind
 
@@ -29,8 +29,8 @@ MODELS = {
     "second order": (jax.jit(jax.vmap(measurement_model.second_order_echo, in_axes=(None, None, 0))), 2),
 }
 models = pytest.mark.parametrize("model", MODELS)
-visibilities = jax.jit(jax.vmap(measurement_model.visibility))
-off_axis_ratios = jax.jit(jax.vmap(measurement_model.off_axis_ratio))
+visibilities = jax.jit(jax.vmap(detection_cones.visibility))
+off_axis_ratios = jax.jit(jax.vmap(detection_cones.off_axis_ratio))
 
 
 def unit(angle):
