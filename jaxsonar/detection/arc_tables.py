@@ -28,7 +28,7 @@ class ArcTables:
     arcs: kernels.RingArcs
     """Equidistant arc points and the occupancy threshold, on the device."""
     pieces: Int[np.ndarray, " paths"]
-    """Number of pieces of ``kernels.PIECE`` points into which the arc of each path is cut."""
+    """Number of pieces of ``kernels.PIECE_POINTS`` points into which the arc of each path is cut."""
 
     @cached_property
     def normal_sums(self) -> NormalSums:
