@@ -90,8 +90,8 @@ def pack(
     Args:
         echoes: the echoes of all scans.
         cells: number of cells of the accumulator.
-        pieces: number of pieces of ``kernels.PIECE_POINTS`` points into which the arc of each path is cut. If omitted, every
-            echo has as many points as the widest arc.
+        pieces: number of pieces of ``kernels.PIECE_POINTS`` points into which the arc of each path is cut. If omitted,
+            every echo has as many points as the widest arc.
         policy: shapes of the batches.
     """
     if echoes.scan_count == 0:
