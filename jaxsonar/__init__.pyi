@@ -7,9 +7,9 @@ from .calibration.calibration_toml import save_calibration as save_calibration
 from .detection.extract import extract_lines as extract_lines
 from .detection.extract import local_model as local_model
 from .detection.extract import local_models as local_models
-from .detection.local_map import Line as Line
-from .detection.local_map import Lines as Lines
-from .detection.local_map import LocalModel as LocalModel
+from .detection.local_model import Line as Line
+from .detection.local_model import Lines as Lines
+from .detection.local_model import LocalModel as LocalModel
 from .diagnostics.check_ring import Health as Health
 from .diagnostics.check_ring import check as check
 from .estimation.odometry_noise import OdometryNoise as OdometryNoise

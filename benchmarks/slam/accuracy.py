@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import Console
 
+from benchmarks.aggregates import rms
 from benchmarks.metrics import environment, without_nan
 from benchmarks.slam.cramer_rao import Bound, bound, pose_bound
 from benchmarks.slam.scenarios import (
@@ -33,7 +34,7 @@ from benchmarks.slam.scenarios import (
     one_scan,
     twins,
 )
-from benchmarks.slam.summary import Outcome, _rms, measures, table
+from benchmarks.slam.summary import Outcome, measures, table
 from jaxsonar import GlobalMap, SonarError
 from jaxsonar.estimation.trajectory import Trajectory
 from jaxsonar.evaluation.map_accuracy import evaluate
@@ -41,7 +42,7 @@ from jaxsonar.evaluation.trajectory_errors import trajectory_errors
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder
 from jaxsonar.geometry.se2 import relative, transform_points, wrap_angle
 from jaxsonar.graph_slam.initial_poses import LoopClosure
-from jaxsonar.mapping.floor_plan import map_from_room
+from jaxsonar.mapping.map_from_room import map_from_room
 
 VARIANTS: dict[str, dict[str, Any]] = {"smoothed": {"smooth": True}, "front end": {"smooth": False}}
 """Variants of SLAM: arguments of ``slam``."""
@@ -107,7 +108,7 @@ def outcome(scene: Scene, variant: str, crb: Bound, *, seed: int = 0) -> Outcome
         odometry_aligned=trajectory_errors(odometry, truth).ate if scene.has_odometry else np.nan,
         bound=crb.ate,
         bound_heading=crb.ate_heading,
-        walls_bound=_rms(np.sqrt(crb.distance)),
+        walls_bound=rms(np.sqrt(crb.distance)),
     )
     start = time.perf_counter()
     try:
@@ -153,7 +154,7 @@ def _map_measures(scene: Scene, world: GlobalMap, frame: Float[np.ndarray, "3"])
     return {
         "missed": float(1 - covered.mean()) if len(walls) else np.nan,
         "false": 1 - results.precision_length,
-        "walls": _rms(results.distance),
+        "walls": rms(results.distance),
     }
 
 
@@ -251,7 +252,7 @@ def main() -> None:
     options.add_argument("--scans", type=int, help="scans of the long run (default: 10000, --quick 1000); 0 = none")
     options.add_argument("--only", metavar="TEXT", help="scenarios whose name contains TEXT")
     options.add_argument(
-        "--variant", "--way", choices=tuple(VARIANTS), help="one variant (default: both, the long run smoothed)"
+        "--variant", choices=tuple(VARIANTS), help="one variant (default: both, the long run smoothed)"
     )
     options.add_argument("-o", "--output", type=Path, default=Path("benchmark-results/slam.json"))
     options = options.parse_args()

@@ -22,7 +22,7 @@ from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.detection.component_centroids import component_centroids
 from jaxsonar.detection.connected_components import label_components
 from jaxsonar.detection.hough_detector import hough_detections
-from jaxsonar.detection.local_map_builder import hough_models
+from jaxsonar.detection.local_model_builder import hough_models
 from jaxsonar.detection.ml_detector import ml_detections
 from jaxsonar.scans.echo_batches import FAST_SCANS, SLOW_SCANS, BatchPolicy, EchoBatch, pack
 from jaxsonar.scans.flat_echoes import FlatEchoes
@@ -55,7 +55,7 @@ def hough_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None 
             [kernels.vote(arcs, echo_batch.packed, settings=settings) for echo_batch in batches]
         ),
         "components": lambda: [label_components(mask) for mask in masks],
-        "centres": lambda: [
+        "centroids": lambda: [
             component_centroids(tables, echo_batch, one, *found)
             for echo_batch, one, found in zip(batches, votes, labels, strict=True)
         ],
@@ -72,7 +72,7 @@ def ml_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = N
     noise = jnp.asarray(np.nan, jnp.float32)
     found = list(ml_detections(ring, FlatEchoes.from_dense(ring, ranges), settings, None))
 
-    def explain() -> Any:
+    def detect() -> Any:
         return [
             kernels.detect_ml(arcs, one, noise, hough_settings=settings, settings=detection_settings) for one in packed
         ]
@@ -80,7 +80,7 @@ def ml_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = N
     return {
         WHOLE: lambda: extract_lines(ring, ranges, method="ml", settings=settings),
         "pack": lambda: _batches(ring, FlatEchoes.from_dense(ring, ranges), settings, SLOW_SCANS),
-        "explain": lambda: jax.block_until_ready(explain()),
+        "detect": lambda: jax.block_until_ready(detect()),
         "lines": lambda: [one.lines for one in found],
     }
 

@@ -8,8 +8,8 @@ from jaxtyping import Int
 from jaxsonar import kernels
 from jaxsonar.batch_jobs.parquet_tables import PROBABILITY_COLUMNS, SCAN_COLUMNS, TABLES, Columns
 from jaxsonar.detection.hough_detector import HoughBatch, hough_detections
-from jaxsonar.detection.local_map import KIND_NAMES
-from jaxsonar.detection.local_map_builder import no_line_reason, no_wall_reason
+from jaxsonar.detection.local_model import KIND_NAMES
+from jaxsonar.detection.local_model_builder import no_line_reason, no_wall_reason
 from jaxsonar.detection.ml_detector import DetectionBatch, ml_detections
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.scans.flat_echoes import FlatEchoes

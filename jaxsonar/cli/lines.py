@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from jaxsonar.detection.local_map import LocalModel
+    from jaxsonar.detection.local_model import LocalModel
 
 from jaxsonar.cli.arguments import add_detection_arguments, figure_filename, number
 from jaxsonar.cli.console import (
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run ``jaxsonar lines``."""
     from jaxsonar.detection.extract import local_models
-    from jaxsonar.detection.local_map import save_models
+    from jaxsonar.detection.local_model import save_models
     from jaxsonar.detection.settings import hough_settings
     from jaxsonar.detection.settings_toml import load_settings, save_settings
     from jaxsonar.fileio.atomic_files import check_outputs, shown

@@ -82,7 +82,7 @@ def _load_known_map(map_filename: str) -> "GlobalMap":
     from jaxsonar.fileio.atomic_files import shown
     from jaxsonar.floor_plans.room_geojson import load_room
     from jaxsonar.hardware.errors import SonarError
-    from jaxsonar.mapping.floor_plan import map_from_room
+    from jaxsonar.mapping.map_from_room import map_from_room
     from jaxsonar.mapping.map_geojson import load_map
 
     try:

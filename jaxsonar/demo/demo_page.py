@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.evaluation.laser_polygonal_model import polygonal_model
 from jaxsonar.floor_plans.room import laser_ranges
 from jaxsonar.geometry.se2 import transform_points, unit

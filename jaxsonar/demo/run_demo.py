@@ -18,7 +18,7 @@ from jaxsonar.demo.comparison import (
 )
 from jaxsonar.demo.demo_page import draw_figures, write_page
 from jaxsonar.detection.extract import local_models
-from jaxsonar.detection.local_map import LocalModel, save_models
+from jaxsonar.detection.local_model import LocalModel, save_models
 from jaxsonar.detection.settings import hough_settings
 from jaxsonar.detection.settings_toml import save_settings
 from jaxsonar.evaluation.line_accuracy import LineAccuracy, line_accuracy

@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from jaxsonar import kernels
 from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.detection.hough_detector import hough_detections
-from jaxsonar.detection.local_map import Lines, LocalModel
-from jaxsonar.detection.local_map_builder import hough_models, ml_models
+from jaxsonar.detection.local_model import Lines, LocalModel
+from jaxsonar.detection.local_model_builder import hough_models, ml_models
 from jaxsonar.detection.ml_detector import ml_detections
 from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
 from jaxsonar.scans.flat_echoes import FlatEchoes

@@ -10,7 +10,7 @@ from jaxsonar import kernels
 from jaxsonar.detection.arc_tables import ArcTables, arc_tables
 from jaxsonar.detection.component_centroids import Centroids, component_centroids
 from jaxsonar.detection.connected_components import label_components
-from jaxsonar.detection.local_map import Lines
+from jaxsonar.detection.local_model import Lines
 from jaxsonar.scans.echo_batches import EchoBatch, pack
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.sensors.ring import Ring

@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from jaxsonar import kernels
 from jaxsonar.detection.arc_tables import ArcTables, arc_tables
-from jaxsonar.detection.local_map import Lines
+from jaxsonar.detection.local_model import Lines
 from jaxsonar.detection.settings import SETTINGS
 from jaxsonar.scans.echo_batches import SLOW_SCANS, EchoBatch, pack
 from jaxsonar.scans.flat_echoes import FlatEchoes

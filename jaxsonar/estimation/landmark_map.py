@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.detection.extract import local_models
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.geometry.landmarks import (
     concatenate_landmarks,
     landmarks_from_points,

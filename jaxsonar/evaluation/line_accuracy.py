@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.evaluation.settings import SETTINGS
 from jaxsonar.floor_plans.room import Room, walls_in_robot_frame
 from jaxsonar.geometry.se2 import wrap_angle

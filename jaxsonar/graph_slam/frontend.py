@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
 from jaxsonar.geometry.landmarks import concatenate_landmarks, transform_landmarks
 from jaxsonar.geometry.se2 import diagonal_covariance, propagate, relative, tangent_of, transform_points

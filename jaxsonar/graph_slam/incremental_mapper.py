@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from jaxsonar import kernels
 from jaxsonar.detection.extract import local_model
-from jaxsonar.detection.local_map import LocalModel
-from jaxsonar.detection.local_map_builder import hough_models
+from jaxsonar.detection.local_model import LocalModel
+from jaxsonar.detection.local_model_builder import hough_models
 from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import transform_points

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar.detection.extract import local_models
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.graph_slam.tracker import Tracker, TrackerState
 from jaxsonar.loop_closure.closure_candidate import ACCEPTED

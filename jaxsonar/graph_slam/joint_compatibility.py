@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 from jaxsonar import kernels
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.geometry.landmarks import (
     concatenate_landmarks,
     landmarks_from_points,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.geometry.se2 import compose, subtract_poses
 from jaxsonar.graph_slam.tracker import Tracker, TrackerState, TrackerStep
 from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence

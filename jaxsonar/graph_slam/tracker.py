@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxsonar import kernels
 from jaxsonar.detection.extract import local_model
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import compose, compose_with_covariance, rotate_covariance

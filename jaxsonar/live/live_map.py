@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxsonar import kernels
 from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.detection.extract import local_model, local_models
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.trajectory import Trajectory

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
 from jaxsonar.geometry.se2 import (
     diagonal_covariance,

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.special import logsumexp
 
 from jaxsonar.detection.extract import local_models
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import check_sigma
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.trajectory import Trajectory, stamps_of

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.mapping.free_space import DirectionalFreeSpace, observe_free_space
 from jaxsonar.mapping.observations import concatenate, merge_cells
 from jaxsonar.mapping.point_landmarks import PointLandmarks, aggregate_points

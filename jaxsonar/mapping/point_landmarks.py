@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.geometry.se2 import perpendicular, transform_points
 from jaxsonar.mapping.observations import Observations, unique_pairs
 from jaxsonar.mapping.segment_fusion import mutual_best

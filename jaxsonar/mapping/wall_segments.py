@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.detection.local_map import Line, LocalModel
+from jaxsonar.detection.local_model import Line, LocalModel
 from jaxsonar.geometry.se2 import tangent_of, transform_points, unit, wrap_angle
 from jaxsonar.mapping.observations import Observations, unique_pairs
 from jaxsonar.mapping.settings import SETTINGS

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.geometry.se2 import inverse, relative
 from jaxsonar.registration.cluster_adjustment import adjust, adjust_poses, single_scan
 from jaxsonar.registration.cluster_alignment import Alignment, align_clusters, nearest_scans, unambiguous_alignment

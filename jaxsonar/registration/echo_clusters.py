@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from scipy.stats import chi2
 
 from jaxsonar import kernels
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.registration.reflector_fit import fit_reflectors
 from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS

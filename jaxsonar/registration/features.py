@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.geometry.se2 import tangent_of, transform_points, unit, wrap_angle
 from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.registration.settings import FEATURE_SETTINGS as SETTINGS

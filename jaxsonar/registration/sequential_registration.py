@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.geometry.se2 import compose, inverse, subtract_poses, wrap_pose
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.registration.feature_map import fuse_scan, map_as_scan

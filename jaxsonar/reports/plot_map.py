@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 
-from jaxsonar.detection.local_map import Line, LocalModel
+from jaxsonar.detection.local_model import Line, LocalModel
 from jaxsonar.evaluation.laser_polygonal_model import PolygonalModel
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import transform_points

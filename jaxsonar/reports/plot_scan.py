@@ -17,7 +17,7 @@ from matplotlib.ticker import MultipleLocator
 from jaxsonar import kernels
 from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.detection.connected_components import label_components
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import hough_settings
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import transform_points

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.detection.extract import local_models
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import check_sigma
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.sparse_adjustment import marginal_covariances

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.estimation.adjustment_state import AdjustmentResult, AdjustmentState
 from jaxsonar.estimation.alternation import SETTINGS as ALTERNATION_SETTINGS
 from jaxsonar.estimation.alternation import AlternationResult, alternate

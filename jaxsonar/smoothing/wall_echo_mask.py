@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool
 
-from jaxsonar.detection.local_map import LocalModel
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.estimation.batch_data import BatchData
 from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
 from jaxsonar.sensors.range_models import plane_range

@@ -27,7 +27,7 @@ from jaxsonar import (
     simulate,
 )
 from jaxsonar.cli import app as cli
-from jaxsonar.detection.local_map import KIND_NAMES
+from jaxsonar.detection.local_model import KIND_NAMES
 from jaxsonar.detection.settings import SETTINGS
 from jaxsonar.sensors.ring_toml import load_ring
 from jaxsonar.simulation.acoustics import Acoustics

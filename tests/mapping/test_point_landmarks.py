@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsonar.detection.extract import local_models
-from jaxsonar.detection.local_map import LocalModel, Point
+from jaxsonar.detection.local_model import LocalModel, Point
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.geometry.segments import point_to_segments

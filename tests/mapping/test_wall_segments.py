@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from support.segments import COLUMNS, moved, same, segments_at
 
-from jaxsonar.detection.local_map import Line, LocalModel
+from jaxsonar.detection.local_model import Line, LocalModel
 from jaxsonar.geometry.se2 import rotation, wrap_angle
 from jaxsonar.mapping.observations import concatenate
 from jaxsonar.mapping.settings import SETTINGS

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsonar import LocalModel, SonarError, local_models, simulate
-from jaxsonar.detection.local_map import Line, Point
+from jaxsonar.detection.local_model import Line, Point
 from jaxsonar.geometry.se2 import compose, inverse, relative, transform_points, wrap_angle
 from jaxsonar.registration.sequential_registration import register_scans
 from jaxsonar.simulation.office import load_office

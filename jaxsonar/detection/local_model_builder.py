@@ -9,7 +9,7 @@ from jaxtyping import Int
 from jaxsonar import kernels
 from jaxsonar.detection.arc_tables import ArcTables
 from jaxsonar.detection.hough_detector import HoughBatch, LineCandidate, hough_detections
-from jaxsonar.detection.local_map import KIND_NAMES, Line, LocalModel, Point, Undecided
+from jaxsonar.detection.local_model import KIND_NAMES, Line, LocalModel, Point, Undecided
 from jaxsonar.detection.ml_detector import DetectionBatch, ml_detections
 from jaxsonar.detection.plane_point_test import confirmed_walls
 from jaxsonar.geometry.se2 import wrap_angle
