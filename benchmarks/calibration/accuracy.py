@@ -17,16 +17,11 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import Console
 
+from benchmarks.aggregates import rms
 from benchmarks.calibration.cramer_rao import (
     bound,
 )
-from benchmarks.calibration.summary import (
-    Outcome,
-    _rms,
-    growth,
-    measures,
-    tables,
-)
+from benchmarks.calibration.summary import Outcome, growth, measures, tables
 from benchmarks.calibration.trials import (
     CONDITIONS,
     SCANS,
@@ -93,8 +88,8 @@ def compared(
     )
     return Outcome(
         seed=-1,
-        rms=_rms(error[:count]),
-        rms_bound=_rms(size[:count]),
+        rms=rms(error[:count]),
+        rms_bound=rms(size[:count]),
         within=float(np.mean(np.abs(error[:count]) < sd[:count])),
         whitened=float(np.sqrt(whitened_squared)),
         nees=float(nees),

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from benchmarks.aggregates import mean, median, rms
 from benchmarks.calibration.trials import SCANS, SIGMA
 
 CONVERGED = 3.0
@@ -60,10 +61,6 @@ class Outcome:
         return not self.failed and self.rms < CONVERGED * self.rms_bound and self.whitened < CONVERGED
 
 
-def _rms(values: Sequence[float] | np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan
-
-
 def measures(outcomes: Sequence[Outcome]) -> dict[str, float]:
     """Measures over all seeds; errors and ratios are those of the successful calibrations."""
     successful = [one for one in outcomes if not one.failed]
@@ -72,33 +69,25 @@ def measures(outcomes: Sequence[Outcome]) -> dict[str, float]:
         "seeds": len(outcomes),
         "failed": len(outcomes) - len(successful),
         "converged": float(np.mean([one.converged for one in outcomes])),
-        "rms_mm": 1e3 * _median([one.rms for one in successful]),
-        "bound_mm": 1e3 * _median([one.rms_bound for one in successful]),
-        "per_bound": _rms(ratio),
-        "per_bound_median": _median(ratio),
+        "rms_mm": 1e3 * median([one.rms for one in successful]),
+        "bound_mm": 1e3 * median([one.rms_bound for one in successful]),
+        "per_bound": rms(ratio),
+        "per_bound_median": median(ratio),
         "per_bound_worst": max(ratio, default=np.nan),
-        "whitened": _rms([one.whitened for one in successful]),
-        "within": _mean([one.within for one in successful]),
-        "nees": _mean([one.nees for one in successful]),
-        "nees_median": _median([one.nees for one in successful]),
+        "whitened": rms([one.whitened for one in successful]),
+        "within": mean([one.within for one in successful]),
+        "nees": mean([one.nees for one in successful]),
+        "nees_median": median([one.nees for one in successful]),
         "nees_worst": max((one.nees for one in successful), default=np.nan),
-        "speed_percent": 100 * _rms([one.speed for one in successful]),
-        "speed_per_bound": _rms([one.speed / one.speed_bound for one in successful]),
-        "speed_per_sd": _rms([one.speed / one.speed_sd for one in successful]),
-        "mean_mm": 1e3 * _rms([one.mean for one in successful]),
-        "mean_free": _mean([float(one.mean_free) for one in successful]),
-        "placed": _mean([one.placed for one in successful]),
-        "explained": _mean([one.explained for one in successful]),
-        "seconds": _median([one.seconds for one in successful]),
+        "speed_percent": 100 * rms([one.speed for one in successful]),
+        "speed_per_bound": rms([one.speed / one.speed_bound for one in successful]),
+        "speed_per_sd": rms([one.speed / one.speed_sd for one in successful]),
+        "mean_mm": 1e3 * rms([one.mean for one in successful]),
+        "mean_free": mean([float(one.mean_free) for one in successful]),
+        "placed": mean([one.placed for one in successful]),
+        "explained": mean([one.explained for one in successful]),
+        "seconds": median([one.seconds for one in successful]),
     }
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if len(values) else np.nan
-
-
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values)) if len(values) else np.nan
 
 
 def growth(rows: Sequence[dict[str, float]]) -> list[float]:

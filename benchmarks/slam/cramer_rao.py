@@ -2,9 +2,9 @@
 
 The association is known from the simulator, the noise is white, the odometry noise is that of ``simulate_odometry``.
 The range formulas are those of ``benchmarks.calibration.cramer_rao`` and the Jacobians are central differences, so
-nothing is shared with the kernels. Second-order echoes and the priors that corners lie where walls meet and that walls
-continue behind a door are not included, so the bound is slightly too large where the library uses them. The first pose
-is known; it is the frame.
+nothing is shared with the kernels. The odometry noise is a random walk here, and proportional to the step there.
+Second-order echoes and the priors that corners lie where walls meet and that walls continue behind a door are not
+included, so the bound is slightly too large where the library uses them. The first pose is known; it is the frame.
 """
 
 from dataclasses import dataclass

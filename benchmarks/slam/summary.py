@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from benchmarks.aggregates import mean, median, rms
+
 LOST = 1.0
 """A run with a larger error (ATE, metres) counts as lost."""
 
@@ -69,8 +71,13 @@ class Outcome:
 def measures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """Measures over the runs of one scenario and variant; errors are root mean squares, counts are sums."""
     successful = [one for one in outcomes if not one.failed]
-    mean = lambda name: _mean([getattr(one, name) for one in successful])  # noqa: E731
-    rms_of = lambda name, of: _rms([getattr(one, name) for one in of])  # noqa: E731
+
+    def mean_of(name: str) -> float:
+        return mean([getattr(one, name) for one in successful])
+
+    def rms_of(name: str, runs: Sequence[Outcome]) -> float:
+        return rms([getattr(one, name) for one in runs])
+
     ratios = [one.ate / one.bound for one in successful]
     return {
         "scenario": outcomes[0].scenario,
@@ -78,10 +85,10 @@ def measures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "runs": len(outcomes),
         "failed": len(outcomes) - len(successful),
         "scans": sum(one.scans for one in outcomes),
-        "metres": _mean([one.metres for one in outcomes]),
+        "metres": mean([one.metres for one in outcomes]),
         "odometry_mm": 1e3 * rms_of("odometry", outcomes),
         "odometry_deg": float(np.degrees(rms_of("odometry_heading", outcomes))),
-        "placed": mean("placed"),
+        "placed": mean_of("placed"),
         "ate_mm": 1e3 * rms_of("ate", successful),
         "ate_deg": float(np.degrees(rms_of("ate_heading", successful))),
         "worst_mm": 1e3 * max((one.ate for one in successful), default=np.nan),
@@ -92,39 +99,23 @@ def measures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "ratio": rms_of("odometry", successful) / rms_of("ate", successful) if successful else np.nan,
         "bound_mm": 1e3 * rms_of("bound", outcomes),
         "bound_deg": float(np.degrees(rms_of("bound_heading", outcomes))),
-        "per_bound": _median(ratios),
-        "nees": mean("nees"),
-        "nees_median": _median([one.nees for one in successful]),
+        "per_bound": median(ratios),
+        "nees": mean_of("nees"),
+        "nees_median": median([one.nees for one in successful]),
         "made": sum(one.made for one in successful),
         "wrong": sum(one.wrong for one in successful),
         "withdrawn": sum(one.withdrawn for one in successful),
         "walls_mm": 1e3 * rms_of("walls", successful),
         "walls_bound_mm": 1e3 * rms_of("walls_bound", outcomes),
-        "missed": mean("missed"),
-        "false": mean("false"),
-        "p50": _median([one.p50 for one in successful]),
+        "missed": mean_of("missed"),
+        "false": mean_of("false"),
+        "p50": median([one.p50 for one in successful]),
         "p99": max((one.p99 for one in successful), default=np.nan),
-        "growth": mean("growth"),
+        "growth": mean_of("growth"),
         "seconds": sum(one.seconds for one in successful),
         "why": next((one.failed for one in outcomes if one.failed), ""),
         "each": [asdict(one) for one in outcomes],
     }
-
-
-def _rms(values: Sequence[float] | np.ndarray) -> float:
-    known = np.asarray(values, dtype=float)
-    known = known[np.isfinite(known)]
-    return float(np.sqrt(np.mean(np.square(known)))) if len(known) else np.nan
-
-
-def _mean(values: Sequence[float]) -> float:
-    known = [value for value in values if not np.isnan(value)]
-    return float(np.mean(known)) if known else np.nan
-
-
-def _median(values: Sequence[float]) -> float:
-    known = [value for value in values if not np.isnan(value)]
-    return float(np.median(known)) if known else np.nan
 
 
 COLUMNS = {

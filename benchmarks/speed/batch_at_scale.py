@@ -24,8 +24,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from benchmarks.metrics import available_cores
 from jaxsonar import Log, Ring, SonarError, random_pose, random_room, save_log, simulate
+from jaxsonar.batch_jobs.worker_environment import available_cores
 from jaxsonar.fileio.atomic_files import atomic_write
 
 SCANS_PER_LOG = 20_000

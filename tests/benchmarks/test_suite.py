@@ -176,9 +176,9 @@ def results(**values):
         Metric("latency.hough.p50", 0.8, "ms", target=1.0),
         *(
             Metric(f"stages.hough.{k}.share", share, "%")
-            for k, share in {"pack": 3, "votes": 60, "centres": 30}.items()
+            for k, share in {"pack": 3, "votes": 60, "centroids": 30}.items()
         ),
-        *(Metric(f"stages.hough.{k}", 10.0, "us/scan") for k in ("whole", "pack", "votes", "centres")),
+        *(Metric(f"stages.hough.{k}", 10.0, "us/scan") for k in ("whole", "pack", "votes", "centroids")),
         Metric("growth.scans.hough.exponent", 1.02, ""),
         *(Metric(f"growth.scans.hough@{n}", 30 + 100 / n, "us/scan") for n in (16, 64, 256)),
     ]
