@@ -120,7 +120,7 @@ def outcome(scene: Scene, variant: str, crb: Bound, *, seed: int = 0) -> Outcome
         return replace(base, failed="no scan was registered")
     first_aligned = trajectory_errors(result.trajectory, truth, align="first")
     aligned = trajectory_errors(result.trajectory, truth)
-    counted = [closure for closure in result.closures if closure.state == "counted"]
+    accepted = [closure for closure in result.closures if closure.state == "accepted"]
     return replace(
         base,
         placed=first_aligned.poses / len(truth),
@@ -129,8 +129,8 @@ def outcome(scene: Scene, variant: str, crb: Bound, *, seed: int = 0) -> Outcome
         aligned=aligned.ate,
         relative=first_aligned.relative,
         nees=first_aligned.nees,
-        made=len(counted),
-        wrong=sum(wrong(scene.poses, closure) for closure in counted),
+        made=len(accepted),
+        wrong=sum(wrong(scene.poses, closure) for closure in accepted),
         withdrawn=sum(closure.state == "withdrawn" for closure in result.closures),
         seconds=seconds,
         **_map_measures(scene, result.world, np.zeros(3) if scene.has_odometry else aligned.truth_from_estimate),

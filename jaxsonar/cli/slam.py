@@ -110,7 +110,7 @@ def run(options: argparse.Namespace) -> None:
             trajectory,
             odometry=result.odometry if np.isfinite(result.odometry).any() else None,
             truth=None if truth is None else truth_in_estimate_frame(trajectory, truth),
-            closures=closure_rows(result, "counted"),
+            closures=closure_rows(result, "accepted"),
             withdrawn=closure_rows(result, "withdrawn"),
             title=f"{plural(len(trajectory), 'pose')}, {walls} from {ascii_name(options.log)}",
         )

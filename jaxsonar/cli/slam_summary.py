@@ -12,6 +12,7 @@ from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.geometry.se2 import compose, inverse
 from jaxsonar.graph_slam.slam import Slam
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.loop_closure.closure_candidate import ACCEPTED, WITHDRAWN
 from jaxsonar.reports.text import plural
 from jaxsonar.scans.scan_log import Log
 
@@ -88,7 +89,7 @@ def as_json(result: Slam, errors: Errors | None) -> dict[str, Any]:
                 "first": closure.first,
                 "second": closure.second,
                 "pose": closure.first_from_second.tolist(),
-                "state": closure.state,
+                "state": "counted" if closure.state == ACCEPTED else closure.state,  # the word of the file format
                 "determined": closure.determined.T.tolist(),
             }
             for closure in result.closures
@@ -117,11 +118,11 @@ def _errors_as_json(errors: TrajectoryErrors) -> dict[str, float | int | None]:
 
 def summary_lines(result: Slam, errors: Errors | None) -> list[str]:
     """The result as lines of text for the user."""
-    states = {state: sum(closure.state == state for closure in result.closures) for state in ("counted", "withdrawn")}
+    states = {state: sum(closure.state == state for closure in result.closures) for state in (ACCEPTED, WITHDRAWN)}
     lines = [
         f"{plural(len(result.poses), 'scan')}, {len(result.trajectory)} of them with a pose, "
         f"{plural(len(result.world), 'wall')}, {plural(len(result.world.points), 'corner')} or edges; "
-        f"{plural(states['counted'], 'loop closure')}, {states['withdrawn']} withdrawn"
+        f"{plural(states[ACCEPTED], 'loop closure')}, {states[WITHDRAWN]} withdrawn"
     ]
     smoothed = result.smoothed
     if smoothed is not None:

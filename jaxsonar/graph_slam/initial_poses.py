@@ -1,7 +1,7 @@
-"""First estimate of all poses of a log, before smoothing: tracked with odometry, or registered without."""
+"""Initial poses of a log, before smoothing: odometry as it is, tracked with odometry, or registered without."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import NamedTuple
 
@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from jaxsonar.detection.extract import local_models
 from jaxsonar.detection.local_model import LocalModel
+from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.graph_slam.tracker import Tracker, TrackerState
-from jaxsonar.loop_closure.closure_candidate import ACCEPTED
 from jaxsonar.loop_closure.submap_graph import SubmapGraph
 from jaxsonar.registration.agglomerative_registration import register_by_ranges
 from jaxsonar.registration.sequential_registration import register_scans
@@ -24,9 +24,17 @@ from jaxsonar.smoothing.settings import SETTINGS as SMOOTHING_SETTINGS
 Progress = Callable[[str, int, int], None]
 """Called with the current task, the number of finished scans, and the number of scans; (0, 0) where it is unknown."""
 
-MAX_REGISTERED_BY_RANGES = 64
-"""Scans; a log without odometry is registered by ranges up to this length, which takes some seconds for each scan.
-Longer logs are registered by walls and corners alone, which leaves more scans without a pose. Chosen by hand."""
+
+@dataclass(frozen=True)
+class InitialPoseSettings:
+    """Constants of the initial poses; chosen by hand."""
+
+    max_registered_by_ranges: int = 64
+    """Scans; a log without odometry is registered by ranges up to this length, which takes some seconds for each scan.
+    Longer logs are registered by walls and corners alone, which leaves more scans without a pose."""
+
+
+SETTINGS = InitialPoseSettings()
 
 
 class LoopClosure(NamedTuple):
@@ -39,8 +47,8 @@ class LoopClosure(NamedTuple):
     first_from_second: Float[np.ndarray, "3"]
     """Pose of the later submap in the frame of the earlier one, metres and radians."""
     state: str
-    """One of "counted" (in the graph), "withdrawn" (accepted, later rejected),
-    "refused" (rejected), "proposed" (not verified)."""
+    """One of "accepted" (in the graph), "withdrawn" (accepted, later removed), "refused" (contradicts the graph),
+    "proposed" (undecided)."""
     determined: Float[np.ndarray, "3 rank"]
     """Unit vectors of (x, y, theta) that the measurement determines, in the earlier frame. Parallel walls leave one
     direction undetermined; there ``first_from_second`` is that of the graph."""
@@ -48,15 +56,21 @@ class LoopClosure(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class InitialPoses:
-    """Poses of a log before smoothing."""
+    """Poses of a log before smoothing, and what was estimated together with them."""
 
     poses: Float[np.ndarray, "scans 3"]
     """world_from_robot; NaN for scans without an estimate."""
     covariance: Float[np.ndarray, "scans 3 3"]
     """With respect to the first scan; NaN where it is not estimated."""
+    odometry: Float[np.ndarray, "scans 3"]
+    """world_from_robot by odometry; NaN for scans without odometry."""
+    models: Sequence[LocalModel] | None = None
+    """Local models of all scans; None with windows."""
     closures: tuple[LoopClosure, ...] = ()
     traversals: Traversals | None = None
     """The submaps and how well they are known relative to each other; None without submaps."""
+    step_ms: Float[np.ndarray, " steps"] = field(default_factory=lambda: np.zeros(0))
+    """Milliseconds of each tracked scan; empty where the log was not tracked."""
 
 
 def detect(ring: Ring, log: Log, *, sigma: float | None, progress: Progress) -> list[LocalModel]:
@@ -68,20 +82,51 @@ def detect(ring: Ring, log: Log, *, sigma: float | None, progress: Progress) -> 
     return models
 
 
-def track(
-    tracker: Tracker, log: Log, models: Sequence[LocalModel] | None, *, progress: Progress
-) -> tuple[TrackerState, list[LocalModel], Float[np.ndarray, " scans"]]:
-    """Track all scans of a log with odometry.
+def initial_poses(
+    ring: Ring,
+    log: Log,
+    models: Sequence[LocalModel] | None,
+    *,
+    window: float | None,
+    sigma: float | None,
+    odometry_noise: OdometryNoise,
+    progress: Progress,
+) -> InitialPoses:
+    """Initial poses of all scans.
+
+    With windows the odometry as it is; otherwise tracked with odometry, or registered without.
 
     Args:
-        tracker: estimates the poses.
-        log: scans whose poses are odometry.
-        models: local models of all scans; None: the tracker detects them.
+        ring: the sensors.
+        log: scans whose poses are odometry; NaN where there is none.
+        models: local models of all scans. None with windows, or if the tracker shall detect them scan by scan.
+        window: metres of trajectory of one window; None: without windows.
+        sigma: standard deviation of the ranges, metres; None: estimated.
+        odometry_noise: noise model of the odometry.
         progress: is informed after each scan.
-
-    Returns:
-        The last state, the local models, and the milliseconds that each scan took.
     """
+    has_odometry = np.asarray(np.isfinite(log.pose).all(axis=1))
+    odometry = np.where(has_odometry[:, None], log.pose, np.nan)
+    if window is not None:
+        return InitialPoses(odometry, np.full((len(log), 3, 3), np.nan), odometry)
+    if has_odometry.any():
+        tracker = Tracker(ring=ring, sigma=sigma, odometry_noise=odometry_noise)
+        return _track(tracker, log, models, odometry, progress=progress)
+    models = models or detect(ring, log, sigma=sigma, progress=progress)
+    poses, covariance = _register(ring, log, models, sigma=sigma, progress=progress)
+    return InitialPoses(poses, covariance, odometry, models)
+
+
+def _track(
+    tracker: Tracker,
+    log: Log,
+    models: Sequence[LocalModel] | None,
+    odometry: Float[np.ndarray, "scans 3"],
+    *,
+    progress: Progress,
+) -> InitialPoses:
+    """Track all scans of a log with odometry, and close loops; without local models the tracker detects them."""
+    # 1. The pose of every scan in its submap, and the graph of submaps.
     state, found, step_ms = tracker.start(), [], np.zeros(len(log))
     for row in range(len(log)):
         begin = perf_counter()
@@ -89,30 +134,27 @@ def track(
         step_ms[row] = 1e3 * (perf_counter() - begin)
         found.append(step.model)
         progress("tracking", row + 1, len(log))
-    return state, found, step_ms
-
-
-def close_loops(tracker: Tracker, state: TrackerState) -> InitialPoses:
-    """Finish the loop closures of a tracked log; all poses after that."""
+    # 2. The last loop closures, and all poses after them.
     state = tracker.finish(state)
     poses, covariance = tracker.poses(state)
-    return InitialPoses(poses, covariance, loop_closures(state.graph), submap_traversals(state))
+    closures, traversals = loop_closures(state.graph), submap_traversals(state)
+    return InitialPoses(poses, covariance, odometry, found, closures, traversals, step_ms)
 
 
-def register(
+def _register(
     ring: Ring, log: Log, models: Sequence[LocalModel], *, sigma: float | None, progress: Progress
-) -> InitialPoses:
-    """Register the scans of a log without odometry; scans outside of the largest reliable cluster have no pose."""
+) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:
+    """Poses and covariances of scans without odometry; scans outside of the largest reliable cluster have no pose."""
 
     def report(done: int, total: int) -> None:
         progress("placing", done, total)
 
-    if len(log) <= MAX_REGISTERED_BY_RANGES:
+    if len(log) <= SETTINGS.max_registered_by_ranges:
         cluster = register_by_ranges(ring, log, models, sigma=sigma, progress=report)[0]
-        return InitialPoses(cluster.poses, cluster.pose_covariance)
+        return cluster.poses, cluster.pose_covariance
     scale = SMOOTHING_SETTINGS.local_model_noise_scale
     poses = register_scans(models, None, noise_scale=scale, progress=report)[0]
-    return InitialPoses(poses, np.full((len(log), 3, 3), np.nan))
+    return poses, np.full((len(log), 3, 3), np.nan)
 
 
 def submap_traversals(state: TrackerState) -> Traversals | None:
@@ -139,6 +181,6 @@ def loop_closures(graph: SubmapGraph) -> tuple[LoopClosure, ...]:
         residual = candidate.measurement.earlier_from_newest - estimate
         residual[2] = wrap_angle(float(residual[2]))
         pose = estimate + basis @ (basis.T @ residual)
-        state = "counted" if candidate.state == ACCEPTED else candidate.state
-        closures.append(LoopClosure(first_row[candidate.earlier], first_row[candidate.newest], pose, state, basis))
+        rows = first_row[candidate.earlier], first_row[candidate.newest]
+        closures.append(LoopClosure(*rows, pose, candidate.state, basis))
     return tuple(closures)

@@ -1,16 +1,16 @@
 """SLAM of a whole log: poses of all scans, and the map (paper, section 5, last paragraph)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import check_sigma
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.trajectory import Trajectory, stamps_of
-from jaxsonar.graph_slam.initial_poses import InitialPoses, LoopClosure, close_loops, detect, register, track
-from jaxsonar.graph_slam.tracker import Tracker
+from jaxsonar.graph_slam.initial_poses import InitialPoses, LoopClosure, detect, initial_poses
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
@@ -112,48 +112,44 @@ def slam(
     if window is None and float(np.asarray(ring.echo_paths.width).sum() / (2 * np.pi)) < SETTINGS.sparse_echoes:
         window = SETTINGS.sparse_window
     has_odometry = np.asarray(np.isfinite(log.pose).all(axis=1))
+    # 1. Check the arguments.
     _check(log, has_odometry, sigma=sigma, window=window, smooth=smooth, speed=speed, scale=scale)
-    odometry = np.where(has_odometry[:, None], log.pose, np.nan)
-    step_ms = np.zeros(0)
-    # 1. Detect: the local model of every scan.
-    models = None if window is not None or live else detect(ring, log, sigma=sigma, progress=report)
-    if window is not None:
-        initial = InitialPoses(odometry, np.full((len(log), 3, 3), np.nan))
-    elif has_odometry.any():
-        # 2. Track: the pose of every scan in its submap, and the graph of submaps.
-        tracker = Tracker(ring=ring, sigma=sigma, odometry_noise=noise)
-        state, models, step_ms = track(tracker, log, models, progress=report)
-        # 3. Close loops.
-        initial = close_loops(tracker, state)
-    else:
-        models = models or detect(ring, log, sigma=sigma, progress=report)
-        initial = register(ring, log, models, sigma=sigma, progress=report)
-    # 4. Smooth: all poses and landmarks on the raw ranges, and the map of the landmarks.
+    # 2. Detect the local model of every scan, unless maps of windows or the tracker do so.
+    scan_by_scan = live and has_odometry.any()
+    models = None if window is not None or scan_by_scan else detect(ring, log, sigma=sigma, progress=report)
+    # 3. Estimate initial poses: odometry as it is, tracked with loop closure, or registered without odometry.
+    initial = initial_poses(ring, log, models, window=window, sigma=sigma, odometry_noise=noise, progress=report)
+    # 4. Smooth all poses and landmarks on the raw ranges.
+    smoothed = None
     if smooth if smooth is not None else _is_smoothed_by_default(initial, has_odometry, speed):
         smoothed = smooth_poses(
             ring,
             log,
             _smoothing_start(initial, has_odometry),
-            odometry=odometry if has_odometry.any() else None,
+            odometry=initial.odometry if has_odometry.any() else None,
             sigma=sigma,
             window=window,
             speed=speed,
             scale=scale,
             odometry_noise=noise,
-            models=models,
+            models=initial.models,
             traversals=initial.traversals,
             progress=lambda task: report(task, 0, 0),
         )
         _check_explained(smoothed)
+    # 5. Take the map of the smoothed landmarks, or build one from the initial poses.
+    if smoothed is not None:
         poses, covariance, world = smoothed.poses, smoothed.pose_cov, smoothed.world
     else:
-        # 5. Map: without smoothing, from the poses as they are.
         report("building the map", 0, 0)
-        smoothed, poses, covariance = None, initial.poses, initial.covariance
-        at = replace(log, pose=poses)
-        evidence = None if models is None else gather_evidence(ring, at, models)
-        world = build_map(ring, at, window=window) if evidence is None else assemble_map(evidence)
-    return Slam(poses, covariance, stamps_of(log), world, log.pose, initial.closures, step_ms, smoothed)
+        poses, covariance = initial.poses, initial.covariance
+        world = _map_at(ring, replace(log, pose=poses), initial.models, window)
+    return Slam(poses, covariance, stamps_of(log), world, log.pose, initial.closures, initial.step_ms, smoothed)
+
+
+def _map_at(ring: Ring, log: Log, models: Sequence[LocalModel] | None, window: float | None) -> GlobalMap:
+    """The map of a log at its poses."""
+    return build_map(ring, log, window=window) if models is None else assemble_map(gather_evidence(ring, log, models))
 
 
 def _is_smoothed_by_default(initial: InitialPoses, has_odometry: Bool[np.ndarray, " scans"], speed: bool) -> bool:

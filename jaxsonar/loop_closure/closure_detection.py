@@ -26,7 +26,7 @@ from jaxsonar.loop_closure.submap_matching import (
     Pairs,
     PoseFit,
     fit_compatible_pairs,
-    log_likelihood_gains,
+    log_likelihood_ratios,
     nearest_pairs,
 )
 from jaxsonar.loop_closure.submap_negative_evidence import submap_negative_evidence
@@ -45,7 +45,7 @@ class ClosureMeasurement(NamedTuple):
     pairs: Pairs
     chi2: float
     dof: int
-    gain: float
+    log_likelihood_ratio: float
     """Log-likelihood ratio of the pairs against chance, nats."""
     log_weight: float
     """Log-density of the prior minus the negative evidence, nats."""
@@ -65,7 +65,7 @@ class _AlignedPair(NamedTuple):
 
     pairs: Pairs
     fit: PoseFit
-    gain: float
+    log_likelihood_ratio: float
     """Log-likelihood ratio of the pairs against chance, nats."""
     negative_evidence: float
     is_redundant: bool
@@ -107,11 +107,11 @@ def detect_closure(
     poses = np.array([fit.pose for _, fit in fits.values()])
     against = _negative_evidence(views, poses, reach)
     aligned = [
-        _AlignedPair(pairs, fit, _gain(earlier, newest, pairs, fit, prior), float(nats), _is_redundant(earlier, pairs))
+        _AlignedPair(pairs, fit, _log_likelihood_ratio(earlier, newest, pairs, fit, prior), float(nats), _is_redundant(earlier, pairs))
         for (pairs, fit), nats in zip(fits.values(), against, strict=True)
     ]
     # 3. The best against all others and against perceptual aliasing.
-    best = max(aligned, key=lambda one: one.gain - one.negative_evidence)
+    best = max(aligned, key=lambda one: one.log_likelihood_ratio - one.negative_evidence)
     measured = _compare(best, aligned, views, prior, reach)
     if measured is None and best.fit.free is None:
         # Where doors repeat, the walls of a corridor still determine the distance from them.
@@ -162,12 +162,12 @@ def _is_redundant(earlier: Submap, pairs: Pairs) -> bool:
     return True
 
 
-def _gain(earlier: Submap, newest: Submap, pairs: Pairs, fit: PoseFit, prior: PosePrior) -> float:
+def _log_likelihood_ratio(earlier: Submap, newest: Submap, pairs: Pairs, fit: PoseFit, prior: PosePrior) -> float:
     """Log-likelihood ratio of pairs against chance, less the volume of the prior that was searched, nats."""
     information = fit.information
     position = information[:2, :2] - np.outer(information[:2, 2], information[2, :2]) / information[2, 2]
     volume = np.linalg.slogdet(np.eye(2) + prior.covariance[:2, :2] @ position)[1] / 2
-    return float(log_likelihood_gains(earlier, newest, pairs, fit.pose).sum() - fit.chi2 / 2 - volume)
+    return float(log_likelihood_ratios(earlier, newest, pairs, fit.pose).sum() - fit.chi2 / 2 - volume)
 
 
 def _basis(free: Float[np.ndarray, "2"] | None) -> Float[np.ndarray, "3 rank"]:
@@ -188,7 +188,7 @@ def _compare(
     # 1. Enough pairs that determine the pose redundantly, and little negative evidence.
     full = fit.free is None
     min_pairs = SETTINGS.min_pairs if full else SETTINGS.min_corridor_pairs
-    if best.gain < (SETTINGS.min_gain if full else 0.0) or len(best.pairs) < min_pairs:
+    if best.log_likelihood_ratio < (SETTINGS.min_log_likelihood_ratio if full else 0.0) or len(best.pairs) < min_pairs:
         return None
     if best.negative_evidence > SETTINGS.max_negative_evidence:
         return None
@@ -199,21 +199,21 @@ def _compare(
     rivals = [one for one in aligned if one is not best and _is_distinct(one.fit.pose, fit, basis)]
     poses = np.array([one.fit.pose for one in rivals]).reshape(-1, 3)
     nats = prior.log_density(poses, basis) - np.array([one.negative_evidence for one in rivals])
-    nats += np.array([min(0.0, one.gain - SETTINGS.similarity * best.gain) for one in rivals])
+    nats += np.array([min(0.0, one.log_likelihood_ratio - SETTINGS.similarity * best.log_likelihood_ratio) for one in rivals])
     if log_sum_exp(nats) > log_weight - SETTINGS.margin:
         return None
     # 3. Places that look alike and were never observed.
     offset, density, grid = enumerate_alternatives(fit, *views, prior, reach=reach)
     distance = np.linalg.norm(offset, axis=-1) if full else np.abs(offset @ basis[:2]).max(axis=-1)
     out = distance > SETTINGS.alternative_distance
-    copies = density[out] + np.log(SETTINGS.copy_probability) - (2 if full else 1) * np.log(SETTINGS.copy_spacing)
+    copies = density[out] + np.log(SETTINGS.aliasing_probability) - (2 if full else 1) * np.log(SETTINGS.aliasing_spacing)
     copies += _log_rarity(offset[out], _normal_between_walls(best, views[0].own))
     alternatives = AlternativeHypotheses(
         np.concatenate([poses[:, :2] - fit.pose[:2], offset[out]]),
         np.concatenate([nats, copies]),
         np.arange(len(rivals) + int(out.sum())) >= len(rivals),
     )
-    log_odds = min(log_weight - log_sum_exp(alternatives.log_weight), SETTINGS.max_odds)
+    log_odds = min(log_weight - log_sum_exp(alternatives.log_weight), SETTINGS.max_log_odds)
     return ClosureMeasurement(
         earlier_from_newest=fit.pose,
         information=fit.information,
@@ -221,7 +221,7 @@ def _compare(
         pairs=best.pairs,
         chi2=fit.chi2,
         dof=fit.dof,
-        gain=best.gain,
+        log_likelihood_ratio=best.log_likelihood_ratio,
         log_weight=log_weight,
         log_odds=log_odds,
         alternatives=alternatives,
@@ -254,7 +254,7 @@ def _log_rarity(
     if normal is None:
         return np.zeros(len(offset))
     aside, least = np.abs(offset @ normal), SETTINGS.alternative_distance
-    rarity = np.log(-np.expm1(-np.square(np.maximum(aside, least) / SETTINGS.copy_spacing)))
+    rarity = np.log(-np.expm1(-np.square(np.maximum(aside, least) / SETTINGS.aliasing_spacing)))
     return np.where(aside > least, rarity, 0.0)
 
 
@@ -287,4 +287,4 @@ def _corridor_alignment(
     if found is None or found[1].free is None:
         return None
     against = float(_negative_evidence(views, found[1].pose[None], reach)[0])
-    return _AlignedPair(*found, _gain(earlier, newest, *found, prior), against, True)
+    return _AlignedPair(*found, _log_likelihood_ratio(earlier, newest, *found, prior), against, True)

@@ -34,7 +34,7 @@ def confirmed_log_odds(graph: PoseGraph, candidate: ClosureCandidate, others: li
         cost += max(float(other.measurement.grid.at(np.zeros((1, 2)))[0]), 0.0)
         position = transform_points(graph.poses[other.earlier], other.position)
         if min(np.linalg.norm(position - one) for one in positions) > SETTINGS.same_place:
-            nats[alternatives.is_copy] += np.log(SETTINGS.copy_probability)
+            nats[alternatives.is_aliased] += np.log(SETTINGS.aliasing_probability)
             positions.append(position)
     if len(positions) == 1 and not corridors:
         return measured.log_odds

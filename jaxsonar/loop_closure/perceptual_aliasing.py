@@ -22,7 +22,7 @@ class AlternativeHypotheses(NamedTuple):
     offset: Float[np.ndarray, "alternatives 2"]
     log_weight: Float[np.ndarray, " alternatives"]
     """Log-probability up to a constant, the same as in ``ClosureMeasurement.log_weight``, nats."""
-    is_copy: Bool[np.ndarray, " alternatives"]
+    is_aliased: Bool[np.ndarray, " alternatives"]
     """Whether this is an unobserved place that looks like the known one, and not the known one itself."""
 
 
@@ -87,7 +87,7 @@ def enumerate_alternatives(
             poses[likely],
             tolerance=SETTINGS.grid_tolerance,
             reach=reach,
-            limit=SETTINGS.max_odds,
+            limit=SETTINGS.max_log_odds,
         )
     grid = PenaltyGrid(offset[0], pitch, nats.reshape(len(step), len(step)))
     return offset, density - nats + 2 * np.log(pitch), grid

@@ -11,7 +11,7 @@ from jaxsonar.geometry.se2 import diagonal_covariance, subtract_poses, wrap_pose
 from jaxsonar.loop_closure.pose_candidates import PosePrior, pose_candidates
 from jaxsonar.loop_closure.settings import SETTINGS
 from jaxsonar.loop_closure.submap import Submap
-from jaxsonar.loop_closure.submap_matching import Pairs, log_likelihood_gains, nearest_pairs, pair_residuals
+from jaxsonar.loop_closure.submap_matching import Pairs, log_likelihood_ratios, nearest_pairs, pair_residuals
 
 
 def odometry_factor(submap: Submap, number: int) -> BetweenFactor:
@@ -49,12 +49,12 @@ def sequential_factor(previous: Submap, following: Submap, number: int = 0) -> B
     if not updates:
         return alone
     # 2. The best must beat all that differ from it.
-    best = max(updates, key=lambda one: one.gain - one.chi2 / 2)
+    best = max(updates, key=lambda one: one.log_likelihood_ratio - one.chi2 / 2)
     position, heading = SETTINGS.sequential_distinct
     for one in updates:
         differs = (np.abs(subtract_poses(one.pose, best.pose)) > np.array([position, position, heading])).any()
         # Where doors repeat, fewer pairs prove nothing; the distance from the exit pose does.
-        gain = min(0.0, one.gain - SETTINGS.sequential_similarity * best.gain) - one.chi2 / 2 + best.chi2 / 2
+        gain = min(0.0, one.log_likelihood_ratio - SETTINGS.sequential_similarity * best.log_likelihood_ratio) - one.chi2 / 2 + best.chi2 / 2
         if differs and gain > -SETTINGS.sequential_margin:
             return alone
     return BetweenFactor(number, number + 1, best.pose, np.linalg.inv(best.covariance))
@@ -65,7 +65,7 @@ class _Update(NamedTuple):
 
     pose: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"]
-    gain: float
+    log_likelihood_ratio: float
     """Log-likelihood ratio of the pairs against chance if their residuals were zero, nats."""
     chi2: float
 
@@ -77,7 +77,7 @@ def _update_from(previous: Submap, following: Submap, pose: Float[np.ndarray, "3
     while len(pairs) >= fewest:
         found, cov, chi2, share = _kalman_update(previous, following, pairs)
         if chi2 <= chdtri(2 * len(pairs), SETTINGS.compatibility_probability):
-            gain = float(log_likelihood_gains(previous, following, pairs, found).sum())
+            gain = float(log_likelihood_ratios(previous, following, pairs, found).sum())
             return _Update(found, cov, gain, chi2)
         pairs = pairs.without(int(share.argmax()))
     return None

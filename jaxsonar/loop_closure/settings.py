@@ -50,7 +50,7 @@ class LoopClosureSettings:
     """Pairs are jointly incompatible if their chi-square is less probable."""
     parallel_angle: float = float(np.radians(10.0))
     """Walls that differ by less in direction do not determine the position along them, radians."""
-    max_pair_gain: float = 4.0
+    max_pair_log_likelihood_ratio: float = 4.0
     """Bound of the log-likelihood ratio of one pair, nats."""
     fit_steps: int = 8
     """Maximum number of Gauss-Newton steps of a fit."""
@@ -76,7 +76,7 @@ class LoopClosureSettings:
     """Covariance inflation: standard deviations of the prior are taken this much larger than estimated."""
     rough_pose_sd: tuple[float, float] = (0.04, float(np.radians(1.5)))
     """Standard deviations of a pose candidate: position (m), heading (rad)."""
-    min_gain: float = 8.0
+    min_log_likelihood_ratio: float = 8.0
     """Log-likelihood ratio by which the pairs must beat chance, nats."""
     min_pairs: int = 4
     """Minimum number of pairs."""
@@ -102,11 +102,11 @@ class LoopClosureSettings:
     """Walls of one corridor differ by less in direction."""
 
     # Perceptual aliasing
-    copy_probability: float = 0.3
+    aliasing_probability: float = 0.3
     """Probability that another place looks like a given one."""
-    copy_spacing: float = 5.0
+    aliasing_spacing: float = 5.0
     """Distance between such places, metres."""
-    max_odds: float = 9.0
+    max_log_odds: float = 9.0
     """Bound of the log-odds of a closure, nats: the robot may have slipped without notice."""
     grid_step: float = 0.4
     """Smallest pitch of the grid of alternative positions, metres."""
@@ -124,7 +124,7 @@ class LoopClosureSettings:
     """Number of positions on the trajectory of a submap that serve as viewpoints."""
     min_scans: int = 3
     """Number of scans that must have observed a reflector before its absence counts."""
-    blocked_path_nats: float = 6.0
+    blocked_trajectory_nats: float = 6.0
     """Evidence against a wall across the trajectory, nats."""
     blocked_sight_nats: float = 3.0
     """Evidence against a wall in a line of sight, nats."""
@@ -156,15 +156,15 @@ class LoopClosureSettings:
     """An accepted closure is withdrawn if its chi-square in the graph is less probable."""
     max_withdrawal_trials: int = 4
     """Number of closures with the largest chi-square whose removal is tried."""
-    acceptance_odds: float = 6.9
+    acceptance_log_odds: float = 6.9
     """Log-odds at which a single closure is accepted, nats (1000:1)."""
-    confirmed_odds: float = 5.3
+    confirmed_log_odds: float = 5.3
     """Log-odds at which a closure is accepted if others confirm it, nats (200:1)."""
     prediction_sd: float = 0.15
     """A closure confirms another one only if it predicts its position with this standard deviation, metres."""
     same_place: float = 3.0
     """Closures whose reflectors are nearer to each other concern one place and may share one aliasing error, metres."""
-    max_open: int = 16
+    max_undecided: int = 16
     """Number of the latest undecided candidates that are reconsidered."""
 
 

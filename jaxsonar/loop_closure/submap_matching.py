@@ -93,7 +93,7 @@ def pair_residuals(
     return PairResiduals(residual, found.by_transform, found.by_parameters)
 
 
-def log_likelihood_gains(
+def log_likelihood_ratios(
     earlier: Submap, newest: Submap, pairs: Pairs, pose: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, " pairs"]:
     """Log-likelihood ratio of each pair against chance, nats, if its residual were zero."""
@@ -103,7 +103,7 @@ def log_likelihood_gains(
     wall = np.log(2 * FEATURE_SETTINGS.wall_offset_range) - np.log(2 * np.pi * cov[:, 0, 0]) / 2
     point = np.log(FEATURE_SETTINGS.point_area / (2 * np.pi)) - np.linalg.slogdet(cov)[1] / 2
     is_wall = newest.landmarks.kind[pairs.newest] == kernels.PLANE
-    return np.minimum(np.where(is_wall, wall, FEATURE_SETTINGS.point_weight * point), SETTINGS.max_pair_gain)
+    return np.minimum(np.where(is_wall, wall, FEATURE_SETTINGS.point_weight * point), SETTINGS.max_pair_log_likelihood_ratio)
 
 
 def nearest_pairs(

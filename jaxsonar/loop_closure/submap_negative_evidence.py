@@ -82,26 +82,26 @@ def _one_sided(
     if not len(walls.theta):
         return np.zeros(len(poses))
     # 1. Walls across the trajectory and across lines of sight.
-    path, start, end = (_transform(poses, part) for part in (viewer.viewpoint, viewer.sight_start, viewer.sight_end))
-    blocked_path = _crosses(other, path[:, :-1], path[:, 1:], tolerance).any(axis=1).sum(-1)
+    viewpoint, start, end = (_transform(poses, part) for part in (viewer.viewpoint, viewer.sight_start, viewer.sight_end))
+    blocked_trajectory = _crosses(other, viewpoint[:, :-1], viewpoint[:, 1:], tolerance).any(axis=1).sum(-1)
     blocked_sight = _crosses(other, start, end, tolerance).any(axis=-1).sum(-1)
-    nats = SETTINGS.blocked_path_nats * blocked_path + SETTINGS.blocked_sight_nats * blocked_sight
+    nats = SETTINGS.blocked_trajectory_nats * blocked_trajectory + SETTINGS.blocked_sight_nats * blocked_sight
     # 2. Missed walls: they face a viewpoint, are near, not hidden, and not among the viewer's own walls.
-    offset = path[:, :, None] - walls.reference
+    offset = viewpoint[:, :, None] - walls.reference
     along, distance = (offset * walls.tangent).sum(-1), -(offset * walls.normal).sum(-1)
     due = (distance > SETTINGS.min_range) & (distance < reach) & other.is_certain
     due &= np.abs(along) < walls.half_length - SETTINGS.end_margin
     due &= ~_has_wall(viewer, other, poses, tolerance)[:, None]
-    foot = path[:, :, None] + 0.9 * distance[..., None] * walls.normal
-    nats += _missed_nats(viewer, other, back, path, foot, due).sum(-1)
+    foot = viewpoint[:, :, None] + 0.9 * distance[..., None] * walls.normal
+    nats += _missed_nats(viewer, other, back, viewpoint, foot, due).sum(-1)
     # 3. Missed points.
-    offset = walls.point - path[:, :, None]
+    offset = walls.point - viewpoint[:, :, None]
     distance = np.linalg.norm(offset, axis=-1)
     due = (distance > SETTINGS.min_range) & (distance < reach) & (other.point_factor > 0)
     own = _transform(poses, viewer.features.point)
     nearest = np.linalg.norm(own[:, :, None] - walls.point, axis=-1).min(axis=1, initial=np.inf)
     due &= ~(nearest < tolerance + 0.1)[:, None]
-    missed = _missed_nats(viewer, other, back, path, path[:, :, None] + 0.9 * offset, due)
+    missed = _missed_nats(viewer, other, back, viewpoint, viewpoint[:, :, None] + 0.9 * offset, due)
     return nats + (other.point_factor * missed).sum(-1)
 
 
@@ -109,14 +109,14 @@ def _missed_nats(
     viewer: SubmapView,
     other: SubmapView,
     back: Float[np.ndarray, "poses 3"],
-    path: Float[np.ndarray, "poses viewpoints 2"],
+    viewpoint: Float[np.ndarray, "poses viewpoints 2"],
     target: Float[np.ndarray, "poses viewpoints reflectors 2"],
     due: Bool[np.ndarray, "poses viewpoints reflectors"],
 ) -> Float[np.ndarray, "poses reflectors"]:
     """Negative evidence of reflectors that are due from viewpoints, unless a wall of either submap hides them."""
     pose, view, which = np.nonzero(due)
     if len(pose):
-        at, end = path[pose, view], target[pose, view, which]
+        at, end = viewpoint[pose, view], target[pose, view, which]
         hidden = _crosses(other, at[:, None], end[:, None], 0.0).any(axis=(1, 2))
         away = back[pose]
         own = [rotate(part, away[:, 2]) + away[:, :2] for part in (at, end)]

@@ -77,26 +77,26 @@ class ClosureVerifier:
         # 2. Accept it if its odds suffice; it may confirm other candidates, too.
         before = len(self.accepted)
         self._accept_if_sure(graph, submap, number, chi2)
-        for other in self._open:
+        for other in self._undecided:
             if other != number:
                 self._accept_if_sure(graph, submap, other, innovation_chi2(graph, self.candidates[other]))
         return len(self.accepted) > before
 
     @property
-    def _open(self) -> list[int]:
+    def _undecided(self) -> list[int]:
         """The latest undecided candidates."""
-        return [number for number, one in enumerate(self.candidates) if one.state == PROPOSED][-SETTINGS.max_open :]
+        return [number for number, one in enumerate(self.candidates) if one.state == PROPOSED][-SETTINGS.max_undecided :]
 
     def _accept_if_sure(self, graph: PoseGraph, submap: int, number: int, chi2: float) -> None:
         candidate = self.candidates[number]
-        log_odds, least = candidate.measurement.log_odds, SETTINGS.acceptance_odds
+        log_odds, least = candidate.measurement.log_odds, SETTINGS.acceptance_log_odds
         if log_odds < least:
             # Closures that are in the graph have narrowed the prior already; they do not count again.
             used = {id(factor.information) for factor in graph.factors}
-            others = [self.candidates[other] for other in self._open]
+            others = [self.candidates[other] for other in self._undecided]
             others += [one for one in self.accepted if id(one.measurement.information) not in used]
             together = confirmed_log_odds(graph, candidate, others)
-            least = least if together == log_odds else SETTINGS.confirmed_odds
+            least = least if together == log_odds else SETTINGS.confirmed_log_odds
             log_odds = together
         if log_odds >= least:
             self._decide(submap, number, ACCEPTED, log_odds, chi2)

@@ -80,4 +80,4 @@ class OdometryOutliers:
     ) -> Bool[np.ndarray, " pairs"]:
         """Whether an outlier lies between two scans that are not far apart."""
         crossed = np.searchsorted(self.steps, last) > np.searchsorted(self.steps, first)
-        return crossed & (last - first <= SETTINGS.outlier_reach)
+        return crossed & (last - first <= SETTINGS.max_split_distance)

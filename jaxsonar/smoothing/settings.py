@@ -56,12 +56,12 @@ class SmoothingSettings:
     """Expected number of steps of a run that are outliers by chance."""
     outlier_steps: int = 2
     """Largest number of consecutive steps that are tested together: a scan with a wrong pose changes two steps."""
-    outlier_reach: int = 40
+    max_split_distance: int = 40
     """Scans beyond an outlier whose points are split. Later the robot may have returned, and the odometry does not
     decide whether a point is the same."""
     max_outlier_rounds: int = 2
     """Largest number of repetitions with split points."""
-    min_growth: float = 1.005
+    min_decrease: float = 1.005
     """Factor by which the number of explained echoes must decrease to count as fewer."""
 
     # Covisibility

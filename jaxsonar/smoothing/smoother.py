@@ -92,7 +92,7 @@ class Smoother:
             self.progress("splitting points at odometry outliers")
             again = self._fit(np.where(has_pose(fit.poses)[:, None], poses, np.nan), split)
             remaining = np.setdiff1d(self._odometry_outliers(again), split)
-            explains_less = again.explained_count * SETTINGS.min_growth < fit.explained_count
+            explains_less = again.explained_count * SETTINGS.min_decrease < fit.explained_count
             if len(remaining) >= len(outliers) or explains_less:
                 break
             fit, outliers, split = again, remaining, np.union1d(split, remaining)
@@ -193,7 +193,7 @@ class Smoother:
             segments = self.traversals.visibility_mask(world, self._row_of_scan)
             mask &= segments[self.traversals.segment_id]
         rows = data.scan_rows[0]
-        visible = np.zeros((len(data.poses), len(landmark_map.world)), dtype=bool)
+        visible = np.zeros((len(data.poses), len(landmark_map.map_index)), dtype=bool)
         visible[: len(rows), : mask.shape[1]] = mask[rows]
         return landmark_map._replace(visible=visible)
 

@@ -184,9 +184,9 @@ def fake(scene, off):
     closures = [
         LoopClosure(1, 9, right + off, state, np.eye(3))
         for off, state in (
-            (np.array([0.02, 0, 0]), "counted"),
-            (np.array([0.5, 0, 0]), "counted"),
-            (np.array([0, 0, np.pi / 2]), "counted"),
+            (np.array([0.02, 0, 0]), "accepted"),
+            (np.array([0.5, 0, 0]), "accepted"),
+            (np.array([0, 0, np.pi / 2]), "accepted"),
             (np.array([0.5, 0, 0]), "withdrawn"),
             (np.zeros(3), "proposed"),
         )
@@ -240,7 +240,7 @@ def test_wrong_closures_contradict_the_truth_in_the_directions_that_they_determi
     right = relative(poses[0], poses[1])
 
     def wrong(off, determined):
-        return slam.wrong(poses, LoopClosure(0, 1, right + off, "counted", determined))
+        return slam.wrong(poses, LoopClosure(0, 1, right + off, "accepted", determined))
 
     whole, along_x = np.eye(3), np.eye(3)[:, 1:]  # walls along x do not determine x
     assert not wrong([0.1, 0.1, 0.1], whole)

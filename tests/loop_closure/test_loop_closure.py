@@ -63,7 +63,7 @@ def test_after_little_drift_a_closure_needs_no_confirmation():
     for seed in range(5):
         earlier, newest, _, prior, cov = two(NICHE, FIRST, SECOND, seed, 0.1)
         found = detect_closure(newest, earlier, prior, cov)
-        sure += found is not None and found.log_odds > SETTINGS.acceptance_odds
+        sure += found is not None and found.log_odds > SETTINGS.acceptance_log_odds
     assert sure >= 4
 
 
@@ -74,7 +74,7 @@ def test_a_similar_room_is_not_accepted(sigma):
     for seed in range(3):
         earlier, newest, _, prior, cov = two(TWINS, first, first + np.array([4.6, 0, 0]), seed, sigma)
         found = detect_closure(newest, earlier, prior, cov)
-        assert found is None or found.log_odds < SETTINGS.acceptance_odds - 2
+        assert found is None or found.log_odds < SETTINGS.acceptance_log_odds - 2
 
 
 def test_a_similar_room_is_not_accepted_where_drift_moves_it_onto_the_known_one():
@@ -82,7 +82,7 @@ def test_a_similar_room_is_not_accepted_where_drift_moves_it_onto_the_known_one(
     for seed in range(4):
         earlier, newest, _, _, cov = two(TWINS, first, first + np.array([4.6, 0, 0]), seed, 2.0)
         found = detect_closure(newest, earlier, np.zeros(3), cov)
-        assert found is None or found.log_odds < SETTINGS.acceptance_odds - 2
+        assert found is None or found.log_odds < SETTINGS.acceptance_log_odds - 2
 
 
 def test_a_rectangle_is_not_rotated_by_half_a_turn():
@@ -95,7 +95,7 @@ def test_a_rectangle_is_not_rotated_by_half_a_turn():
             assert np.abs(off_by(found, true)[0]).max() < 0.1
         # If every heading is possible, the pose is ambiguous.
         found = detect_closure(newest, earlier, compose(true, np.array([0.0, 0.0, 1.5])), np.diag([1.0, 1.0, 9.0]))
-        assert found is None or found.log_odds < SETTINGS.acceptance_odds
+        assert found is None or found.log_odds < SETTINGS.acceptance_log_odds
         earlier, newest, true, prior, cov = two(outline, FIRST, there, seed, 0.3)
         found = detect_closure(newest, earlier, prior, cov)
         assert found is None or np.abs(off_by(found, true)[0]).max() < 0.1
@@ -107,7 +107,7 @@ def test_repeating_doors_are_not_accepted_wrongly():
         second = drive((9.2 + shift, 0.8), (5.9 + shift, 0.8))
         earlier, newest, _, prior, cov = two(DOORS, drive((5.0, 0.9), (8.5, 0.9)), second, seed, 0.8)
         found = detect_closure(newest, earlier, prior, cov)
-        assert found is None or found.free is not None or found.log_odds < SETTINGS.acceptance_odds
+        assert found is None or found.free is not None or found.log_odds < SETTINGS.acceptance_log_odds
 
 
 def test_parallel_walls_leave_the_direction_along_them_undetermined():

@@ -79,7 +79,7 @@ def test_candidates_are_limited_to_visible_landmarks(world):
     poses, here = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.zeros(2, dtype=np.int64)
     both = landmark_map.candidates_in_range(poses, here, 2.0)
     assert all(set(row[row >= 0].tolist()) == {0, 1, 2, 3} for row in both)
-    mask = np.zeros((2, len(landmark_map.world)), dtype=bool)
+    mask = np.zeros((2, len(landmark_map.map_index)), dtype=bool)
     mask[0, [0, 2]] = mask[1, [1, 3]] = True
     own = landmark_map._replace(visible=mask).candidates_in_range(poses, here, 2.0)
     assert [set(row[row >= 0].tolist()) for row in own] == [{0, 2}, {1, 3}]
