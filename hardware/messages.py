@@ -11,12 +11,10 @@ ECHO = np.dtype(
 """One echo as in a frame: 14 bytes, packed.
 
 ``tx`` is the transmitter, ``rx`` the receiver. ``echo`` numbers the echoes of this path from 0, nearest first.
-``flags`` is a bit set, see ``FLAGS``. ``time_us`` is the two-way time of flight, microseconds. ``amplitude`` is in the
-device's own unit, NaN if it is not measured. A path without an echo has no record.
+``flags`` is a bit set: 1 is ring-down, 2 is saturated; other bits are 0 and ignored. ``time_us`` is the
+two-way time of flight, microseconds. ``amplitude`` is in the device's own unit, NaN if it is not measured. A path
+without an echo has no record.
 """
-
-FLAGS = {"ring_down": 1, "saturated": 2}
-"""Bits of ``flags`` of an echo. All other bits are 0 and ignored."""
 
 
 @dataclass(frozen=True, eq=False)

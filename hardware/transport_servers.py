@@ -65,7 +65,7 @@ class Sink(ABC):
         """
 
     @abstractmethod
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """Drop the client abruptly, like an unplugged cable. The next client can connect at the same URL."""
 
     @abstractmethod
@@ -125,7 +125,7 @@ class TcpSink(Sink):
             self._client.close()
             self._client = None
 
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """See ``Sink``."""
         if self._client is not None:
             self._client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # RST, not FIN
@@ -205,7 +205,7 @@ class UdpSink(Sink):
                 return True
         return False
 
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """See ``Sink``."""
         self._client = None
 
@@ -217,7 +217,7 @@ class UdpSink(Sink):
 class PtySink(Sink):
     """The device end of a pty. The client end is in raw mode, so that bytes pass unchanged.
 
-    With ``pty:PATH``, PATH is a symbolic link to the client end. It stays valid after ``hang_up``.
+    With ``pty:PATH``, PATH is a symbolic link to the client end. It stays valid after ``disconnect``.
     """
 
     def __init__(self, url: Url):
@@ -287,7 +287,7 @@ class PtySink(Sink):
                 self._client = False
         return not remaining
 
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """See ``Sink``."""
         self._close_pty()
         self._client = False

@@ -11,6 +11,8 @@ Modules, in the order of the data:
 - ``focus_measure``, ``beam_pattern``: ring parameters without landmarks, and the detection cones of the sensors.
 - ``planar_geometry``: vectors, poses and lines. ``shape_buckets``: sizes of padded arrays.
 
+Kernels that have a slow NumPy oracle in ``tests/support/oracles.py`` name it in their docstrings.
+
 Design decisions:
 
 - The parameter space of lines has two seams: theta wraps, and (-rho, theta) is (rho, theta + pi). Low pass, soft

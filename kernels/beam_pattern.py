@@ -47,7 +47,7 @@ def off_axis_angles(
     landmarks: Landmarks,
     candidates: CandidateReflections,
     poses: Float[Array, "scans 3"],
-    world: Int[Array, " scans"],
+    map_index: Int[Array, " scans"],
 ) -> Float[Array, "scans candidates sensors"]:
     """Direction of arrival of every sensor's direct echo of every candidate, from its heading, radians.
 
@@ -59,23 +59,23 @@ def off_axis_angles(
         landmarks: of all maps.
         candidates: reflections at these landmarks.
         poses: world_from_robot of the scans, metres and radians.
-        world: the map in which each scan was taken.
+        map_index: index of the map in which each scan was taken.
     """
     count = sensors.heading.shape[0]
     paths = jax.tree.map(lambda leaf: leaf[:count], echo_paths(sensors))
     wide = eqx.tree_at(lambda p: p.cone, paths, jnp.full_like(paths.cone, 2))  # half the plane
 
-    def one_echo(pose, scan_world, reflection, candidate_world, first, second, path):
+    def one_echo(pose, map_of_scan, reflection, map_of_candidate, first, second, path):
         distance, visibility, arrival = predict_reflection(pose, reflection, first, second, path)
         angle = signed_angle(path.axes[0], arrival)
-        exists = (visibility > 0) & (distance < sensors.max_range) & (scan_world == candidate_world)
+        exists = (visibility > 0) & (distance < sensors.max_range) & (map_of_scan == map_of_candidate)
         return jnp.where(exists, angle, jnp.nan)
 
     first, second = landmarks.take(candidates.reflection.first), landmarks.take(candidates.reflection.second)
     each = jax.vmap(one_echo, in_axes=(None, None, None, None, None, None, 0))
     each = jax.vmap(each, in_axes=(None, None, 0, 0, 0, 0, None))
     each = jax.vmap(each, in_axes=(0, 0, None, None, None, None, None))
-    return each(poses, world, candidates.reflection, candidates.world, first, second, wide)
+    return each(poses, map_index, candidates.reflection, candidates.map_index, first, second, wide)
 
 
 def beam_negative_log_likelihood(

@@ -16,8 +16,8 @@ class CandidateReflections(eqx.Module):
 
     reflection: Reflection
     """(candidates,) kind and landmarks of each reflection; kind -1 for unused rows."""
-    world: Int[AnyArray, " candidates"]
-    """The map that each reflection belongs to; -1 for unused rows."""
+    map_index: Int[AnyArray, " candidates"]
+    """Index of the map that each reflection belongs to; -1 for unused rows."""
     group: Int[AnyArray, " candidates"]
     """Candidates of one group do not compete with each other: second order reflections at two walls in either order."""
 
@@ -40,7 +40,7 @@ def associate(
     landmarks: Landmarks,
     candidates: CandidateReflections,
     poses: Float[Array, "scans 3"],
-    world: Int[Array, " scans"],
+    map_index: Int[Array, " scans"],
     path: Int[Array, "scans echoes"],
     reported: Float[Array, "scans echoes"],
     near: Int[Array, "scans near"],
@@ -52,7 +52,7 @@ def associate(
         landmarks: of all maps.
         candidates: reflections at these landmarks.
         poses: world_from_robot of the scans, metres and radians.
-        world: the map in which each scan was taken.
+        map_index: index of the map in which each scan was taken.
         path: row of the ring's ``paths`` of each echo.
         reported: half path lengths as reported, metres; NaN where there is no echo.
         near: rows of the candidates that each scan may receive; -1 for unused entries.
@@ -68,15 +68,15 @@ def associate(
     each_candidate = jax.vmap(each_path, in_axes=(None, 0, 0, 0, None))
 
     def associate_scan(scan):
-        pose, scan_world, path, reported, near = scan
+        pose, map_of_scan, path, reported, near = scan
         # Expected ranges of all candidates on the path of each echo.
         echo_path = jax.tree.map(lambda leaf: leaf[path], paths)
-        reflection, world, group = jax.tree.map(
-            lambda leaf: leaf[jnp.maximum(near, 0)], (candidates.reflection, candidates.world, candidates.group)
+        reflection, map_of_candidate, group = jax.tree.map(
+            lambda leaf: leaf[jnp.maximum(near, 0)], (candidates.reflection, candidates.map_index, candidates.group)
         )
         first, second = landmarks.take(reflection.first), landmarks.take(reflection.second)
         expected = each_candidate(pose, reflection, first, second, echo_path)
-        expected = jnp.where(((world == scan_world) & (near >= 0))[:, None], expected, jnp.inf)
+        expected = jnp.where(((map_of_candidate == map_of_scan) & (near >= 0))[:, None], expected, jnp.inf)
         # The nearest one.
         distance = jnp.abs(reported[None] - expected)  # (near, echoes)
         distance = jnp.where(jnp.isfinite(distance), distance, jnp.inf)
@@ -89,4 +89,4 @@ def associate(
         competitor_gap = jnp.where(competes, gap, jnp.inf).min(axis=0)
         return jnp.where(found, near[best], -1), jnp.where(found, reported - nearest, jnp.inf), competitor_gap
 
-    return EchoAssociation(*jax.lax.map(associate_scan, (poses, world, path, reported, near)))
+    return EchoAssociation(*jax.lax.map(associate_scan, (poses, map_index, path, reported, near)))

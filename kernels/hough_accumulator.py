@@ -100,6 +100,8 @@ def cell_of(
     """Flat index row * rho_cells + column of each line's cell, from its distance (any sign) and its row.
 
     Lines that do not exist and lines beyond the accumulator get the index one past the last cell.
+
+    Oracle: ``cell`` of tests/support/oracles.py.
     """
     turned = row + settings.theta_cells // 2  # (-rho, theta) is (rho, theta + pi)
     turned = jnp.where(turned < settings.theta_cells, turned, turned - settings.theta_cells)
@@ -111,7 +113,10 @@ def cell_of(
 
 
 def accumulate(cells: Int[Array, "*lines"], settings: HoughSettings) -> Int[Array, "theta rho"]:
-    """Number of points in each cell. The votes are integers, so that their order and the device do not matter."""
+    """Number of points in each cell. The votes are integers, so that their order and the device do not matter.
+
+    Oracle: ``accumulate`` of tests/support/oracles.py.
+    """
     votes = jnp.zeros(settings.cells + 1, jnp.int32).at[cells.ravel()].add(1, mode="promise_in_bounds")
     return votes[:-1].reshape(settings.theta_cells, settings.rho_cells)
 
@@ -147,7 +152,10 @@ def soft_accumulate(
 
 
 def lowpass(votes: Num[Array, "theta rho"], settings: HoughSettings) -> Float[Array, "theta rho"]:
-    """Two-dimensional low pass across both seams (paper, section 4); beyond the last column there are no votes."""
+    """Two-dimensional low pass across both seams (paper, section 4); beyond the last column there are no votes.
+
+    Oracle: ``lowpass`` of tests/support/oracles.py.
+    """
     taps = (np.asarray(settings.smoothing) / np.sum(settings.smoothing)).tolist()
     half, (rows, columns) = len(taps) // 2, votes.shape
     smooth = jnp.asarray(votes, jnp.float32)
@@ -169,6 +177,8 @@ def extend_across_seams(cells: Float[Array, "theta rho"], width: int) -> Float[A
     """An accumulator with this many more cells on every side: neighbors across both seams; 0 beyond the last column.
 
     It is one array in memory, so that XLA compiles an operation on neighborhoods to one loop.
+
+    Oracle: ``cell_across_seams`` of tests/support/oracles.py.
     """
     rows, columns = cells.shape
     before = _before(cells, width)
@@ -183,6 +193,8 @@ def full_wall_votes(paths: EchoPaths, settings: HoughSettings) -> Float[Array, "
 
     It is the number of paths that receive the wall times the number of points that an arc has in one cell. So the
     threshold depends neither on the point pitch nor on the ring.
+
+    Oracle: ``full_wall_votes`` of tests/support/oracles.py.
     """
     return votes_of_paths(full_wall_paths(paths), settings)
 

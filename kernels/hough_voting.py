@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from . import hough_accumulator as hough
+from . import hough_accumulator
 from . import isorange_arcs as arcs
 from .hough_accumulator import HoughSettings
 from .measurement_model import corrected_range
@@ -76,11 +76,11 @@ def ring_arcs(sensors: SensorArray, *, settings: HoughSettings, points: int) -> 
     return RingArcs(
         paths=paths,
         arcs=arcs_of_paths,
-        theta_rows=hough.theta_row(arcs_of_paths.theta, settings),
-        vote_threshold=settings.threshold * hough.full_wall_votes(paths, settings),
+        theta_rows=hough_accumulator.theta_row(arcs_of_paths.theta, settings),
+        vote_threshold=settings.threshold * hough_accumulator.full_wall_votes(paths, settings),
         range_scale=sensors.range_scale,
         max_range=sensors.max_range,
-        full_wall_paths=hough.full_wall_paths(paths),
+        full_wall_paths=hough_accumulator.full_wall_paths(paths),
     )
 
 
@@ -96,7 +96,7 @@ def transform_arcs(ring: RingArcs, pose: Float[Array, "paths 3"], *, settings: H
     paths = jax.vmap(transform_path)(ring.paths, pose)
     points = ring.arcs.theta.shape[-1]
     arcs_of_paths = jax.vmap(partial(arcs.arc, pitch=settings.point_pitch, points=points))(paths)
-    rows = hough.theta_row(arcs_of_paths.theta, settings)
+    rows = hough_accumulator.theta_row(arcs_of_paths.theta, settings)
     return eqx.tree_at(lambda r: (r.paths, r.arcs, r.theta_rows), ring, (paths, arcs_of_paths, rows))
 
 
@@ -115,11 +115,14 @@ class TangentLines(eqx.Module):
     normal_y: Float[Array, "*arcs points"]
     """Sines of the normals."""
     cell: Int[Array, "*arcs points"]
-    """Cells of the accumulator (``hough.cell_of``)."""
+    """Cells of the accumulator (``hough_accumulator.cell_of``)."""
 
 
 def tangent_lines(ring: RingArcs, echoes: PackedEchoes, settings: HoughSettings) -> TangentLines:
-    """Tangent line at every point of every echo's arc, for ONE scan or several scans gathered in one frame."""
+    """Tangent line at every point of every echo's arc, for ONE scan or several scans gathered in one frame.
+
+    Oracle: ``tangent_lines_in_frame`` of tests/support/oracles.py.
+    """
 
     def one_arc(arc: arcs.Arc, row: Int[Array, " points"], path: Int[Array, ""], echo: Int[Array, ""]) -> TangentLines:
         offset = ring.paths.range_offset[path]
@@ -131,8 +134,8 @@ def tangent_lines(ring: RingArcs, echoes: PackedEchoes, settings: HoughSettings)
             cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
             normal_x, normal_y = cosine * normal_x - sine * normal_y, sine * normal_x + cosine * normal_y
             rho = rho + pose[0] * normal_x + pose[1] * normal_y
-            row = hough.theta_row(arc.theta + pose[2], settings)
-        return TangentLines(rho, normal_x, normal_y, hough.cell_of(rho, row, exists, settings))
+            row = hough_accumulator.theta_row(arc.theta + pose[2], settings)
+        return TangentLines(rho, normal_x, normal_y, hough_accumulator.cell_of(rho, row, exists, settings))
 
     def whole_arc(echo: Int[Array, ""]) -> TangentLines:
         path = echoes.path[echo]
@@ -194,8 +197,8 @@ def vote(ring: RingArcs, echoes: PackedEchoes, *, settings: HoughSettings) -> Vo
     scan_count = jnp.ones(len(lines.cell)) if echoes.scans_per_row is None else echoes.scans_per_row
 
     def one_scan(cell: Int[Array, "arcs points"], threshold: Float[Array, ""]) -> Bool[Array, "theta rho"]:
-        votes = hough.accumulate(cell, settings)  # points per cell
-        smooth = hough.lowpass(votes, settings)  # balance between neighbor cells
+        votes = hough_accumulator.accumulate(cell, settings)  # points per cell
+        smooth = hough_accumulator.lowpass(votes, settings)  # balance between neighbor cells
         return smooth > threshold  # highly occupied cells
 
     return Votes(map_scans(one_scan, lines.cell, ring.vote_threshold * scan_count), lines.cell, lines.rho)
@@ -208,8 +211,8 @@ def accumulators(
     """Votes before and after the low pass, for plots; arguments as ``vote``."""
 
     def one_scan(scan: PackedEchoes):
-        votes = hough.accumulate(tangent_lines(ring, scan, settings).cell, settings)
-        return votes, hough.lowpass(votes, settings)
+        votes = hough_accumulator.accumulate(tangent_lines(ring, scan, settings).cell, settings)
+        return votes, hough_accumulator.lowpass(votes, settings)
 
     return map_scans(one_scan, echoes)
 
@@ -233,9 +236,9 @@ def vote_lines(
     def one_cluster(lines: tuple[Array, Array]) -> tuple[Array, Array]:
         rho, theta = lines
         known = jnp.isfinite(rho)
-        row = hough.theta_row(jnp.where(known, theta, 0), settings)
-        cell = hough.cell_of(jnp.where(known, rho, 0), row, known, settings)
-        votes = hough.accumulate(cell, settings)
-        return hough.lowpass(votes, settings) > settings.threshold, cell
+        row = hough_accumulator.theta_row(jnp.where(known, theta, 0), settings)
+        cell = hough_accumulator.cell_of(jnp.where(known, rho, 0), row, known, settings)
+        votes = hough_accumulator.accumulate(cell, settings)
+        return hough_accumulator.lowpass(votes, settings) > settings.threshold, cell
 
     return jax.lax.map(one_cluster, (rho, theta))

@@ -39,6 +39,8 @@ class Arc(eqx.Module):
 def arc(path: EchoPaths, *, pitch: float, points: int) -> Arc:
     """Equidistant points over the detection range of ONE path (paper, section 4).
 
+    Oracle: ``arc_normals`` of tests/support/oracles.py.
+
     Args:
         path: the echo path.
         pitch: nominal distance between points, radians; the detection range is divided into the nearest whole number
@@ -68,6 +70,8 @@ def tangent_rho(
     A missing echo (0 or NaN), an echo at or beyond the maximum range, and an echo shorter than the baseline, which no
     reflector can cause, have no lines.
 
+    Oracle: ``lines_of_echo`` of tests/support/oracles.py.
+
     Args:
         arc: the arc's normals and constants.
         distance: half the path length of the echo (its range), metres.
@@ -85,7 +89,10 @@ def tangent_rho(
 
 
 def arc_point(path: EchoPaths, distance: Float[Array, ""], theta: Float[Array, ""]) -> Float[Array, "2"]:
-    """Point of ONE echo's arc at which the tangent line has the normal direction theta, robot frame, metres."""
+    """Point of ONE echo's arc at which the tangent line has the normal direction theta, robot frame, metres.
+
+    Oracle: ``ellipse_tangent_rho`` of tests/support/oracles.py.
+    """
     n, t = normal(theta), tangent(theta)
     along, across = path.half_baseline @ n, path.half_baseline @ t
     height = safe_sqrt(distance * distance - across * across)

@@ -36,7 +36,7 @@ from .ml_detection_prior import alignment_ratio, plane_log_prior, point_log_prio
 from .ml_detection_settings import DetectionSettings
 from .ml_detection_state import Hypotheses, ScanData, SceneEstimate, Selection, count, determinant
 from .planar_geometry import fold_line, segment_endpoints, wrap_angle
-from .robust_fit import edge, fit_reflector, paths_and_ranges, plane, start_of_point
+from .robust_fit import edge_from_midpoint, fit_reflector, paths_and_ranges, plane_from_both_sides, start_of_point
 from .sensor_array import EchoPaths
 
 _IS_EDGE = (0.0, 1.0)  # corner, edge
@@ -191,7 +191,7 @@ def fit_hypotheses(
     initial_scale = jnp.maximum(settings.fit_initial_scale, tolerance)
     candidate = jnp.isfinite(rho)
     starts = jnp.stack([jnp.where(candidate, rho, 1), jnp.where(candidate, theta, 0)], axis=-1)
-    fit_plane = partial(fit_reflector, plane, tolerance=tolerance, initial_scale=initial_scale)
+    fit_plane = partial(fit_reflector, plane_from_both_sides, tolerance=tolerance, initial_scale=initial_scale)
     lines, scores = jax.vmap(fit_plane, in_axes=(0, None, None))(starts, paths, ranges)
     # Of candidates that converge to the same line keep the best one.
     total = jnp.where(candidate, scores.sum(axis=1), -1)
@@ -206,7 +206,7 @@ def fit_hypotheses(
     def fit_point(is_edge: Float[Array, ""], line: Float[Array, "2"], score: Float[Array, " echoes"]):
         legs = eqx.tree_at(lambda p: p.half_baseline, paths, is_edge * paths.half_baseline)
         start = start_of_point(line, paths.midpoint, score)
-        return fit_reflector(edge, start, legs, ranges, tolerance=tolerance, initial_scale=tolerance)[0]
+        return fit_reflector(edge_from_midpoint, start, legs, ranges, tolerance=tolerance, initial_scale=tolerance)[0]
 
     each_point = jax.vmap(jax.vmap(fit_point, in_axes=(None, 0, 0)), in_axes=(0, None, None))
     points = each_point(jnp.asarray(_IS_EDGE, rho.dtype), lines[best], scores[best])

@@ -47,6 +47,8 @@ def refine(
 ) -> Hypotheses:
     """Maximum likelihood of ONE reflector: each echo is weighted by its probability of coming from this reflector.
 
+    ``robust_fit.fit_reflector`` finds the start with a robust loss, without a model of clutter and misses.
+
     Args:
         scan: the echoes.
         model: measurement model of the reflector's kind.

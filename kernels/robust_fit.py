@@ -4,6 +4,10 @@ The Hough transform votes for planes only. A corner or a post is visible from ma
 of its echoes accumulate almost like those of a wall. The ranges tell them apart: the footpoint of a wall moves along
 with the sensor, a point stays where it is. The fit is Gauss-Newton with the loss of Geman and McClure, whose scale is
 reduced from step to step (graduated non-convexity), so that echoes of other reflectors lose their weight.
+
+The ranges are those of ``measurement_model``. ``registration.reflector_fit`` fits with the same loss in NumPy, because
+it fits a varying number of reflectors, which would be compiled again for every size.
+``ml_detection_likelihood.refine`` has no such loss: it weights each echo by its probability of being clutter.
 """
 
 from collections.abc import Callable
@@ -42,8 +46,8 @@ SETTINGS = RobustFitSettings()
 _MIN_HEIGHT = 1e-9  # m; avoids a division by zero if the virtual sensor is on the plane
 
 
-class ReflectorRange(NamedTuple):
-    """What ONE echo path measures of a reflector."""
+class RangeAndBearing(NamedTuple):
+    """The part of ``measurement_model.PredictedEcho`` that the fit needs: fewer arrays in its innermost loop."""
 
     range: Float[Array, ""]
     """Half the path length, metres."""
@@ -86,7 +90,7 @@ def paths_and_ranges(ring: RingArcs, echoes: PackedEchoes) -> tuple[EchoPaths, F
 
 
 def fit_reflector(
-    model: Callable[[Float[Array, "2"], EchoPaths], ReflectorRange],
+    model: Callable[[Float[Array, "2"], EchoPaths], RangeAndBearing],
     start: Float[Array, "2"],
     paths: EchoPaths,
     ranges: Float[Array, " echoes"],
@@ -97,7 +101,7 @@ def fit_reflector(
     """Robust Gauss-Newton fit of ONE reflector with two parameters to the echoes of ONE scan.
 
     Args:
-        model: ``plane``, ``corner`` or ``edge``.
+        model: ``plane_from_both_sides``, ``corner_from_midpoint`` or ``edge_from_midpoint``.
         start: first guess.
         paths: (echoes,) path of every echo, those of other reflectors included.
         ranges: corrected ranges, metres; 0 where there is no echo.
@@ -139,24 +143,27 @@ def fit_reflector(
     return x, jnp.where(visible, jnp.maximum(1 - (residual / tolerance) ** 2, 0), 0)
 
 
-def plane(line: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:
-    """A wall (rho, theta), visible from both of its sides: during a window the robot may drive past its line."""
+def plane_from_both_sides(line: Float[Array, "2"], path: EchoPaths) -> RangeAndBearing:
+    """Range of a wall (rho, theta), visible from both of its sides: in a window the robot may drive past its line.
+
+    It differs from ``measurement_model.plane_echo`` in this only.
+    """
     here = plane_coordinates(line, path.midpoint, path.half_baseline)
     height = jnp.where(jnp.abs(here.height) < _MIN_HEIGHT, _MIN_HEIGHT, here.height)
     distance, gradient, _, _ = image_source(here._replace(height=height))
-    return ReflectorRange(distance, gradient, jnp.where(height >= 0, here.normal, -here.normal))
+    return RangeAndBearing(distance, gradient, jnp.where(height >= 0, here.normal, -here.normal))
 
 
-def corner(point: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:
-    """A right-angled corner (x, y)."""
+def corner_from_midpoint(point: Float[Array, "2"], path: EchoPaths) -> RangeAndBearing:
+    """``measurement_model.corner_echo`` of a corner (x, y), with the bearing from the virtual sensor."""
     echo = corner_echo(point, path)
-    return ReflectorRange(echo.range, echo.d_range_d_landmark, echo.arrival)
+    return RangeAndBearing(echo.range, echo.d_range_d_landmark, echo.arrival)
 
 
-def edge(point: Float[Array, "2"], path: EchoPaths) -> ReflectorRange:
-    """An edge or a thin pole (x, y)."""
+def edge_from_midpoint(point: Float[Array, "2"], path: EchoPaths) -> RangeAndBearing:
+    """``measurement_model.edge_echo`` of an edge (x, y), with the bearing from the virtual sensor."""
     echo = edge_echo(point, path)
-    return ReflectorRange(echo.range, echo.d_range_d_landmark, length_and_direction(point - path.midpoint)[1])
+    return RangeAndBearing(echo.range, echo.d_range_d_landmark, length_and_direction(point - path.midpoint)[1])
 
 
 def start_of_point(
@@ -191,10 +198,13 @@ def fit_candidates(
         paths, ranges = paths_and_ranges(ring, scan)
 
         def one_candidate(rho: Float[Array, ""], theta: Float[Array, ""]) -> CandidateFits:
-            line, score = fit_reflector(plane, jnp.stack([rho, theta]), paths, ranges, tolerance=tolerance)
+            line, score = fit_reflector(
+                plane_from_both_sides, jnp.stack([rho, theta]), paths, ranges, tolerance=tolerance
+            )
             start = start_of_point(line, paths.midpoint, score)
             points = [
-                fit_reflector(model, start, paths, ranges, tolerance=tolerance)[1].sum() for model in (corner, edge)
+                fit_reflector(model, start, paths, ranges, tolerance=tolerance)[1].sum()
+                for model in (corner_from_midpoint, edge_from_midpoint)
             ]
             rho, theta = fold_line(line[0], line[1])
             footpoint = paths.midpoint @ tangent(theta)

@@ -74,7 +74,10 @@ def transform_path(path: EchoPaths, pose: Float[Array, "3"]) -> EchoPaths:
 
 @jax.jit
 def echo_paths(sensors: SensorArray) -> EchoPaths:
-    """Geometry of every echo path of a ring, in the order of ``sensors.tx``."""
+    """Geometry of every echo path of a ring, in the order of ``sensors.tx``.
+
+    Oracle: ``receives`` of tests/support/oracles.py.
+    """
 
     def one_path(tx: Int[Array, ""], rx: Int[Array, ""]) -> EchoPaths:
         # The echo of a plane reaches rx only from a direction in both cones: intersect them, relative to tx.

@@ -177,15 +177,6 @@ def _check_versions(client: Any) -> None:
         raise SonarError(f"a worker of the cluster: {reason(failure)}; needed is {here} on each") from None
 
 
-def check_dask() -> None:
-    """Check that Dask is installed.
-
-    Raises:
-        SonarError: the extra is missing.
-    """
-    _import_dask()
-
-
 def _import_dask() -> tuple[Any, Any]:
     try:
         import dask

@@ -104,8 +104,8 @@ def _observations(ring: Ring, data: BatchData, found: AdjustmentResult) -> _Obse
     """
     landmark_map = found.state.landmark_map
     landmarks, candidates = (jax.tree.map(jnp.asarray, x) for x in (landmark_map.landmarks, landmark_map.candidates))
-    poses, world = jnp.asarray(found.state.poses), jnp.asarray(data.world)
-    angle = np.asarray(kernels.off_axis_angles(ring.sensors, landmarks, candidates, poses, world))
+    poses, map_index = jnp.asarray(found.state.poses), jnp.asarray(data.map_index)
+    angle = np.asarray(kernels.off_axis_angles(ring.sensors, landmarks, candidates, poses, map_index))
     detected = np.zeros(angle.shape, dtype=bool)
     scan, echo = np.nonzero(found.used & (data.path < ring.count))
     detected[scan, found.candidate[scan, echo], data.path[scan, echo]] = True

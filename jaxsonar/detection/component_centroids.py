@@ -72,6 +72,8 @@ def mean_lines(
 ) -> tuple[Float[np.ndarray, " components"], Float[np.ndarray, " components"], Int[np.ndarray, " components"]]:
     """Mean line of each component from partial sums over its points; the mean of theta is circular.
 
+    Oracle: ``mean_line`` of tests/support/oracles.py.
+
     Args:
         component: component of each partial sum.
         points: number of points of each partial sum.

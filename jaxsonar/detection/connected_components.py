@@ -13,6 +13,8 @@ def label_components(
     The first and the last row are neighbors, because theta is periodic. Cells of the first column are neighbors of
     those half a turn away, because (-rho, theta) is the line (rho, theta + pi).
 
+    Oracle: ``components`` of tests/support/oracles.py.
+
     Args:
         occupied: highly occupied cells, rows theta, columns rho.
 

@@ -69,6 +69,8 @@ def hough_detections(
 ) -> Iterator[HoughBatch]:
     """Lines of every scan by the algorithm of the paper's section 4, batch by batch.
 
+    Oracle: ``hough_lines`` of tests/support/oracles.py.
+
     Args:
         ring: the sensors.
         echoes: echoes of scans or of windows.

@@ -25,7 +25,7 @@ SETTINGS = AlternationSettings()
 
 
 class AlternationResult(NamedTuple):
-    """Maps, one per world, and the adjustment of their landmarks."""
+    """Maps, one for each ``map_index``, and the adjustment of their landmarks."""
 
     maps: list[GlobalMap]
     adjustment: AdjustmentResult
@@ -51,12 +51,12 @@ def alternate(
 
     Args:
         state: initial values; its landmarks are ignored.
-        build_maps: the maps at a state, one per world.
+        build_maps: the maps at a state, one for each ``map_index``.
         adjust: adjusts a state, with this initial scale of the robust loss (metres).
         initial_scale: that scale for the first map.
         progress: called with a description of each step.
         max_maps: maps that are built at most.
-        landmarks_of: the landmarks of maps; by default every scan of a world may observe all of its landmarks.
+        landmarks_of: the landmarks of maps; by default every scan may observe all landmarks of its map.
         settings: constants of the loop.
 
     Returns:

@@ -47,7 +47,7 @@ class BatchData:
     """Reported ranges, metres; NaN where there is no echo."""
     poses: Float[np.ndarray, "scans 3"]
     """world_from_robot, initial values."""
-    world: Int[np.ndarray, " scans"]
+    map_index: Int[np.ndarray, " scans"]
     """Index of the log, which has a map of its own; -1 for padding and for scans without a pose."""
     prior_information: Float[np.ndarray, "scans 3"]
     odometry: Float[np.ndarray, "scans 3"]
@@ -108,7 +108,7 @@ class BatchData:
             path=np.zeros((scans, columns), np.int32),
             reported=np.full((scans, columns), np.nan),
             poses=np.zeros((scans, 3)),
-            world=np.full(scans, -1, np.int32),
+            map_index=np.full(scans, -1, np.int32),
             prior_information=np.full((scans, 3), 1 / settings.pose_sd**2),
             odometry=np.zeros((scans, 3)),
             odometry_information=np.zeros((scans, 3)),
@@ -132,7 +132,7 @@ class BatchData:
         self.path[row, column] = flat.path[echo]
         self.reported[row, column] = flat.reported[echo]
         self.poses[first : first + len(rows)] = log.pose[rows]
-        self.world[first : first + len(rows)] = number
+        self.map_index[first : first + len(rows)] = number
 
     def _fill_odometry(self, number: int, measured: Float[np.ndarray, "_ 3"], noise: OdometryNoiseModel) -> None:
         """Write the odometry steps of one log into the rectangles."""
@@ -152,7 +152,7 @@ class BatchData:
     @property
     def scan_count(self) -> int:
         """Number of scans, without padding."""
-        return int((self.world >= 0).sum())
+        return int((self.map_index >= 0).sum())
 
     @cached_property
     def packed_echoes(self) -> tuple[Int[np.ndarray, "rows columns"], Int[np.ndarray, "rows columns"]]:

@@ -87,21 +87,21 @@ class LandmarkMap(NamedTuple):
     """Landmarks of one or more worlds, and the reflections at them; NumPy arrays, padded."""
 
     landmarks: kernels.Landmarks
-    world: Int[np.ndarray, " landmarks"]
+    map_index: Int[np.ndarray, " landmarks"]
     """Index of the map that each landmark belongs to; -1 for padding."""
     candidates: kernels.CandidateReflections
     """Reflections that echoes may be associated with."""
     visible: Bool[np.ndarray, "scans landmarks"] | None = None
-    """Visibility mask: which scans can observe each landmark; None: all of their world."""
+    """Visibility mask: which scans can observe each landmark; None: all scans of their map."""
 
     def candidates_in_range(
-        self, poses: Float[np.ndarray, "scans 3"], world: Int[np.ndarray, " scans"], max_range: float
+        self, poses: Float[np.ndarray, "scans 3"], map_index: Int[np.ndarray, " scans"], max_range: float
     ) -> Int[np.ndarray, "scans near"]:
         """Rows of the candidates that each scan can observe; -1 for unused entries.
 
         Args:
             poses: world_from_robot of the scans.
-            world: index of the map of each scan.
+            map_index: index of the map of each scan.
             max_range: largest distance of the closest part of a landmark, metres.
         """
         landmarks, reflection = self.landmarks, self.candidates.reflection
@@ -117,7 +117,7 @@ class LandmarkMap(NamedTuple):
         distance = np.where(is_wall, np.hypot(across, beyond_end), np.linalg.norm(offset - parameters, axis=-1))
         first, second = np.asarray(reflection.first), np.asarray(reflection.second)
         in_range = np.minimum(distance[:, first], distance[:, second]) < max_range
-        in_range &= (np.asarray(self.candidates.world) == world[:, None]) & (world >= 0)[:, None]
+        in_range &= (np.asarray(self.candidates.map_index) == map_index[:, None]) & (map_index >= 0)[:, None]
         in_range &= np.asarray(reflection.kind) >= 0
         if self.visible is not None:
             in_range &= self.visible[:, first]
@@ -131,22 +131,22 @@ def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> Landmark
     """The landmarks of maps, and the reflections at them.
 
     Args:
-        maps: one map per world.
+        maps: the maps; ``map_index`` is the position in this sequence.
         tie_corners: whether a corner is the intersection of its walls, with echoes of second order. These depend on the
             distance of the walls differently than echoes of first order. Otherwise a corner is a landmark of its own.
     """
     parts: list[kernels.Landmarks] = []
-    world: list[Int[np.ndarray, " landmarks"]] = [np.zeros(0, int)]
-    wall_pairs: list[tuple[int, int, int]] = []  # first wall, second wall, world
+    map_index: list[Int[np.ndarray, " landmarks"]] = [np.zeros(0, int)]
+    wall_pairs: list[tuple[int, int, int]] = []  # first wall, second wall, map
     for number, map_ in enumerate(maps):
         pairs, is_intersection = _wall_intersections(map_)
         first = sum(len(part.kind) for part in parts)
         kept = np.append(np.ones(len(map_), bool), ~is_intersection | (not tie_corners))
         parts.append(map_landmarks(map_).take(np.flatnonzero(kept)))
-        world.append(np.full(len(parts[-1].kind), number))
+        map_index.append(np.full(len(parts[-1].kind), number))
         if tie_corners:
             wall_pairs += [(first + a, first + b, number) for a, b in pairs]
-    return _padded(concatenate_landmarks(parts), np.concatenate(world), wall_pairs)
+    return _padded(concatenate_landmarks(parts), np.concatenate(map_index), wall_pairs)
 
 
 def map_landmarks(map_: GlobalMap) -> kernels.Landmarks:
@@ -177,14 +177,14 @@ def _wall_intersections(
 
 def _padded(
     landmarks: kernels.Landmarks,
-    world: Int[np.ndarray, " landmarks"],
+    map_index: Int[np.ndarray, " landmarks"],
     wall_pairs: Sequence[tuple[int, int, int]],
     settings: LandmarkMapSettings = SETTINGS,
 ) -> LandmarkMap:
     """The map with landmarks and candidates padded to powers of two, so that few shapes are compiled."""
-    count = len(world)
+    count = len(map_index)
     landmarks = pad_landmarks(landmarks, next_power_of_two(count, least=settings.min_rows))
-    first, second, pair_world = np.array(wall_pairs, dtype=np.int32).reshape(-1, 3).T
+    first, second, map_of_pair = np.array(wall_pairs, dtype=np.int32).reshape(-1, 3).T
     pairs = len(first)
     size = next_power_of_two(count + 2 * pairs, least=settings.min_rows)
     own = np.arange(count, dtype=np.int32)
@@ -197,8 +197,8 @@ def _padded(
             first=pad_rows(np.concatenate([own, first, second]), size),
             second=pad_rows(np.concatenate([own, second, first]), size),
         ),
-        world=pad_rows(np.concatenate([world, pair_world, pair_world]).astype(np.int32), size, fill=-1),
+        map_index=pad_rows(np.concatenate([map_index, map_of_pair, map_of_pair]).astype(np.int32), size, fill=-1),
         group=pad_rows(group, size, fill=-1),
     )
-    world = pad_rows(world.astype(np.int32), len(landmarks.kind), fill=-1)
-    return LandmarkMap(landmarks, world, candidates)
+    map_index = pad_rows(map_index.astype(np.int32), len(landmarks.kind), fill=-1)
+    return LandmarkMap(landmarks, map_index, candidates)

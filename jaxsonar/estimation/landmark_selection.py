@@ -97,8 +97,8 @@ def remove_misfitting_points(
         return state
     variance = float(np.mean(found.residual[of_wall] ** 2))
     of_point = found.used & ((kind == kernels.CORNER) | (kind == kernels.EDGE))
-    count = np.bincount(first[of_point], minlength=len(landmark_map.world))
-    squares = np.bincount(first[of_point], weights=found.residual[of_point] ** 2, minlength=len(landmark_map.world))
+    count = np.bincount(first[of_point], minlength=len(landmark_map.map_index))
+    squares = np.bincount(first[of_point], weights=found.residual[of_point] ** 2, minlength=len(landmark_map.map_index))
     margin = 1 + 4 * np.sqrt(2 / np.maximum(count, 1))  # four standard deviations of the sample variance
     misfits = (count >= settings.min_judged_echoes) & (
         squares > settings.max_variance_ratio * count * variance * margin

@@ -205,13 +205,13 @@ class _GncJob:
         rows, columns = data.packed_echoes
         scan = rows[:, 0]
         max_range = float(self.ring.max_range) + settings.range_margin
-        in_range = landmark_map.candidates_in_range(state.poses, data.world, max_range)
+        in_range = landmark_map.candidates_in_range(state.poses, data.map_index, max_range)
         found = kernels.associate(
             kernels.apply_parameters(self.ring.sensors, jnp.asarray(self.basis.columns @ state.coordinates)),
             to_jax(landmark_map.landmarks),
             to_jax(landmark_map.candidates),
             jnp.asarray(state.poses[scan]),
-            jnp.asarray(data.world[scan]),
+            jnp.asarray(data.map_index[scan]),
             jnp.asarray(data.path[rows, columns]),
             jnp.asarray(data.reported[rows, columns]),
             jnp.asarray(in_range[scan]),
@@ -233,7 +233,7 @@ class _GncJob:
         if data.wall_explained is not None:
             used &= ~(data.wall_explained & np.isin(kind, (kernels.CORNER, kernels.EDGE)))
         # 3. Landmarks with too few echoes, in a scan or in all.
-        count = len(landmark_map.world)
+        count = len(landmark_map.map_index)
         if data.min_echoes_per_landmark > 1:
             pair = first + count * np.arange(len(first))[:, None]
             used &= np.bincount(pair[used], minlength=count * len(first))[pair] >= data.min_echoes_per_landmark

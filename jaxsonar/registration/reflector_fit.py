@@ -1,4 +1,8 @@
-"""Robust fit of reflectors as every kind, at fixed transducer poses (Geman-McClure, graduated non-convexity)."""
+"""Robust fit of reflectors as every kind, at fixed transducer poses (Geman-McClure, graduated non-convexity).
+
+The loss is that of ``kernels.robust_fit``. Here it is written in NumPy, because the numbers of reflectors and echoes
+vary from call to call and would be compiled again.
+"""
 
 from typing import NamedTuple
 

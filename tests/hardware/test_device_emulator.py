@@ -52,7 +52,7 @@ class Clocked(Sink):
         self.when.append(time.monotonic() - self.there)
         return True
 
-    def hang_up(self):
+    def disconnect(self):
         pass
 
     def close(self):
@@ -120,7 +120,7 @@ def test_an_unplugged_link_loses_only_what_was_in_flight(office, log):
         for message in sent:
             if message.sequence == 70:
                 time.sleep(0.2)
-                sink.hang_up()
+                sink.disconnect()
             yield message
 
     with sink:

@@ -117,7 +117,7 @@ def test_a_broken_link_without_reconnection_is_the_end(scheme, pty_url):
         open_source(device.url, reconnect=False) as source,
     ):
         heard = threading.Event()
-        device.run(b"one", heard, "hang_up")
+        device.run(b"one", heard, "disconnect")
         assert read_until(source, lambda data: data == b"one") == b"one"
         heard.set()
         with pytest.raises(EndOfStream, match=r"reset by peer|the device is gone|Input/output"):
@@ -137,7 +137,7 @@ def test_a_client_reconnects_after_an_unplugged_link(scheme, pty_url):
         events, tell = events_of()
         with open_source(url, on_event=tell) as source:
             pull = [threading.Event(), threading.Event()]
-            device.run(b"half a fr", pull[0], "hang_up", b"one\0", pull[1], "hang_up", b"two\0")
+            device.run(b"half a fr", pull[0], "disconnect", b"one\0", pull[1], "disconnect", b"two\0")
             got = read_until(source, lambda data: data.endswith(b"fr"))
             pull[0].set()
             got += read_until(source, lambda data: data.endswith(b"one\0"))
@@ -287,7 +287,7 @@ def test_links_and_ptys_are_cleaned_up(pty_url):
             device.run(b"x")
             read_until(source, lambda data: b"x" in data)
             device.finish()
-            device.sink.hang_up()
+            device.sink.disconnect()
     assert not os.path.lexists(pty_url.removeprefix("pty:"))
     if before:
         assert len(os.listdir("/proc/self/fd")) == before

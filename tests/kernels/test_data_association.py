@@ -54,16 +54,16 @@ def the_scene(corners=CORNERS):
 def the_candidates(*, wall_to_wall=False):
     """Every reflector alone, every pair of neighboring walls in both orders, padding.
 
-    Wall to wall of square walls is their corner: where there are corners it has no world.
+    Wall to wall of square walls is their corner: where there are corners it belongs to no map.
     """
     alone = list(range(11))
     first = [*alone, *(a for a, _ in PAIRS), *(b for _, b in PAIRS), 0]
     second = [*alone, *(b for _, b in PAIRS), *(a for a, _ in PAIRS), 0]
     kind = np.concatenate([the_scene().kind[:11], np.full(8, SECOND_ORDER), [-1]]).astype(np.int32)
     group = np.concatenate([alone, 11 + np.tile(np.arange(4), 2), [-1]]).astype(np.int32)
-    world = np.concatenate([np.zeros(11), np.full(8, 0 if wall_to_wall else -2), [-1]]).astype(np.int32)
+    map_index = np.concatenate([np.zeros(11), np.full(8, 0 if wall_to_wall else -2), [-1]]).astype(np.int32)
     reflection = Reflection(kind, np.array(first, np.int32), np.array(second, np.int32))
-    return CandidateReflections(reflection=reflection, world=world, group=group)
+    return CandidateReflections(reflection=reflection, map_index=map_index, group=group)
 
 
 @pytest.fixture(autouse=True)
@@ -93,15 +93,15 @@ def heard():
     return poses, path, reported, truth
 
 
-def associated(poses, path, reported, world=None, candidates=None, scene=None):
-    world = np.zeros(len(poses), np.int32) if world is None else world
+def associated(poses, path, reported, map_index=None, candidates=None, scene=None):
+    map_index = np.zeros(len(poses), np.int32) if map_index is None else map_index
     trees = (the_scene() if scene is None else scene, the_candidates() if candidates is None else candidates)
     scene, candidates = (jax.tree.map(jnp.asarray, tree) for tree in trees)
     found = kernels.associate(
         RING.sensors,
         scene,
         candidates,
-        *(jnp.asarray(x) for x in (poses, world, path, reported)),
+        *(jnp.asarray(x) for x in (poses, map_index, path, reported)),
         every(candidates, poses),
     )
     return [np.asarray(x) for x in (found.candidate, found.residual, found.competitor_gap)]
@@ -109,7 +109,7 @@ def associated(poses, path, reported, world=None, candidates=None, scene=None):
 
 def every(candidates, poses):
     """All candidates for all scans."""
-    return jnp.tile(jnp.arange(len(candidates.world), dtype=jnp.int32), (len(poses), 1))
+    return jnp.tile(jnp.arange(len(candidates.map_index), dtype=jnp.int32), (len(poses), 1))
 
 
 # A slow search
@@ -242,14 +242,14 @@ def test_nothing_is_found_where_no_echo_is(heard):
     assert not np.isnan(rival).any()
 
 
-def test_other_worlds_are_never_chosen(heard):
-    """The same reflectors in two worlds, the second one moved away: scans know only their own."""
+def test_reflections_of_other_maps_are_never_chosen(heard):
+    """The same reflectors in two maps, the second one moved away: scans are associated with their own map."""
     poses, path, reported, _ = heard
     own = the_candidates()
     half = np.arange(SCANS) % 2
     for number in (0, 1):
         candidates = CandidateReflections(
-            own.reflection, np.where(own.world == 0, number, -1).astype(np.int32), own.group
+            own.reflection, np.where(own.map_index == 0, number, -1).astype(np.int32), own.group
         )
         candidate, residual, _ = associated(poses, path, reported, half.astype(np.int32), candidates)
         assert (candidate[half != number] == -1).all()
@@ -279,13 +279,13 @@ def test_offsets_and_speed_of_sound_are_part_of_what_is_expected(heard, rng):
     tx, rx = RING.paths[path].transpose(2, 0, 1)
     told = reported / scale + (offset[tx] + offset[rx]) / 2
     scene, candidates = (jax.tree.map(jnp.asarray, tree) for tree in (the_scene(), the_candidates()))
-    world = jnp.zeros(SCANS, jnp.int32)
+    map_index = jnp.zeros(SCANS, jnp.int32)
     found = kernels.associate(
         sensors,
         scene,
         candidates,
         jnp.asarray(poses),
-        world,
+        map_index,
         jnp.asarray(path),
         jnp.asarray(told),
         every(candidates, poses),

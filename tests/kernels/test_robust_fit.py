@@ -228,7 +228,9 @@ def path_between(tx, rx):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", [robust_fit.plane, robust_fit.corner, robust_fit.edge])
+@pytest.mark.parametrize(
+    "model", [robust_fit.plane_from_both_sides, robust_fit.corner_from_midpoint, robust_fit.edge_from_midpoint]
+)
 def test_gradients_of_the_ranges_agree_with_finite_differences(model: Callable[..., Any], rng):
     def ranges(x, echo):
         return model(x, echo)[0]
@@ -244,7 +246,9 @@ def test_gradients_of_the_ranges_agree_with_finite_differences(model: Callable[.
                 np.testing.assert_allclose(slope, numerical, atol=1e-8)
 
 
-@pytest.mark.parametrize("model", [robust_fit.plane, robust_fit.corner, robust_fit.edge])
+@pytest.mark.parametrize(
+    "model", [robust_fit.plane_from_both_sides, robust_fit.corner_from_midpoint, robust_fit.edge_from_midpoint]
+)
 def test_gradients_are_finite_if_a_sensor_is_on_the_reflector(model: Callable[..., Any]):
     here = jnp.asarray([0.5, 0.0])
     echo = path_between(here, here)
@@ -254,14 +258,16 @@ def test_gradients_are_finite_if_a_sensor_is_on_the_reflector(model: Callable[..
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", [robust_fit.plane, robust_fit.corner, robust_fit.edge])
+@pytest.mark.parametrize(
+    "model", [robust_fit.plane_from_both_sides, robust_fit.corner_from_midpoint, robust_fit.edge_from_midpoint]
+)
 def test_ranges_are_those_of_the_oracle(model: Callable[..., Any], rng):
     """Each model fitted to its own echoes leaves no residuals."""
     poses, place = poses_past_a_point(rng, 0.7)
-    if model is robust_fit.plane:
+    if model is robust_fit.plane_from_both_sides:
         truth, echoes = np.array([0.9, math.pi / 2]), echoes_of_plane(poses, (0.9, math.pi / 2))
     else:
-        truth, corner = place, model is robust_fit.corner
+        truth, corner = place, model is robust_fit.corner_from_midpoint
         echoes = [echo for pose in poses for echo in oracles.point_echoes(RING, pose, place, corner=corner)][:SLOTS]
     start = jnp.asarray(truth + np.array([0.03, -0.03]), jnp.float32)
     came, score = fit(model, start, *paths_and_ranges(packed(echoes)), tolerance=SETTINGS.window_tolerance)

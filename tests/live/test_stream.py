@@ -140,7 +140,7 @@ def test_a_stream_survives_a_reconnection(link, office, log, tmp_path):
     def unplugged():
         yield from sent[:70]
         time.sleep(0.3)
-        sink.hang_up()
+        sink.disconnect()
         gone.set()
         yield from sent[70:]
 
