@@ -131,6 +131,7 @@ def test_each_table_opens_as_one_data_set_with_units(done):
 # Reproducibility
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "sizes"), [("hough", (1, 5, 16)), ("ml", (5,))])
 def test_shards_of_any_size_give_the_same_rows(method, sizes):
     """The result of a scan does not depend on the other scans, bit by bit."""

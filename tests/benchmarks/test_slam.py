@@ -55,6 +55,7 @@ def office():
     return scenarios.office()
 
 
+@pytest.mark.slow
 def test_trajectories_keep_clear_of_walls(scene):
     route, walls = LineString(scene.poses[:, :2]), MultiLineString(list(scene.room.walls))
     assert not route.crosses(walls)

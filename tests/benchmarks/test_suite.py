@@ -40,7 +40,7 @@ def walls(ring, rho, theta):
 
 @pytest.fixture(scope="module", params=["outward", "inward"])
 def given(request):
-    """Scans of rooms and of walls at the seam of theta, or a ring that faces inward with walls through its centre."""
+    """Scans of rooms and of walls at the seam of theta, or a ring that faces inward with walls through its center."""
     ring = replace(Ring.circular(), range_offset=np.full(24, 0.004, np.float32))
     rng = np.random.default_rng(1)
     if request.param == "outward":
@@ -99,6 +99,7 @@ def test_the_numba_loop_finds_the_lines_of_the_product(given):
     np.testing.assert_allclose(np.sin(turn / 2), 0 * turn, rtol=0, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_plain_numpy_finds_the_lines_of_the_product(given):
     ring, ranges = given
     lines, plain = extract_lines(ring, ranges, method="hough"), NumpyPeer(ring, SETTINGS)

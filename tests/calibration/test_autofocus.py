@@ -1,4 +1,4 @@
-"""Focus measure of the accumulator: derivatives, invariances, limits; and the autofocus that maximises it."""
+"""Focus measure of the accumulator: derivatives, invariances, limits; and the autofocus that maximizes it."""
 
 import dataclasses
 

@@ -194,6 +194,7 @@ def bag(request, tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_bag_gives_scans_of_direct_echoes(bag, tmp_path):
     log = parts_of(bag, tmp_path)
     assert log.tx.tolist() == log.rx.tolist() == [0, 1, 2, 0]

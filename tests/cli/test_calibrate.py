@@ -78,7 +78,7 @@ MISTAKES = {
     "one of two logs missing": ("calibrate log.csv no.csv --ring faw -o out.toml", {}, ["no.csv", "No such file"]),
     "no such ring": ("calibrate log.csv --ring fawn -o out.toml", {}, ["fawn", "faw"]),
     "sensor beyond the ring": ("calibrate log.csv --ring corridor8 -o out.toml", {}, ["log.csv", "tx", "0 to 7"]),
-    "unknown freedom": (f"{OUT} --free speed,colour", {}, ["colour", "offset", "heading"]),
+    "unknown freedom": (f"{OUT} --free speed,color", {}, ["color", "offset", "heading"]),
     "no freedom": (f"{OUT} --free ''", {}, ["free", "offset"]),
     "unknown poses": (f"{OUT} --poses guess", {}, ["guess", "trust", "estimate"]),
     "temperature of the moon": (f"{OUT} --temperature 120", {}, ["--temperature", "120", "85"]),

@@ -51,6 +51,7 @@ def read_models(path):
 # Results
 
 
+@pytest.mark.slow
 def test_a_simulated_log_has_the_poses_of_the_trajectory(here):
     with open("log.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -67,6 +68,7 @@ def test_a_simulated_log_has_the_poses_of_the_trajectory(here):
         assert 0 < float(row["range"]) < 2.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["ml", "hough"])
 def test_lines_are_as_documented(here, method):
     if method == "hough":
@@ -96,6 +98,7 @@ def test_lines_are_as_documented(here, method):
                 assert (np.linalg.eigvalsh(line["cov"]) > 0).all()
 
 
+@pytest.mark.slow
 def test_written_settings_reproduce_the_result(here, office):
     settings = office / "lines.settings.toml"
     assert set(tomllib.loads(settings.read_text())) == {
@@ -106,6 +109,7 @@ def test_written_settings_reproduce_the_result(here, office):
     assert Path("again.settings.toml").read_bytes() == settings.read_bytes()
 
 
+@pytest.mark.slow
 def test_given_settings_are_used_and_written(here):
     Path("mine.toml").write_text("threshold = 0.35\nmin_echoes = 5\nsmoothing = [1, 2, 3, 2, 1]\n")
     paper = ["lines", "log.csv", "--ring", "faw", "--method", "hough"]
@@ -118,6 +122,7 @@ def test_given_settings_are_used_and_written(here):
     assert Path("again.jsonl").read_bytes() != Path("paper.jsonl").read_bytes()
 
 
+@pytest.mark.slow
 def test_lines_to_standard_output(here, capsys):
     before = contents(here)
     assert call("lines", "log.csv", "--ring", "faw", "-o", "-") == 0
@@ -127,6 +132,7 @@ def test_lines_to_standard_output(here, capsys):
     assert contents(here) == before
 
 
+@pytest.mark.slow
 def test_a_simulation_to_standard_output(here, capsys):
     before = contents(here)
     assert call(*SIMULATE, "-o", "-") == 0
@@ -136,6 +142,7 @@ def test_a_simulation_to_standard_output(here, capsys):
     assert contents(here) == before
 
 
+@pytest.mark.slow
 def test_lines_through_a_named_pipe_leave_nothing_beside_it(here):
     os.mkfifo("pipe.jsonl")
     with ThreadPoolExecutor() as pool:
@@ -146,6 +153,7 @@ def test_lines_through_a_named_pipe_leave_nothing_beside_it(here):
     assert contents(here) == before
 
 
+@pytest.mark.slow
 def test_output_of_the_installed_command_can_be_appended_to_a_file(here):
     Path("both.csv").write_bytes(b"before\n")
     with open("both.csv", "a") as file:
@@ -154,6 +162,7 @@ def test_output_of_the_installed_command_can_be_appended_to_a_file(here):
     assert Path("both.csv").read_bytes() == b"before\n" + Path("log.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_log(here):
     for name, seed in (("same.csv", 1), ("other.csv", 2)):
         assert call(*SIMULATE[:-1], seed, "-o", name) == 0
@@ -161,6 +170,7 @@ def test_the_same_seed_gives_the_same_log(here):
     assert Path("other.csv").read_bytes() != Path("log.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_errors_of_the_ring_are_simulated(here):
     options = ("--drift", "0.01", "--dropout", "0.5", "--clutter", "0.3", "--max-echoes", "1")
     assert call(*SIMULATE, *options, "-o", "bad.csv") == 0
@@ -171,6 +181,7 @@ def test_errors_of_the_ring_are_simulated(here):
     assert len(np.unique(places, axis=0)) == len(places), "one echo a path"
 
 
+@pytest.mark.slow
 def test_conversions_lose_nothing(here):
     pytest.importorskip("pyarrow")
     assert call("convert", "log.csv", "log.parquet") == 0
@@ -182,6 +193,7 @@ def test_conversions_lose_nothing(here):
     assert Path("named.csv").read_bytes() == Path("log.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_parquet_and_csv_give_the_same_result(here):
     pytest.importorskip("pyarrow")
     assert call(*SIMULATE, "-o", "log.parquet") == 0
@@ -189,6 +201,7 @@ def test_parquet_and_csv_give_the_same_result(here):
     assert Path("again.jsonl").read_bytes() == Path("lines.jsonl").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("suffix", "start"), [("svg", b"<?xml"), ("png", b"\x89PNG"), ("PDF", b"%PDF")])
 def test_a_figure_of_one_scan(here, suffix, start):
     figure = Path(f"scan.{suffix}")
@@ -214,6 +227,7 @@ def test_the_command_line_accepts_exactly_the_figure_formats():
         figure_filename("a.gif")
 
 
+@pytest.mark.slow
 def test_logs_without_scans_or_echoes_are_valid(here, capsys):
     Path("empty.csv").write_text(HEADER)
     assert call("lines", "empty.csv", "--ring", "faw", "-o", "empty.jsonl") == 0
@@ -229,6 +243,7 @@ def test_logs_without_scans_or_echoes_are_valid(here, capsys):
     assert "2 scans, 0 lines" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_echoes_of_no_path_are_reported(here, capsys):
     Path("wide.csv").write_text(HEADER + "0,,,,,3,12,1.0\n0,,,,,3,3,1.0\n")
     assert call("lines", "wide.csv", "--ring", "faw", "--method", "hough", "-o", "wide.jsonl") == 0
@@ -238,6 +253,7 @@ def test_echoes_of_no_path_are_reported(here, capsys):
 # Errors: one line with what came and what is allowed, and nothing is written
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "files", "said"), list(INVALID_CALLS.values()), ids=list(INVALID_CALLS))
 def test_an_invalid_call_is_answered_in_one_line_and_changes_nothing(here, capsys, line, files, said):
     if "parquet" in line:
@@ -258,6 +274,7 @@ def test_an_invalid_call_is_answered_in_one_line_and_changes_nothing(here, capsy
     assert contents(here) == before
 
 
+@pytest.mark.slow
 def test_an_error_with_a_line_break_is_one_line(here, capsys):
     assert call("lines", "log.csv", "--ring", "faw", "-o", "out.jsonl", "--two\nlines") == 2
     assert call("lines", "two\nlines.csv", "--ring", "faw", "-o", "out.jsonl") == 2
@@ -265,6 +282,7 @@ def test_an_error_with_a_line_break_is_one_line(here, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 3
 
 
+@pytest.mark.slow
 def test_the_installed_command_answers_in_one_line(here):
     done = script("convert", "no.csv", "out.csv")
     assert (done.returncode, done.stdout) == (2, "")
@@ -272,6 +290,7 @@ def test_the_installed_command_answers_in_one_line(here):
     assert "no.csv" in done.stderr
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_no_partial_result(here, capsys, monkeypatch, faw_ring):
     from jaxsonar.detection import extract as local
 
@@ -320,6 +339,7 @@ def test_the_version_is_that_of_the_project(capsys):
     assert capsys.readouterr().out == f"jaxsonar {project['version']}\n"
 
 
+@pytest.mark.slow
 def test_a_saved_log_is_what_the_command_reads(here):
     """Round trip through the library between two commands."""
     log = load_log("log.csv")

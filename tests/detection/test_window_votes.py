@@ -64,6 +64,7 @@ def test_identity_poses_give_the_votes_of_one_scan(rng):
     jax.tree.map(np.testing.assert_array_equal, posed, plain)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(metres, metres, turns, st.integers(0, 1000))
 def test_lines_are_equivariant_under_a_motion_of_all_poses(x, y, turn, seed):

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from jaxsonar import Log, Ring, SonarError, random_pose, random_room, simulate
-from jaxsonar.diagnostics.beam_width import BIN_CENTRES, detection_probability, fit_cone, fit_each_cone
+from jaxsonar.diagnostics.beam_width import BIN_CENTERS, detection_probability, fit_cone, fit_each_cone
 from jaxsonar.diagnostics.check_ring import check
 from jaxsonar.diagnostics.range_offsets import remove_gauge_freedom
 from jaxsonar.kernels.detection_cones import predict_all_echoes
@@ -57,6 +57,7 @@ def healthy(log):
     return check(RING, log)
 
 
+@pytest.mark.slow
 def test_a_healthy_ring_has_no_findings(log, healthy):
     assert healthy.findings == ()
     assert not any(healthy.remarks)
@@ -69,6 +70,7 @@ def test_a_healthy_ring_has_no_findings(log, healthy):
     assert 0.5 * SIGMA < healthy.sigma < 3 * SIGMA
 
 
+@pytest.mark.slow
 def test_the_measured_cones_have_the_simulated_width(healthy):
     width, error = np.degrees(healthy.beam)
     assert abs(width - 60) < 3
@@ -98,6 +100,7 @@ def test_a_swap_is_distinguished_from_its_mirror_image():
     assert len(found.findings) == 1
 
 
+@pytest.mark.slow
 def test_renumbered_sensors_give_the_renumbered_results(log, healthy):
     """If the exchange is found, the other results are the same as without it."""
     place = np.arange(24)
@@ -108,6 +111,7 @@ def test_renumbered_sensors_give_the_renumbered_results(log, healthy):
     np.testing.assert_array_equal(found.direct, healthy.direct[place])
 
 
+@pytest.mark.slow
 def test_a_cyclic_exchange_of_three_sensors_is_named(log):
     place = np.arange(24)
     place[[2, 9, 16]] = 9, 16, 2
@@ -115,6 +119,7 @@ def test_a_cyclic_exchange_of_three_sensors_is_named(log):
     assert found.findings[0].startswith("sensors 2, 16 and 9 look permuted")
 
 
+@pytest.mark.slow
 def test_a_dead_sensor_is_named(log):
     found = check(RING, only(log, (log.tx != 11) & (log.rx != 11)))
     assert found.findings[0].startswith("sensor 11 hears nothing")
@@ -144,6 +149,7 @@ def test_an_offset_is_attributed_to_its_sensor_only():
     assert abs(found.offset[3] - 0.01) < 0.003
 
 
+@pytest.mark.slow
 def test_a_stuck_sensor_is_named(log):
     own = (log.tx == 4) & (log.rx == 4)
     stuck = only(log, ~own)
@@ -178,6 +184,7 @@ def test_the_reason_for_missing_walls_is_reported(log, rng):
         health_figure(found)
 
 
+@pytest.mark.slow
 def test_left_out_echoes_are_reported(log):
     """For a device that listens to more neighbors than the ring specifies."""
     seen, reported, far = [], [], np.flatnonzero(log.tx == log.rx)[::4]
@@ -191,6 +198,7 @@ def test_left_out_echoes_are_reported(log):
     assert any("does not listen to" in finding for finding in found.findings)
 
 
+@pytest.mark.slow
 def test_wrong_input_is_refused_in_one_line(log):
     with pytest.raises(SonarError, match="allowed are 0 to 7"):
         check(Ring.circular(count=8), log)
@@ -198,6 +206,7 @@ def test_wrong_input_is_refused_in_one_line(log):
         check(RING, log, sigma=2.0)
 
 
+@pytest.mark.slow
 def test_json_table_and_figure(healthy, tmp_path):
     plain = written(healthy)
     assert plain["ring"] == RING.name
@@ -235,8 +244,8 @@ def test_predicted_echoes_are_those_of_the_image_source(rng):
 @pytest.mark.parametrize("half", [10.0, 25.0, 45.0])
 def test_the_cone_fit_recovers_the_true_cone(rng, half):
     truth = np.array([np.radians(half), np.radians(2), 0.85, 0.03])
-    asked = np.full(len(BIN_CENTRES), 60)
-    answered = rng.binomial(asked, detection_probability(truth, BIN_CENTRES))
+    asked = np.full(len(BIN_CENTERS), 60)
+    answered = rng.binomial(asked, detection_probability(truth, BIN_CENTERS))
     curve, error = fit_cone(asked, answered)
     assert abs(curve[0] - truth[0]) < 4 * error
     assert error < np.radians(1)
@@ -245,11 +254,11 @@ def test_the_cone_fit_recovers_the_true_cone(rng, half):
 
 def test_a_turned_cone_is_found(rng):
     truth = np.array([np.radians(30), np.radians(2), 0.9, 0.02])
-    asked = np.full((3, len(BIN_CENTRES)), 5)
+    asked = np.full((3, len(BIN_CENTERS)), 5)
     turn = np.radians([0.0, 12.0, -9.0])[:, None]
-    answered = rng.binomial(asked, detection_probability(truth, BIN_CENTRES - turn))
-    half, centre = fit_each_cone(asked, answered, truth)
-    assert (np.abs(centre[:, 0] - turn[:, 0]) < 4 * centre[:, 1]).all()
+    answered = rng.binomial(asked, detection_probability(truth, BIN_CENTERS - turn))
+    half, center = fit_each_cone(asked, answered, truth)
+    assert (np.abs(center[:, 0] - turn[:, 0]) < 4 * center[:, 1]).all()
     assert (np.abs(half[:, 0] - truth[0]) < 4 * half[:, 1]).all()
 
 

@@ -24,7 +24,7 @@ def pairs_of(name, rng):
 
 @pytest.fixture(params=["chain", "ring", "star", "random", "all", "none"])
 def equations(request, rng):
-    """A symbolic factorisation, the stored entries of a normal matrix, and the same matrix as a dense one."""
+    """A symbolic factorization, the stored entries of a normal matrix, and the same matrix as a dense one."""
     sizes = rng.integers(1, 4, BLOCKS)
     sizes[5] = 12  # larger than the blocks that LAPACK inverts
     begin = np.append(0, np.cumsum(sizes))

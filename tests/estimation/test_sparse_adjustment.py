@@ -66,6 +66,7 @@ def assert_covariances(found, expected):
         np.testing.assert_allclose(one / scale, other / scale, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odometry_scale", [False, True])
 def test_dense_solvers_find_the_same(rng, odometry, odometry_scale):
     problem, start, _ = problem_with_truth(rng, odometry=odometry, odometry_scale=odometry_scale)

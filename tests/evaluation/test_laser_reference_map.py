@@ -126,6 +126,7 @@ def test_invalid_laser_scans_are_refused(bearing, ranges, words):
 # --- a whole run ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "tolerance"), [(0.0, 0.002), (0.01, 0.006)])
 def test_the_walls_of_a_hall_with_a_recess_are_found(noise, tolerance, rng):
     truth = loop(HALL)
@@ -139,6 +140,7 @@ def test_the_walls_of_a_hall_with_a_recess_are_found(noise, tolerance, rng):
     assert (np.diff(np.linalg.norm(walls[:, 1] - walls[:, 0], axis=1)) <= 0.05).all()  # the longest first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_random_rooms_are_accurate_to_millimetres(seed):
     rng = np.random.default_rng(seed)

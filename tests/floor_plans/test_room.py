@@ -86,6 +86,7 @@ def test_ends_farther_apart_stay_unchanged():
     assert len(room.junctions.vertices) == 4
 
 
+@pytest.mark.slow
 @given(seed=seeds)
 def test_wedges_around_a_vertex_sum_to_360_degrees_and_rotate_with_the_room(seed):
     room = random_room(np.random.default_rng(seed), box=1.0, segment=1.0)
@@ -252,6 +253,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
 # Lines, random rooms.
 
 
+@pytest.mark.slow
 @given(seed=seeds)
 def test_lines_contain_their_walls_in_the_robot_frame(seed):
     rng = np.random.default_rng(seed)
@@ -274,6 +276,7 @@ def test_theta_stays_below_pi():
     assert walls_in_robot_frame(room, np.array([0.0, 0.0, 1e-17]))[1][0] == -np.pi
 
 
+@pytest.mark.slow
 @given(seed=seeds)
 def test_random_rooms_are_closed_and_poses_keep_clear(seed):
     shapely = pytest.importorskip("shapely")
@@ -292,6 +295,7 @@ def test_random_rooms_are_closed_and_poses_keep_clear(seed):
     assert np.linalg.norm(room.poles - [x, y], axis=-1).min(initial=np.inf) >= 0.45
 
 
+@pytest.mark.slow
 def test_random_rooms_have_all_features():
     rng = np.random.default_rng(0)
     rooms = [random_room(rng) for _ in range(60)]

@@ -116,6 +116,7 @@ def test_jacobians_are_differences(a, b):
     np.testing.assert_allclose(by_second, jacobian(lambda x: relative(a, x), b), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_covariance_of_a_composition_is_that_of_samples(rng):
     a, b = np.array([1.0, 2.0, 2.8]), np.array([0.5, -0.4, 1.1])
     cov_a, cov_b = random_covariance(rng, 3, 1e-4), random_covariance(rng, 3, 1e-4)

@@ -9,7 +9,7 @@ import pytest
 from jaxsonar import Ring, Room, kernels, local_model, simulate
 from jaxsonar.geometry.landmarks import wall_segments
 from jaxsonar.geometry.se2 import unit
-from jaxsonar.graph_slam.frontend import SubmapState, close_submap, start_submap, update
+from jaxsonar.graph_slam.frontend import SubmapState, finish_submap, start_submap, update
 from jaxsonar.graph_slam.joint_compatibility import FeatureMeasurements, associate_features
 
 RING = Ring.circular()
@@ -130,7 +130,7 @@ def test_a_closed_submap_has_no_landmark_of_a_single_scan():
     poses = tuple(np.full(3, 0.1 * k) for k in range(4))
     covariances = tuple(np.eye(3) * k for k in range(4))
     state = SubmapState(known, np.array([3, 1, 2]), rows=(4, 5, 6, 7), poses=poses, covariances=covariances)
-    submap = close_submap(state)
+    submap = finish_submap(state)
     np.testing.assert_array_equal(submap.landmarks.anchor, known.landmarks.anchor[[0, 2]])
     np.testing.assert_array_equal(
         submap.covariance, known.covariance[np.ix_([0, 1, 2, 3, 4, 7, 8], [0, 1, 2, 3, 4, 7, 8])]
@@ -138,7 +138,7 @@ def test_a_closed_submap_has_no_landmark_of_a_single_scan():
     np.testing.assert_array_equal(submap.exit_pose, known.pose)
     assert submap.rows.tolist() == [4, 5, 6, 7]
     np.testing.assert_array_equal(submap.poses, poses)
-    lost = close_submap(replace(state, track_loss_count=3))
+    lost = finish_submap(replace(state, track_loss_count=3))
     assert (np.diag(lost.covariance - submap.covariance)[:3] > 0.2).all()
     np.testing.assert_allclose(wall_segments(submap.landmarks)[0], [[1.0, -1.0], [1.0, 1.0]], atol=1e-12)
 

@@ -187,6 +187,7 @@ def test_windows_scan_by_scan_equal_those_of_the_whole_log(lost):
     assert [k for k, info in enumerate(infos) if info.ignored] == list(lost)
 
 
+@pytest.mark.slow
 def test_finishing_twice_or_an_empty_run_changes_nothing():
     ring, log = corridor_log()
     mapper = Mapper(ring=ring, window=2.0)

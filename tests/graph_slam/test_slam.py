@@ -122,6 +122,7 @@ def test_single_scans_without_odometry_do_not_distort_the_trajectory(missing):
     assert own.nees < 4
 
 
+@pytest.mark.slow
 def test_odometry_bridges_a_scan_without_odometry():
     """Without echoes, the pose after it is that of the odometry."""
     tracker = Tracker(ring=RING, sigma=SIGMA)

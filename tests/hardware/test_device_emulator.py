@@ -72,6 +72,7 @@ def test_messages_are_sent_in_real_time(office, log):
     assert late.max() == pytest.approx(served.max_delay, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_playback_speed_scales_time(office, log):
     took = []
     for speed in (0.0, 20.0):
@@ -135,6 +136,7 @@ def test_an_unplugged_link_loses_only_what_was_in_flight(office, log):
     assert numbers[-(len(sent) - 70) :] == list(range(70, len(sent)))
 
 
+@pytest.mark.slow
 def test_a_waiting_device_can_be_stopped(office, log):
     """While it waits for a client, for the time of a message, or for a client that does not read."""
     sent = list(log_messages(log, office.ring))

@@ -71,6 +71,7 @@ def test_every_kind_of_corruption_occurs(rng):
     assert all(corrupt_frame(rng, b"\0") != b"\0" for _ in range(100))
 
 
+@pytest.mark.slow
 def test_a_stalled_device_sends_late(office, log):
     """The receiver reports the silence, and the delayed messages arrive afterwards."""
     sent = list(log_messages(log[:4], office.ring))

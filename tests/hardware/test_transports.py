@@ -78,6 +78,7 @@ def test_read_returns_none_after_the_timeout():
         assert source.read(0.0) is None
 
 
+@pytest.mark.slow
 def test_waiting_uses_no_cpu_time():
     with ScriptedDevice("tcp://127.0.0.1:0") as device, open_source(device.url, silence=0.1) as source:
         begin = time.thread_time()
@@ -127,6 +128,7 @@ def test_a_broken_link_without_reconnection_is_the_end(scheme, pty_url):
 # --- breaks and silence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["tcp", "pty", "serial"])
 def test_a_client_reconnects_after_an_unplugged_link(scheme, pty_url):
     """The stream continues, the gap is reported, and frames before and after it are never joined."""
@@ -151,6 +153,7 @@ def test_a_client_reconnects_after_an_unplugged_link(scheme, pty_url):
         assert 0 <= events[1].time - events[0].time < 10
 
 
+@pytest.mark.slow
 def test_a_client_reconnects_to_a_restarted_device(tmp_path):
     """The device file disappears and returns; attempts become less frequent and are not reported one by one."""
     url = f"pty:{tmp_path / 'ring'}"
@@ -247,6 +250,7 @@ def test_a_udp_client_binds_a_free_port_or_sends_hellos():
             assert read_until(source, lambda data: b"def" in data).strip(b"\0") == b"def"
 
 
+@pytest.mark.slow
 def test_a_udp_device_that_restarts_finds_its_port_free():
     events, tell = events_of()
     with ScriptedDevice("udp://127.0.0.1:0") as device:

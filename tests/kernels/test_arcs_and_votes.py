@@ -154,6 +154,7 @@ def test_cones_that_do_not_overlap_have_no_arc():
 # accumulator
 
 
+@pytest.mark.slow
 @ways
 def test_votes_are_in_the_cells_of_their_lines(rng, run):
     rho = rng.uniform(-2.5, 2.5, 400).astype(np.float32)
@@ -189,7 +190,7 @@ def test_the_low_pass_preserves_the_sum_of_inner_votes(rng):
     assert float(kernels.lowpass(jnp.asarray(votes), SMALL).sum()) == pytest.approx(votes.sum(), rel=1e-6)
 
 
-def test_soft_votes_equal_hard_votes_at_cell_centres(rng):
+def test_soft_votes_equal_hard_votes_at_cell_centers(rng):
     row, column = rng.integers(0, 12, 60), rng.integers(0, 9, 60)
     theta = ((row + 0.5) * SMALL.theta_cell - np.pi).astype(np.float32)
     rho = ((column + 0.5) * SMALL.rho_cell).astype(np.float32)
@@ -198,6 +199,7 @@ def test_soft_votes_equal_hard_votes_at_cell_centres(rng):
     np.testing.assert_allclose(soft, hard, atol=1e-4)
 
 
+@pytest.mark.slow
 @given(st.floats(-2, 2, width=32, allow_subnormal=False), angles, st.floats(0.125, 5, width=32))
 def test_soft_votes_sum_to_the_weight_and_are_continuous_across_the_seams(rho, theta, weight):
     soft = kernels.soft_accumulate(one(rho), one(theta), one(weight), SMALL)
@@ -274,6 +276,7 @@ def test_gradients_are_finite_everywhere(faw_ring, rng):
     assert np.abs(by_ring.position).max() > 0
 
 
+@pytest.mark.slow
 def test_forward_reverse_and_numerical_gradients_agree(faw_ring):
     arc = kernels.arc(one_path(faw_ring, 60), pitch=0.05, points=9)
     with jax.enable_x64(True):

@@ -89,7 +89,7 @@ def test_an_empty_accumulator_and_cells_at_the_level_have_no_maxima():
 
 @pytest.mark.parametrize("row", range(ROWS))
 @pytest.mark.parametrize("column", [0, 1, 4, COLUMNS - 1])
-def test_an_isolated_cell_gives_the_line_at_its_centre(row, column):
+def test_an_isolated_cell_gives_the_line_at_its_center(row, column):
     smooth = np.zeros((ROWS, COLUMNS))
     smooth[row, column] = 1.0
     ((rho, theta),) = peaks_of(smooth)

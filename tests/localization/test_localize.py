@@ -72,6 +72,7 @@ def test_global_localization_does_not_depend_on_the_frames(world):
     np.testing.assert_allclose(compose(inverse(turn), moved.poses), found.poses, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_one_scan_and_a_start_pose(world):
     for row, wrong in ((5, (0.2, -0.1, 0.1)), (8, (-0.15, 0.2, -0.15))):
         truth = office().poses[row : row + 1]

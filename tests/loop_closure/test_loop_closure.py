@@ -87,7 +87,7 @@ def test_a_similar_room_is_not_accepted_where_drift_moves_it_onto_the_known_one(
 
 def test_a_rectangle_is_not_rotated_by_half_a_turn():
     outline, half = rectangle(4.0, 3.2), np.array([4.0, 3.2, np.pi])
-    there = compose(half, SECOND)  # the same trajectory, rotated by half a turn about the centre of the room
+    there = compose(half, SECOND)  # the same trajectory, rotated by half a turn about the center of the room
     for seed in range(3):
         earlier, newest, true, prior, cov = two(outline, FIRST, SECOND, seed, 0.3)
         found = detect_closure(newest, earlier, prior, cov)
@@ -107,7 +107,7 @@ def test_repeating_doors_are_not_accepted_wrongly():
         second = drive((9.2 + shift, 0.8), (5.9 + shift, 0.8))
         earlier, newest, _, prior, cov = two(DOORS, drive((5.0, 0.9), (8.5, 0.9)), second, seed, 0.8)
         found = detect_closure(newest, earlier, prior, cov)
-        assert found is None or found.free is not None or found.log_odds < SETTINGS.acceptance_log_odds
+        assert found is None or found.undetermined_direction is not None or found.log_odds < SETTINGS.acceptance_log_odds
 
 
 def test_parallel_walls_leave_the_direction_along_them_undetermined():
@@ -118,9 +118,9 @@ def test_parallel_walls_leave_the_direction_along_them_undetermined():
         found = detect_closure(newest, earlier, prior, cov)
         if found is None:
             continue
-        assert found.free is not None
-        assert abs(found.free @ np.array([1.0, 0.0])) > 0.99
-        free = np.append(found.free, 0.0)
+        assert found.undetermined_direction is not None
+        assert abs(found.undetermined_direction @ np.array([1.0, 0.0])) > 0.99
+        free = np.append(found.undetermined_direction, 0.0)
         assert np.abs(found.information @ free).max() < 1e-6 * np.abs(found.information).max()
         assert np.linalg.matrix_rank(found.information, tol=1.0) == 2
         assert off_by(found, true)[1] < 32
@@ -158,7 +158,7 @@ def test_pair_residuals_and_their_derivatives(rng):
         step = np.zeros(3)
         step[k] = 1e-6
         sides = [pair_residuals(earlier, newest, *pairs, pose + sign * step).residual for sign in (1, -1)]
-        np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, seen.by_pose[..., k], atol=1e-6)
+        np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, seen.d_residual_d_pose[..., k], atol=1e-6)
     for k in range(2):
         step = np.zeros(2)
         step[k] = 1e-6
@@ -171,7 +171,7 @@ def test_pair_residuals_and_their_derivatives(rng):
             ).residual
             for sign in (1, -1)
         ]
-        np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, seen.by_newest[..., k], atol=1e-6)
+        np.testing.assert_allclose((sides[0] - sides[1]) / 2e-6, seen.d_residual_d_newest[..., k], atol=1e-6)
 
 
 def test_the_fit_is_the_least_squares_solution():
@@ -184,7 +184,7 @@ def test_the_fit_is_the_least_squares_solution():
         rows = (3 + 2 * pairs.earlier[:, None] + np.arange(2)).ravel()
         others = (3 + 2 * pairs.newest[:, None] + np.arange(2)).ravel()
         design = np.zeros((len(rows), len(others)))
-        for k, block in enumerate(pair_residuals(earlier, newest, *pairs, fit.pose).by_newest):
+        for k, block in enumerate(pair_residuals(earlier, newest, *pairs, fit.pose).d_residual_d_newest):
             design[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = block
         cov = earlier.covariance[np.ix_(rows, rows)] + design @ newest.covariance[np.ix_(others, others)] @ design.T
         off = seen.residual.ravel()
@@ -326,6 +326,6 @@ def test_overlap_candidates_are_few_and_near():
 
 
 def test_without_removes_one_pair():
-    pairs = Pairs(np.array([3, 1, 2]), np.array([0, 4, 5])).without(1)
+    pairs = Pairs(np.array([3, 1, 2]), np.array([0, 4, 5])).take(np.array([0, 2]))
     assert pairs.earlier.tolist() == [3, 2]
     assert pairs.newest.tolist() == [0, 5]

@@ -32,7 +32,7 @@ def segment(start, end, *, seen_from=None, last_seen=0.0, scan=0, info=1e4, echo
         normal = -normal
     half = np.linalg.norm(end - start) / 2
     return WallSegments(
-        centre=middle[None],
+        center=middle[None],
         theta=np.array([math.atan2(normal[1], normal[0])]),
         extent=np.array([[-half, half]]),
         info_offset=np.array([info]),
@@ -55,7 +55,7 @@ def answer_of(point, pose, *, half=0.15, **about):
 
 def moved(segments, turn, shift):
     theta = oracles.wrap(segments.theta + turn)
-    return dataclasses.replace(segments, centre=segments.centre @ rotation(turn).T + shift, theta=theta)
+    return dataclasses.replace(segments, center=segments.center @ rotation(turn).T + shift, theta=theta)
 
 
 def echoes_of(segments):
@@ -135,6 +135,7 @@ def test_short_walls_apart_from_everything_stay():
     assert len(cleaned(concatenate(sides))) == 4
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(st.integers(0, 10_000), st.integers(0, 30))
 def test_long_walls_always_stay_in_any_order_and_frame(seed, count):
@@ -159,10 +160,10 @@ def test_a_corner_line_beyond_the_observed_end_of_its_wall_is_removed():
     beside = segment((2.945, 1.91), (3.392, 1.939), seen_from=(3.1, 0.7))
     corner = segment((2.826, 2.066), (3.036, 1.976), seen_from=(2.4, 0.6))  # true corner: (2.916, 2.028)
     walls = numbered([door, beside, corner])
-    # The centre of a fused segment is not the middle between its ends.
+    # The center of a fused segment is not the middle between its ends.
     moved_on = dataclasses.replace(
         walls,
-        centre=walls.centre + np.array([[0, 0], [0, 0], [0.016, -0.007]]),
+        center=walls.center + np.array([[0, 0], [0, 0], [0.016, -0.007]]),
         extent=walls.extent + np.array([[0], [0], [0.0175]]),
     )
     assert echoes_of(cleaned(walls)) == [100, 101]

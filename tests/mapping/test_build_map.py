@@ -122,6 +122,7 @@ def covered(world, line, *, within=0.08):
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("merging", MERGING_METHODS)
 @pytest.mark.parametrize("shift", [(0.3, -0.7), (-12.1, 4.0), (1000.0, 0.1)])
 def test_map_is_equivariant_under_translations_by_whole_cells(office_log, shift, merging):
@@ -133,6 +134,7 @@ def test_map_is_equivariant_under_translations_by_whole_cells(office_log, shift,
     np.testing.assert_allclose(here.sigma_theta, there.sigma_theta, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_map_is_equivariant_under_rigid_motions(office_log, seed):
     """Other cells give other groups in the fusion, so the result differs slightly: by less than 1 mm."""
@@ -142,6 +144,7 @@ def test_map_is_equivariant_under_rigid_motions(office_log, seed):
     assert_same_map(here, there, turn=turn, shift=shift, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("split", [1, 8, 16])
 def test_the_union_of_two_parts_is_the_evidence_of_the_whole(office_log, split):
     parts = [in_order(office_log, rows) for rows in np.split(np.arange(len(office_log)), [split])]
@@ -165,6 +168,7 @@ def test_the_order_of_the_scans_does_not_matter(office_log, seed, merging):
     assert_same_map(here, there, atol=1e-9 if merging == "fused" else 1e-5)
 
 
+@pytest.mark.slow
 def test_the_same_log_gives_exactly_the_same_map(office_log):
     one, two = build_map(RING, office_log), build_map(RING, office_log)
     for name in ("segments", "rho", "theta", "sigma_rho", "sigma_theta", "echoes"):
@@ -172,6 +176,7 @@ def test_the_same_log_gives_exactly_the_same_map(office_log):
     assert one.scans == two.scans
 
 
+@pytest.mark.slow
 def test_invariants_of_a_map(office_maps):
     """Lines pass through their segments, walls are sorted by echoes, scans ascend, and enough scans saw each wall."""
     for world in office_maps:
@@ -224,6 +229,7 @@ def test_a_robot_without_free_space_gets_a_map(merging):
     assert isinstance(build_map(RING, log, merging=merging), GlobalMap)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("merging", MERGING_METHODS)
 def test_scans_without_a_pose_are_left_out(office_log, merging):
     pose = office_log.pose.copy()
@@ -296,6 +302,7 @@ def test_a_repeated_scan_number_is_refused_with_its_row(office_log, tmp_path):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_every_wall_of_the_office_within_reach_is_one_segment(office, office_logs, office_maps, seed):
     """Walls with at least 8 true echoes in two scans, including the chair; every segment is on a wall."""
@@ -310,6 +317,7 @@ def test_every_wall_of_the_office_within_reach_is_one_segment(office, office_log
     assert 0.3 < np.linalg.norm(np.diff(office_maps[seed].segments[chair], axis=0)) < 0.6
 
 
+@pytest.mark.slow
 def test_walls_of_the_office_are_accurate(office, office_maps):
     """Root mean square errors over all seeds: half a centimetre, two degrees."""
     off, turned = [], []
@@ -326,6 +334,7 @@ def test_walls_of_the_office_are_accurate(office, office_maps):
     assert np.abs(off).max() < 0.0323  # the paper's largest deviation of one scan
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_nothing_bridges_the_doors_recess(office, office_maps, seed):
     """The door lies 12 cm behind the wall: across the recess the map has no wall."""
@@ -380,6 +389,7 @@ def test_vanished_objects_leave_the_map_and_new_ones_enter_it(thing, count, roun
 DRIVE = np.column_stack([np.arange(-2.0, 2.01, 0.25), np.full(17, -1.0), np.zeros(17)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("behind", [None, 0.3, 0.8])
 def test_an_open_door_stays_open(behind, seed):
@@ -393,6 +403,7 @@ def test_an_open_door_stays_open(behind, seed):
     assert on_walls(world, np.array(walls, float)[:2]).sum(axis=0).tolist() == [1, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_wall_occluded_by_a_chair_is_one_segment(seed):
     walls = [[[-3, 0], [3, 0]], [[-0.25, -0.4], [0.25, -0.4]]]
@@ -402,6 +413,7 @@ def test_a_wall_occluded_by_a_chair_is_one_segment(seed):
     assert covered(world, [(-2.0, 0.0), (2.0, 0.0)]) > 3.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_random_rooms_are_recognizable(seed):
     """Loose bounds on recall and precision."""

@@ -33,7 +33,7 @@ def place_of(point, theta):
     return math.floor(point[0] / FREE.cell), math.floor(point[1] / FREE.cell), direction_of(theta)
 
 
-def centre_of(cells):
+def center_of(cells):
     """A point and a normal in the middle of each cell."""
     cells = np.asarray(cells)
     return (cells[:, :2] + 0.5) * FREE.cell, (cells[:, 2] + 0.5) * STEP
@@ -76,7 +76,7 @@ def test_query_gives_the_latest_times_in_descending_order(seed, count, around):
     rng = np.random.default_rng(seed)
     cells, when = some_cells(rng, count, around=around)
     seen = DirectionalFreeSpace().updated(cells, when)
-    points, theta = centre_of(cells)
+    points, theta = center_of(cells)
     times_found = seen.query(points, theta + 2 * math.pi * rng.integers(-2, 3, count))
     for cell, times in zip(cells, times_found, strict=True):
         by_hand = sorted(when[(cells == cell).all(axis=1)].tolist(), reverse=True)[: FREE.remembered]
@@ -89,8 +89,8 @@ def test_unobserved_cells_have_no_times(rng):
     known = set(map(tuple, cells.tolist()))
     others = [cell for cell in map(tuple, some_cells(rng, 2000)[0].tolist()) if cell not in known]
     assert len(others) > 100
-    assert np.isneginf(seen.query(*centre_of(others))).all()
-    assert np.isneginf(DirectionalFreeSpace().query(*centre_of(cells))).all()
+    assert np.isneginf(seen.query(*center_of(others))).all()
+    assert np.isneginf(DirectionalFreeSpace().query(*center_of(cells))).all()
     assert seen.query(np.zeros((0, 2)), np.zeros(0)).shape == (0, FREE.remembered)
 
 
@@ -215,7 +215,7 @@ def test_free_space_equals_the_oracle(ring):
 def test_without_echoes_the_cones_are_free(faw_ring):
     """Up to the certain fraction of the maximum range and of the width, in all directions, and no farther."""
     (cells,) = free_cells(faw_ring, [(0.0, 0.0, 0.0)], [[]], [np.zeros((0, 2, 2))])
-    points, theta = centre_of(sorted(cells))
+    points, theta = center_of(sorted(cells))
     farthest = np.linalg.norm(points, axis=-1).max()
     assert 0.28 + FREE.certain * 2.0 - 2 * FREE.cell < farthest < 0.28 + FREE.certain * 2.0 + FREE.cell
     # Most positions that face a sensor; far ones may lie between the rays.
@@ -264,7 +264,7 @@ def test_a_wall_with_echoes_is_not_free(rho, theta, heading, x):
         for shift in (-0.03, 0.0, 0.03):
             foot = transform_points(pose, position + (rho - position @ normal + shift) * normal)
             assert place_of(foot, theta + heading) not in cells
-    points, facing = centre_of(sorted(cells))
+    points, facing = center_of(sorted(cells))
     robot = (points - pose[:2]) @ np.array(
         [[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]]
     )
@@ -323,7 +323,7 @@ def test_walls_of_the_office_are_never_free():
     log = heard.as_log(office.ring, office.poses)
     seen = gather_evidence(office.ring, log, list(local_models(office.ring, log))).free_space
     truth = {place for pose in office.poses for place in true_places(office.ring, office.room, pose)}
-    points, theta = centre_of(sorted(truth))
+    points, theta = center_of(sorted(truth))
     times_found = seen.query(points, theta)
     assert len(truth) > 50
     assert np.isneginf(times_found[:, -1]).all()  # three scans in agreement would remove a wall

@@ -73,6 +73,7 @@ SETS = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", SETS, ids=lambda points: points.__name__)
 @settings(max_examples=25, phases=[Phase.generate])
 @given(seed=SEEDS, n=st.integers(2, 50), cut=st.sampled_from([0.05, 0.4, 2.0]))
@@ -112,7 +113,7 @@ def paper(segments, cut):
         origin = midpoints[members].mean(axis=0)
         lines = []
         for m in members:
-            rho, theta = (segments.centre[m] - origin) @ segments.normal[m], segments.theta[m]
+            rho, theta = (segments.center[m] - origin) @ segments.normal[m], segments.theta[m]
             lines.append((rho, theta) if rho >= 0 else (-rho, oracles.wrap(theta + math.pi)))
         columns = int(max(rho for rho, _ in lines) / 0.10) + 3
         settings = HoughSettings(rho_cell=0.10, rho_cells=columns)
@@ -147,11 +148,11 @@ def office(rng, count):
     foot, theta = rng.uniform(-2, 2, (walls, 2)), rng.uniform(-np.pi, np.pi, walls)
     wall = rng.integers(0, walls, count)
     tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
-    centre = foot[wall] + rng.uniform(-1, 1, count)[:, None] * tangent[wall] + rng.normal(0, 0.01, (count, 2))
+    center = foot[wall] + rng.uniform(-1, 1, count)[:, None] * tangent[wall] + rng.normal(0, 0.01, (count, 2))
     turn = theta[wall] + rng.normal(0, np.radians(3), count)
     stray = rng.random(count) < 0.1
-    centre[stray], turn[stray] = rng.uniform(-3, 3, (stray.sum(), 2)), rng.uniform(-np.pi, np.pi, stray.sum())
-    return segments_at(centre, turn, length=rng.uniform(0.3, 0.6, count))
+    center[stray], turn[stray] = rng.uniform(-3, 3, (stray.sum(), 2)), rng.uniform(-np.pi, np.pi, stray.sum())
+    return segments_at(center, turn, length=rng.uniform(0.3, 0.6, count))
 
 
 @pytest.mark.slow
@@ -186,8 +187,8 @@ def walls_apart(rng, count, each):
     place = 3.0 * np.stack([wall % 4, wall // 4], axis=-1)
     along = np.tile((np.arange(each) - (each - 1) / 2) * 0.2, count)
     tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
-    centre = place + along[:, None] * tangent + rng.normal(0, 0.005, (len(wall), 2))
-    return segments_at(centre, theta + rng.normal(0, np.radians(1), len(wall)))
+    center = place + along[:, None] * tangent + rng.normal(0, 0.005, (len(wall), 2))
+    return segments_at(center, theta + rng.normal(0, np.radians(1), len(wall)))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -215,6 +216,7 @@ def test_merging_is_equivariant_under_rigid_motions(cells, shift):
     assert there.take(order).chi_squared == pytest.approx(here.chi_squared, rel=1e-3, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_the_order_of_the_segments_does_not_matter(seed):
     rng = np.random.default_rng(seed)
@@ -239,7 +241,7 @@ def test_parallel_walls_in_one_cluster_are_two(theta):
 
 
 def test_merged_walls_face_like_their_segments():
-    """Normals point away from the robot, not away from the centre of the cluster."""
+    """Normals point away from the robot, not away from the center of the cluster."""
     segments = segments_at([[0, 0], [0, 0.3], [0.5, 0], [0.5, 0.3]], np.zeros(4))
     merged = merge_by_hough(segments, linkage_distance=0.6)
     assert len(merged) == 2
@@ -250,15 +252,15 @@ def test_merged_walls_face_like_their_segments():
 def test_a_wall_far_from_the_origin_is_not_lost(far):
     """The paper's accumulator covers ten metres from the world's origin and would contain none of these."""
     along = np.linspace(-0.5, 0.5, 6)
-    centre = np.stack([0 * along, along], axis=-1)
-    there = moved(segments_at(centre, np.zeros(6)), (far, far, 0.3))
+    center = np.stack([0 * along, along], axis=-1)
+    there = moved(segments_at(center, np.zeros(6)), (far, far, 0.3))
     merged = merge_by_hough(there, linkage_distance=CUT)
     assert len(merged) == 1
-    assert ((merged.centre - far) @ [math.cos(0.3), math.sin(0.3)]) == pytest.approx([0], abs=1e-4)
+    assert ((merged.center - far) @ [math.cos(0.3), math.sin(0.3)]) == pytest.approx([0], abs=1e-4)
 
 
 @pytest.mark.slow
-def test_a_large_cluster_with_walls_far_from_its_centre():
+def test_a_large_cluster_with_walls_far_from_its_center():
     """Walls along a street form one cluster; rho exceeds a kilometre."""
     along = np.arange(0, 2500, 50.0)
     merged = merge_by_hough(segments_at(np.stack([along, 0 * along], axis=-1), 0 * along), linkage_distance=60.0)
@@ -271,7 +273,7 @@ def test_nothing_to_merge(count):
     assert same(merge_by_hough(segments, linkage_distance=CUT), segments)
 
 
-def test_a_wall_through_the_cluster_centre_seen_from_both_sides_is_one():
+def test_a_wall_through_the_cluster_center_seen_from_both_sides_is_one():
     """Lines around rho = 0, with normals to both sides: the seam at rho = 0."""
     along = np.linspace(-0.6, 0.6, 8)
     across = 0.01 * (-1.0) ** np.arange(8)
@@ -279,5 +281,5 @@ def test_a_wall_through_the_cluster_centre_seen_from_both_sides_is_one():
     merged = merge_by_hough(segments, linkage_distance=CUT)
     assert len(merged) == 1
     assert merged.count.tolist() == [8]
-    assert abs(merged.centre[0, 0]) < 1e-3
+    assert abs(merged.center[0, 0]) < 1e-3
     assert abs(math.cos(merged.theta[0])) == pytest.approx(1, abs=1e-4)

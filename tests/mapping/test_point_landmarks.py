@@ -208,7 +208,7 @@ def walls_of(*segments, sigma=0.001, turn=0.002, count=4):
     length = np.linalg.norm(along, axis=-1)
     n = len(ends)
     return WallSegments(
-        centre=ends.mean(axis=1),
+        center=ends.mean(axis=1),
         theta=np.arctan2(-along[:, 0], along[:, 1]),
         extent=np.stack([-length, length], axis=-1) / 2,
         info_offset=np.full(n, sigma**-2),
@@ -325,6 +325,7 @@ def ends_off(world, room):
     return np.array(off)
 
 
+@pytest.mark.slow
 def test_points_of_the_office_are_where_walls_end(office_map):
     office, runs = office_map
     junctions = office.room.junctions
@@ -341,6 +342,7 @@ def test_points_of_the_office_are_where_walls_end(office_map):
         assert (np.diff(world.point_echoes) <= 0).all()
 
 
+@pytest.mark.slow
 def test_snapped_ends_are_closer_to_the_true_ends_than_footpoints(office_map):
     office, runs = office_map
     with_points, without = [], []
@@ -353,11 +355,13 @@ def test_snapped_ends_are_closer_to_the_true_ends_than_footpoints(office_map):
     assert (ends < 0.02).mean() > 2 * (feet < 0.02).mean()
 
 
+@pytest.mark.slow
 def test_merging_as_in_the_paper_has_no_points(office_map):
     _, runs = office_map
     assert len(assemble_map(runs[0][2], merging="paper").points) == 0
 
 
+@pytest.mark.slow
 def test_scan_by_scan_in_any_order_equals_all_at_once(office_map, rng):
     office, runs = office_map
     log, models, evidence = runs[0]
@@ -415,11 +419,12 @@ def test_a_line_with_foreign_echoes_is_down_weighted():
     together = np.zeros(7, np.int64)
     plain = segments.fuse(together)
     settled = robust_refit(segments, together, plain)
-    assert abs(settled.centre[0, 1]) < 0.3 * abs(plain.centre[0, 1])
+    assert abs(settled.center[0, 1]) < 0.3 * abs(plain.center[0, 1])
     clean = segments.take(np.arange(6))
-    assert robust_refit(clean, together[:6], clean.fuse(together[:6])).centre[0, 1] == pytest.approx(0, abs=1e-12)
+    assert robust_refit(clean, together[:6], clean.fuse(together[:6])).center[0, 1] == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_map_figure_shows_the_points(office_map):
     world = assemble_map(office_map[1][0][2])
     figure = map_figure(world)

@@ -39,11 +39,11 @@ def seen_walls(rng, walls, each, *, noise=1.0, reach=0.2):
     tangent = along / size[:, None]
     normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=-1)
     place = np.tile((np.arange(each) + 0.5) / each, len(walls)) * (size - 2 * reach) + reach
-    centre = walls[wall, 0] + place[:, None] * tangent
-    centre += noise * rng.normal(0, NOISE.offset_sd, len(wall))[:, None] * normal
+    center = walls[wall, 0] + place[:, None] * tangent
+    center += noise * rng.normal(0, NOISE.offset_sd, len(wall))[:, None] * normal
     theta = np.arctan2(normal[:, 1], normal[:, 0]) + noise * rng.normal(0, NOISE.theta_sd, len(wall))
     order = rng.permutation(len(wall))
-    return segments_at(centre, theta, length=2 * reach).take(order), wall[order]
+    return segments_at(center, theta, length=2 * reach).take(order), wall[order]
 
 
 def every_pair(count):
@@ -89,6 +89,7 @@ def crowd(rng):
 # --- the result ---
 
 
+@pytest.mark.slow
 @SOME
 @given(SEEDS)
 def test_segments_of_a_house_become_its_walls(seed):
@@ -113,9 +114,9 @@ def test_no_two_walls_match(seed, gap):
 def parallels(offset, first, last, *, theta=0.0):
     """Long parallel walls with small covariances."""
     first, last = np.broadcast_arrays(np.asarray(first, float), np.asarray(last, float), offset)[:2]
-    centre = np.stack([np.asarray(offset, float), (first + last) / 2], axis=-1)
-    sure = np.full(len(centre), 1e6)
-    return segments_at(centre, theta + 0 * first, length=last - first, info_offset=sure, info_theta=sure)
+    center = np.stack([np.asarray(offset, float), (first + last) / 2], axis=-1)
+    sure = np.full(len(center), 1e6)
+    return segments_at(center, theta + 0 * first, length=last - first, info_offset=sure, info_theta=sure)
 
 
 @pytest.mark.parametrize("beside", range(13))
@@ -178,6 +179,7 @@ def test_fusion_is_idempotent(seed):
     assert wall_of.tolist() == list(range(len(walls)))
 
 
+@pytest.mark.slow
 @SOME
 @given(SEEDS, st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-4, 4)))
 def test_fusion_is_equivariant_under_rigid_motions(seed, pose):
@@ -203,8 +205,8 @@ def test_distant_walls_do_not_affect_each_other():
     far = moved(segments, (1e4, -1e4, 1.0))
     both, _ = fuse_segments(concatenate([segments, far]), gap=GAP)
     one, other = fuse_segments(segments, gap=GAP)[0], fuse_segments(far, gap=GAP)[0]
-    near(both.take(both.centre[:, 0] < 1e3), one, 1e-9)
-    near(both.take(both.centre[:, 0] > 1e3), other, 1e-9)
+    near(both.take(both.center[:, 0] < 1e3), one, 1e-9)
+    near(both.take(both.center[:, 0] > 1e3), other, 1e-9)
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -239,6 +241,7 @@ def test_parallel_walls(seed, apart):
     assert len(fuse_segments(segments, gap=GAP)[0]) == expected
 
 
+@pytest.mark.slow
 @SOME
 @given(SEEDS, st.sampled_from([(0.12, 2), (0.08, 2), (0.01, 1)]))
 def test_the_two_faces_of_a_wall(seed, apart):
@@ -300,6 +303,7 @@ def test_openings_stay_open():
     assert same(fuse_segments(walls, gap=GAP, is_opening=opening)[0], walls)
 
 
+@pytest.mark.slow
 @SOME
 @given(SEEDS)
 def test_without_openings_nothing_changes(seed):

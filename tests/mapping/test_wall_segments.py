@@ -24,10 +24,10 @@ SOME = settings(max_examples=40, phases=[Phase.generate])
 def one_wall(rng, count, *, noise=1.0, theta=0.7, length=3.0):
     """Segments of one straight wall with a distinct value in every column; noise 1 is that of the Hough detector."""
     along, across = rng.uniform(-length / 2, length / 2, count), rng.normal(0, noise * NOISE.offset_sd, count)
-    centre = np.array([2.0, -1.0]) + np.stack([across, along], axis=-1) @ rotation(theta).T
+    center = np.array([2.0, -1.0]) + np.stack([across, along], axis=-1) @ rotation(theta).T
     seen = [sorted(rng.choice(40, rng.integers(1, 5), replace=False).tolist()) for _ in range(count)]
     return segments_at(
-        centre,
+        center,
         theta + rng.normal(0, noise * NOISE.theta_sd, count),
         extent=np.sort(rng.uniform(-0.4, 0.4, (count, 2)), axis=1),
         info_offset=rng.uniform(0.5, 3, count) * NOISE.offset_sd**-2,
@@ -44,7 +44,7 @@ def one_wall(rng, count, *, noise=1.0, theta=0.7, length=3.0):
 def near(one, two, tolerance, *, extent=None):
     """Assert that lines (m, rad) and ends (m) differ by less than the tolerance, and nothing else differs."""
     turn = np.abs(wrap_angle(one.theta - two.theta))
-    across = np.abs(((one.centre - two.centre) * one.normal).sum(-1))
+    across = np.abs(((one.center - two.center) * one.normal).sum(-1))
     assert turn.max() < tolerance
     assert across.max() < tolerance
     assert np.abs(one.endpoints - two.endpoints).max() < (tolerance if extent is None else extent)
@@ -139,7 +139,7 @@ def least_squares_line(segments, origin):
     def deviations(line):
         offset, theta = line
         n = np.array([math.cos(theta), math.sin(theta)])
-        across = [(centre - origin) @ n - offset for centre in segments.centre]
+        across = [(center - origin) @ n - offset for center in segments.center]
         turn = [(t - theta + math.pi) % (2 * math.pi) - math.pi for t in segments.theta]
         return np.concatenate([np.sqrt(segments.info_offset) * across, np.sqrt(segments.info_theta) * turn])
 
@@ -147,16 +147,17 @@ def least_squares_line(segments, origin):
     return found.x, 2 * found.cost, found.jac.T @ found.jac
 
 
+@pytest.mark.slow
 @SOME
 @given(SEEDS, st.integers(2, 12))
 def test_fusion_is_the_least_squares_line(seed, count):
     segments = one_wall(np.random.default_rng(seed), count, noise=0.02)  # small angles
     total = all_of(segments)
-    (offset, theta), misfit, information = least_squares_line(segments, total.centre[0])
+    (offset, theta), misfit, information = least_squares_line(segments, total.center[0])
     assert wrap_angle(total.theta - theta) == pytest.approx(0, abs=1e-6)
     assert offset == pytest.approx(0, abs=1e-7)
     assert total.chi_squared - segments.chi_squared.sum() == pytest.approx(misfit, rel=1e-3)
-    # At the centre the errors of offset and direction are uncorrelated.
+    # At the center the errors of offset and direction are uncorrelated.
     assert np.diag(information) == pytest.approx([total.info_offset[0], total.info_theta[0]], rel=1e-3)
     assert abs(information[0, 1]) < 1e-3 * math.sqrt(information[0, 0] * information[1, 1])
 
@@ -235,7 +236,7 @@ def test_fusion_adds_up_the_columns(seed, count):
         )
         assert total.chi_squared[k] >= sum(segments.chi_squared[mine]) * (1 - 1e-12)
         assert total.info_theta[k] >= max(segments.info_theta[mine])
-        way = [float((end - total.centre[k]) @ total.tangent[k]) for end in segments.endpoints[mine].reshape(-1, 2)]
+        way = [float((end - total.center[k]) @ total.tangent[k]) for end in segments.endpoints[mine].reshape(-1, 2)]
         assert total.extent[k] == pytest.approx([min(way), max(way)], abs=1e-12)  # outermost projections, no farther
 
 

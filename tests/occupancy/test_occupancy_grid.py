@@ -46,8 +46,8 @@ def silent(poses):
     return Log.from_echoes(nothing, nothing, nothing, np.zeros(0), stamp=np.arange(len(poses)) / 10, pose=poses)
 
 
-def centres(grid):
-    """Centre (x, y) of each pixel of the image."""
+def centers(grid):
+    """Center (x, y) of each pixel of the image."""
     rows, columns = grid.free.shape
     x = grid.origin[0] + (np.arange(columns) + 0.5) * grid.resolution
     y = grid.origin[1] + (np.arange(rows) + 0.5) * grid.resolution
@@ -80,10 +80,10 @@ def free_trajectory(rng, room, *, step=0.1, clearance=0.35):
     return poses[clear]
 
 
-def circle(centre, radius, count):
+def circle(center, radius, count):
     """Poses on a circle with tangential headings."""
     angle = 2 * np.pi * np.arange(count) / count
-    return np.stack([centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle), angle + QUARTER], axis=-1)
+    return np.stack([center[0] + radius * np.cos(angle), center[1] + radius * np.sin(angle), angle + QUARTER], axis=-1)
 
 
 def shuffled(log, order):
@@ -136,7 +136,7 @@ def test_free_cells_are_truly_free_and_most_cells_near_the_robot_are_known(faw_r
     poses = free_trajectory(rng, room)
     log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed, **errors).as_log(faw_ring, poses)
     grid = occupancy(faw_ring, log, walls=room.walls)
-    image, points = grid.classify(), centres(grid)
+    image, points = grid.classify(), centers(grid)
     inside = truly_free(room, points)
     free = image == FREE
     assert inside[free].mean() >= 0.99
@@ -156,14 +156,14 @@ def test_unknown_walls_become_obstacles(faw_ring, seed):
     poses = free_trajectory(rng, room, step=0.05)
     log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed).as_log(faw_ring, poses)
     grid = occupancy(faw_ring, log)
-    image, points = grid.classify(), centres(grid)
+    image, points = grid.classify(), centers(grid)
     assert truly_free(room, points)[image == FREE].mean() > 0.85
     gap = point_to_segments(points.reshape(-1, 2), room.walls).min(axis=1).reshape(image.shape)
     assert np.mean(gap[image == OCCUPIED] < 0.15) > 0.6
 
 
 def test_the_office_is_free_inside_and_unknown_outside(office, office_grid):
-    image, points = office_grid.classify(), centres(office_grid)
+    image, points = office_grid.classify(), centers(office_grid)
     shell = office.room.walls[[name != "chair back-rest" for name in office.room.wall_names]]
     inside = shapely.contains_xy(shapely.Polygon(shell[:, 0]), points[..., 0], points[..., 1])
     assert inside[image == FREE].all()
@@ -187,7 +187,7 @@ def test_no_echo_is_free_space_and_never_a_wall(faw_ring):
     grid = occupancy(faw_ring, silent(poses))
     image = grid.classify()
     assert not (image == OCCUPIED).any()
-    reach = np.linalg.norm(centres(grid)[:, :, None] - poses[:, :2], axis=-1).min(axis=2)
+    reach = np.linalg.norm(centers(grid)[:, :, None] - poses[:, :2], axis=-1).min(axis=2)
     assert (image[reach < 2.0] == FREE).mean() > 0.99
     assert (image[reach > 2.28 + 0.05] == UNKNOWN).all()
     at_max = Log.from_echoes(
@@ -200,7 +200,7 @@ def test_an_unknown_pole_becomes_an_obstacle_at_its_position(faw_ring):
     pole = np.array([0.33, 0.21])
     poses = circle(pole, 0.9, 24)
     grid = occupancy(faw_ring, listen(faw_ring, [], poses, poles=pole))
-    image, points = grid.classify(), centres(grid)
+    image, points = grid.classify(), centers(grid)
     gap = np.linalg.norm(points - pole, axis=-1)
     assert (image[gap < 0.04] == OCCUPIED).all()
     assert gap[image == OCCUPIED].max() < 0.2
@@ -210,7 +210,7 @@ def test_an_unknown_pole_becomes_an_obstacle_at_its_position(faw_ring):
 def test_an_arc_from_a_single_viewpoint_is_not_an_obstacle(faw_ring):
     poses = np.tile([0.1, 0.1, 0.3], (50, 1))
     grid = occupancy(faw_ring, listen(faw_ring, [], poses, poles=[1.0, 0.4]))
-    image, points = grid.classify(), centres(grid)
+    image, points = grid.classify(), centers(grid)
     assert not (image == OCCUPIED).any()
     assert not (image[np.linalg.norm(points - [1.0, 0.4], axis=-1) < 0.05] == FREE).any()
 
@@ -219,7 +219,7 @@ def test_an_obstacle_in_front_of_a_known_wall_is_kept(faw_ring):
     wall = [[-3.0, 1.5], [3.0, 1.5]]
     poses = np.stack([np.linspace(-1, 1, 21), np.zeros(21), np.zeros(21)], axis=-1)
     grid = occupancy(faw_ring, listen(faw_ring, [wall], poses, poles=[0.1, 0.9]), walls=np.array([wall]))
-    image, points = grid.classify(), centres(grid)
+    image, points = grid.classify(), centers(grid)
     assert (image[np.linalg.norm(points - [0.1, 0.9], axis=-1) < 0.04] == OCCUPIED).all()
     assert not (image[points[..., 1] > 1.5] == FREE).any()
 
@@ -231,7 +231,7 @@ def test_a_known_wall_bounds_oblique_beams(faw_ring):
     behind = {}
     for known in (True, False):
         grid = occupancy(faw_ring, log, walls=wall if known else NO_WALLS)
-        behind[known] = centres(grid)[grid.classify() == FREE]
+        behind[known] = centers(grid)[grid.classify() == FREE]
         behind[known] = behind[known][behind[known][:, 1] > 0.8]
     assert not len(behind[True])
     # Beside the trajectory there are always sensors that face the wall and hear it.
@@ -246,7 +246,7 @@ def test_walls_that_end_too_early_are_extended(faw_ring, seed):
     poses = np.stack([random_pose(rng, room) for _ in range(40)])
     log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed).as_log(faw_ring, poses)
     grid = occupancy(faw_ring, log, walls=build_map(faw_ring, log).segments)
-    image, points = grid.classify(), centres(grid)
+    image, points = grid.classify(), centers(grid)
     inside = truly_free(room, points)
     assert inside[image == FREE].mean() >= 0.98
     clear = point_to_segments(points.reshape(-1, 2), room.walls).min(axis=1).reshape(inside.shape) > 0.1
@@ -254,9 +254,10 @@ def test_walls_that_end_too_early_are_extended(faw_ring, seed):
     assert (image == FREE)[inside & clear & near].mean() > 0.9
 
 
+@pytest.mark.slow
 def test_the_office_with_the_walls_of_its_map_is_free_inside_only(office, heard):
     grid = occupancy(office.ring, heard, walls=build_map(office.ring, heard).segments)
-    image, points = grid.classify(), centres(grid)
+    image, points = grid.classify(), centers(grid)
     inside = truly_free(office.room, points)
     assert inside[image == FREE].mean() >= 0.98
     assert np.mean(image[inside] == FREE) > 0.85
@@ -266,14 +267,14 @@ def test_an_open_door_is_free_for_beams_perpendicular_to_it(faw_ring):
     walls = np.array([[[-3.0, 1.0], [-0.4, 1.0]], [[0.4, 1.0], [3.0, 1.0]]])
     past = np.stack([np.linspace(-1, 1, 21), np.zeros(21), np.zeros(21)], axis=-1)
     grid = occupancy(faw_ring, listen(faw_ring, walls, past), walls=walls)
-    points = centres(grid)
+    points = centers(grid)
     x, y = np.abs(points[..., 0]), points[..., 1]
     assert (grid.classify()[(x < 0.3) & (y > 0.9) & (y < 1.6)] == FREE).all()
     assert not (grid.classify()[(x > 0.6) & (y > 1.05)] == FREE).any()
     # From oblique views it is unknown whether the wall continues.
     aside = past[past[:, 0] < -0.65]
     grid = occupancy(faw_ring, listen(faw_ring, walls, aside), walls=walls)
-    assert not (grid.classify()[centres(grid)[..., 1] > 1.05] == FREE).any()
+    assert not (grid.classify()[centers(grid)[..., 1] > 1.05] == FREE).any()
 
 
 def test_a_wall_extends_until_a_sensor_would_have_heard_it_or_it_meets_another():
@@ -309,7 +310,7 @@ def test_sensors_that_did_not_fire_contribute_nothing(faw_ring):
     poses = circle((0.0, 0.0), 0.5, 12)
     fired = np.zeros((12, 24), bool)
     grid = occupancy(faw_ring, silent(poses), fired=fired)
-    points = centres(grid)
+    points = centers(grid)
     gap = np.linalg.norm(points[:, :, None] - poses[:, :2], axis=-1).min(axis=2)
     assert gap[grid.classify() == FREE].max() < 0.28  # only the robot's own body
 
@@ -318,7 +319,7 @@ def test_sensors_without_an_outline_have_no_footprint_area():
     for position in ([(0.2, 0.0)], [(0.2, -0.2), (0.2, 0.0), (0.2, 0.2)]):
         ring = Ring(position, np.zeros(len(position)), beam=0.5, neighbors=0, max_range=1.0)
         grid = occupancy(ring, silent(np.zeros((3, 3))))
-        points = centres(grid)
+        points = centers(grid)
         assert points[grid.classify() == FREE][:, 0].min() > 0.2
         assert points[grid.classify() == FREE][:, 0].max() == pytest.approx(1.175)
 

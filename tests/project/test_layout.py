@@ -234,6 +234,7 @@ def test_no_import_cycles():
     assert import_cycles(ROOT) == []
 
 
+@pytest.mark.slow
 def test_kernels_and_hardware_are_leaves():
     assert leaf_violations(ROOT) == []
 
@@ -246,6 +247,7 @@ def test_sizes():
     assert oversized(ROOT) == []
 
 
+@pytest.mark.slow
 def test_names_are_unambiguous():
     assert ambiguous_names(ROOT) == []
 
@@ -448,6 +450,7 @@ def test_drivers_do_without_jax():
     assert python(f"import sys, {names}; print(*(set({heavy}) & set(sys.modules)))") == []
 
 
+@pytest.mark.slow
 def test_no_sub_package_hides_a_public_name():
     """``jaxsonar.simulate`` is a function. Importing any module must not replace it by a module."""
     names = ", ".join(name for name in modules(ROOT) if name != "jaxsonar" and not name.endswith("__main__"))

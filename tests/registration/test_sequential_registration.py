@@ -106,6 +106,7 @@ def test_scans_without_features_are_left_out_and_do_not_disturb_others():
         assert_same(found[left], poses[left], position=1e-6, turn=1e-6)
 
 
+@pytest.mark.slow
 def test_a_bare_corridor_needs_odometry():
     """Two parallel walls do not determine the position along them."""
     corridor = np.array([[-9.0, -1.0], [9.0, -1.0], [9.0, 1.0], [-9.0, 1.0]])
@@ -181,10 +182,10 @@ def drifting(poses, share, rng):
 
 def assert_aligned(found, poses, *, position, turn):
     """The poses agree after rigid alignment by least squares."""
-    centred, expected = (xy - xy.mean(axis=0) for xy in (found[:, :2], poses[:, :2]))
+    centered, expected = (xy - xy.mean(axis=0) for xy in (found[:, :2], poses[:, :2]))
     # Kabsch in the complex plane.
-    angle = np.angle((np.conj(centred @ [1, 1j]) * (expected @ [1, 1j])).sum())
-    moved = transform_points(np.array([0.0, 0.0, angle]), centred)
+    angle = np.angle((np.conj(centered @ [1, 1j]) * (expected @ [1, 1j])).sum())
+    moved = transform_points(np.array([0.0, 0.0, angle]), centered)
     assert np.linalg.norm(moved - expected, axis=1).max() < position
     assert np.abs(wrap_angle(found[:, 2] + angle - poses[:, 2])).max() < turn
 

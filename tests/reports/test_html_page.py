@@ -151,6 +151,7 @@ def test_images_are_the_figures(page):
         assert (attributes["width"], attributes["height"]) == ("384", "288")
 
 
+@pytest.mark.slow
 def test_a_figure_too_large_as_svg_becomes_png(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "PAGE_BYTES", 200_000)
     heavy = Section("", [Picture(a_figure(20_000), "many points"), Picture(a_figure(), "few")])

@@ -176,6 +176,7 @@ def test_drawing_does_not_change_the_global_style():
     assert dict(matplotlib.rcParams) == before
 
 
+@pytest.mark.slow
 def test_all_audible_paths_of_a_scan_have_an_arc(faw_ring):
     """As many curves as there are paths with overlapping cones and no echo, plus the echoes."""
     here = office()
@@ -234,6 +235,7 @@ def test_many_positions_are_a_trajectory_without_numbers(poses, numbers):
     assert np.size(crosses.get_xdata()) <= plot_map.MAX_NUMBERED_POSES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(25, 4), (4, 25), (4, 4), (200, 1), (1, 200), (0.3, 0.3)])
 def test_the_figure_size_fits_the_plan(size):
     """Corridors along x get wide figures, along y figures of limited height; both axes have the same scale."""
@@ -262,6 +264,7 @@ def test_every_end_of_a_segment_has_a_tick_across():
     np.testing.assert_allclose(np.linalg.norm(across, axis=-1), 8)  # points
 
 
+@pytest.mark.slow
 def test_a_thousand_segments_are_few_elements(rng, tmp_path):
     """The number of artists does not grow with the number of scans."""
     ends = rng.uniform(0, 20, (1000, 2, 2))
@@ -297,6 +300,7 @@ def svg_names(path):
     return {element.tag.rpartition("}")[2] for element in ElementTree.parse(path).iter()}
 
 
+@pytest.mark.slow
 def test_svg_is_xml_and_the_same_twice(figure, tmp_path):
     plot_style.save_figure(figure, tmp_path / "a.svg")
     plot_style.save_figure(plot_scan.ring_figure(BUMPER), tmp_path / "b.svg")
@@ -304,6 +308,7 @@ def test_svg_is_xml_and_the_same_twice(figure, tmp_path):
     assert {"svg", "path", "g"} <= svg_names(tmp_path / "a.svg")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -322,6 +327,7 @@ def test_every_svg_is_the_same_twice(tmp_path, name):
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
 
 
+@pytest.mark.slow
 def test_png_and_pdf(figure, tmp_path):
     plot_style.save_figure(figure, str(tmp_path / "a.PNG"))
     head = (tmp_path / "a.PNG").read_bytes()
@@ -335,6 +341,7 @@ def test_png_and_pdf(figure, tmp_path):
     assert body.rstrip().endswith(b"%%EOF")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.gif", "a", "svg", "a.svg.txt"])
 def test_another_suffix_is_rejected(figure, tmp_path, name):
     with pytest.raises(SonarError, match=r"allowed are \.svg, \.png, \.pdf"):
@@ -342,6 +349,7 @@ def test_another_suffix_is_rejected(figure, tmp_path, name):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written_is_named(figure, tmp_path):
     with pytest.raises(SonarError, match=r"no/a\.png.*cannot write"):
         plot_style.save_figure(figure, tmp_path / "no" / "a.png")

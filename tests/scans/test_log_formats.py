@@ -55,6 +55,7 @@ def test_scans_can_be_indexed_like_a_list():
             SMALL[i]
 
 
+@pytest.mark.slow
 @given(any_scans, st.slices(5))
 def test_a_slice_of_a_log_contains_the_scans_of_the_slice(scans, part):
     log = log_of(scans)
@@ -140,6 +141,7 @@ def test_csv_round_trip(scans):
         assert np.signbit(again.pose).tolist() == np.signbit(log.pose).tolist()  # -0.0 is not 0.0
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(any_scans)
 def test_csv_to_parquet_to_csv_gives_the_same_file(scans):
@@ -172,6 +174,7 @@ def test_csv_agrees_with_the_standard_library(scans):
     assert found == expected
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(any_scans, st.integers(1, 300))
 def test_parsing_does_not_depend_on_the_block_size(scans, block):

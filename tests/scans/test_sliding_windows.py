@@ -99,6 +99,7 @@ def test_a_log_of_no_scans():
 # contents of windows
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.sampled_from([0.3, 1.0, 2.5, 50.0]), st.sampled_from([0.0, 0.05, 0.4]))
 def test_windows_contain_the_fresh_echoes_of_their_section_in_the_frame_of_its_end(seed, length, missing):
@@ -196,6 +197,7 @@ def test_every_second_repeated_reading_is_fresh_and_a_gap_restarts_the_count(tim
     assert kept_of([[here]] * times)[0][0] == 0
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 10_000))
 def test_fresh_readings_agree_with_the_slow_oracle(seed):

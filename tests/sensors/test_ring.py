@@ -47,8 +47,8 @@ def test_detection_ranges_of_section_3(beam, neighbors, widths):
     apart = (ring.paths[:, 1] - ring.paths[:, 0] + 12) % 24 - 12
     for distance, width in enumerate(widths):
         np.testing.assert_allclose(np.degrees(last - first)[np.abs(apart) == distance], width, atol=1e-3)
-    centre = ring.heading[ring.paths[:, 0]] + np.radians(15) * apart / 2  # between the two headings
-    np.testing.assert_allclose(np.cos((first + last) / 2 - centre), 1, atol=1e-6)
+    center = ring.heading[ring.paths[:, 0]] + np.radians(15) * apart / 2  # between the two headings
+    np.testing.assert_allclose(np.cos((first + last) / 2 - center), 1, atol=1e-6)
 
 
 @pytest.mark.slow

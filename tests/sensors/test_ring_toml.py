@@ -122,6 +122,7 @@ def test_round_trip_of_a_circular_ring(settings):
     assert_same(again, ring)
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(number, number, st.floats(-7, 7), beams, st.floats(-1, 1)), min_size=2, max_size=6),
     st.fixed_dictionaries(common | {"neighbors": st.integers(0, 1)}),

@@ -174,6 +174,7 @@ def test_a_standing_robot_gets_the_echoes_of_a_simulated_scan(office):
     assert_same_log(log_from_messages(room_messages(office.ring, office.room, poses, stamps)), log)
 
 
+@pytest.mark.slow
 def test_a_moving_robot_gets_each_group_at_its_own_pose(office):
     stamps = np.array([0.0, 0.2])
     poses = office.poses[:2]

@@ -58,6 +58,7 @@ def pra_images(pra, corners, tx, rx):
 SPECULAR = (EchoKind.PLANE, EchoKind.CORNER, EchoKind.SECOND_ORDER)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_path_lengths_agree_with_pyroomacoustics():
     pra = pytest.importorskip("pyroomacoustics")
@@ -163,6 +164,7 @@ def assert_as_oracle(room, tx, rx):
     return found
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(seed=seeds)
 def test_traced_echoes_agree_with_a_slow_oracle(seed):
@@ -180,6 +182,7 @@ def test_junctions_within_walls_agree_with_the_oracle(rng):
     assert set(found.kind.tolist()) == {EchoKind.PLANE, EchoKind.CORNER, EchoKind.EDGE, EchoKind.SECOND_ORDER}
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(seed=seeds)
 def test_occlusion_agrees_with_shapely(seed):
@@ -200,6 +203,7 @@ def test_occlusion_agrees_with_shapely(seed):
         assert ((k, pole) in heard) == free
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(seed=seeds)
 def test_incidence_points_lie_on_the_reflectors_and_give_the_path_length(seed):
@@ -225,6 +229,7 @@ def test_incidence_points_lie_on_the_reflectors_and_give_the_path_length(seed):
         assert np.allclose(apart, 0, atol=1e-8)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(seed=seeds)
 def test_reciprocity_of_single_pairs(seed):
@@ -264,6 +269,7 @@ def test_max_range_limits_the_traced_echoes(rng):
 coordinate = st.floats(-1.5, 1.5)
 
 
+@pytest.mark.slow
 @given(xi=coordinate, xj=coordinate, yi=st.floats(0.1, 2), yj=st.floats(0.1, 2), angle=st.floats(-np.pi, np.pi))
 def test_length_of_a_plane_echo(xi, xj, yi, yj, angle):
     walls = turned([[[-9.0, 0.0], [9.0, 0.0]]], angle)

@@ -38,6 +38,7 @@ def causes(heard: Simulation):
     return by_cause(heard.scan, heard.path, heard.kind, heard.reflector, heard.range, heard.amplitude)
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(seed=seeds, beam=st.floats(0.2, np.pi), neighbors=st.integers(0, 5))
 def test_a_ring_receives_the_traced_echoes_within_both_cones(seed, beam, neighbors):
@@ -68,6 +69,7 @@ def test_a_ring_receives_the_traced_echoes_within_both_cones(seed, beam, neighbo
     assert np.allclose(mine, other, atol=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(seed=seeds, angle=st.floats(-np.pi, np.pi), x=st.floats(-50, 50), y=st.floats(-50, 50))
 def test_echoes_are_invariant_under_a_common_motion_of_world_and_robot(seed, angle, x, y):
@@ -225,6 +227,7 @@ def many(seed=0, scans=400, **options):
     return simulate(RING, room, poses, seed=seed, **options)
 
 
+@pytest.mark.slow
 def test_white_noise():
     exact, noisy = many(max_echoes=1), many(max_echoes=1, sigma=0.005)
     error = noisy.range - exact.range  # one echo per path: noise cannot change the order
@@ -235,6 +238,7 @@ def test_white_noise():
     assert abs(np.corrcoef(error[:-1], error[1:])[0, 1]) < 5 / np.sqrt(n)
 
 
+@pytest.mark.slow
 def test_drift_belongs_to_sensors_and_decorrelates_slowly():
     ring = Ring.circular(count=6, neighbors=1, beam=np.pi, radius=0.0)
     room = Room(loop([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
@@ -263,6 +267,7 @@ def test_drift_is_constant_at_one_stamp_and_independent_after_long_pauses():
     assert len(np.unique(heard.range)) == 2
 
 
+@pytest.mark.slow
 def test_dropout_rate():
     everything, some = many(), many(dropout=0.3)
     n = len(everything.range)
@@ -271,6 +276,7 @@ def test_dropout_rate():
     assert len(many(dropout=1.0).range) == 0
 
 
+@pytest.mark.slow
 def test_clutter_statistics():
     everything, more = many(), many(clutter=0.2, max_echoes=1000)
     real = many(max_echoes=1000)
@@ -305,6 +311,7 @@ def test_seeds_are_reproducible_and_streams_are_independent():
     assert {tuple(row) for row in rows(with_loss)} <= {tuple(row) for row in rows(without_loss)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [1, 7, 1000])
 def test_result_does_not_depend_on_the_chunk_size(chunk):
     options = {"sigma": 0.003, "drift": 0.002, "dropout": 0.2, "clutter": 0.2, "scans": 40}

@@ -34,8 +34,8 @@ INVALID_CALLS = {
     "no such ring": ("lines log.csv --ring fawn -o out.jsonl", {}, ["fawn", "faw", "corridor8", "scitos24", "sew-amr"]),
     "ring with an unknown key": (
         "lines log.csv --ring ring.toml -o out.jsonl",
-        {"ring.toml": RING + "colour = 'red'\n"},
-        ["ring.toml", "ring.colour", "count", "radius"],
+        {"ring.toml": RING + "color = 'red'\n"},
+        ["ring.toml", "ring.color", "count", "radius"],
     ),
     "ring out of range": (
         "lines log.csv --ring ring.toml -o out.jsonl",

@@ -11,13 +11,13 @@ from jaxsonar.mapping.wall_segments import WallSegments
 COLUMNS = [field.name for field in fields(WallSegments) if field.name != "scans"]
 
 
-def segments_at(centre, theta, *, length: np.ndarray | float = 0.5, **columns):
+def segments_at(center, theta, *, length: np.ndarray | float = 0.5, **columns):
     """Segments as of single lines of local models, one scan each; any column can be given."""
     theta = wrap_angle(np.asarray(theta, float).reshape(-1))
     count = len(theta)
     half = np.broadcast_to(np.asarray(length, float), count) / 2
     known = {
-        "centre": np.array(centre, float).reshape(-1, 2),
+        "center": np.array(center, float).reshape(-1, 2),
         "theta": theta,
         "extent": np.stack([-half, half], axis=-1),
         "info_offset": np.full(count, SETTINGS.segments.offset_sd**-2),
@@ -35,7 +35,7 @@ def segments_at(centre, theta, *, length: np.ndarray | float = 0.5, **columns):
 def moved(segments, pose):
     """The same segments in a world that was rotated by pose[2] and then translated."""
     columns = {name: getattr(segments, name) for name in COLUMNS}
-    columns["centre"] = segments.centre @ rotation(pose[2]).T + pose[:2]
+    columns["center"] = segments.center @ rotation(pose[2]).T + pose[:2]
     return WallSegments(**columns | {"theta": wrap_angle(segments.theta + pose[2])}, scans=segments.scans)
 
 
