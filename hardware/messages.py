@@ -16,6 +16,9 @@ two-way time of flight, microseconds. ``amplitude`` is in the device's own unit,
 without an echo has no record.
 """
 
+REFERENCE_SPEED_OF_SOUND = 343.2
+"""Metres per second, air at 20 deg C. A log's range is half the time of flight times this, at any temperature."""
+
 
 @dataclass(frozen=True, eq=False)
 class Group:

@@ -11,10 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from .messages import ECHO, Group, Message, Pose
-
-REFERENCE_SPEED_OF_SOUND = 343.2
-"""Metres per second. Fixed reference that converts times of flight to the ranges of a log, whatever the air was."""
+from .messages import ECHO, REFERENCE_SPEED_OF_SOUND, Group, Message, Pose
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from .sensor_array import SensorArray, echo_paths
 class BeamPatternPrior:
     """Priors of the beam patterns. All of them were chosen by hand."""
 
-    centre_sd: float = 0.2
+    center_sd: float = 0.2
     """Standard deviation of the direction of a sensor around its heading, radians."""
     rolloff_width: float = 0.1
     """Median of the rolloff width, radians. Without a prior, few observations would make it 0."""
@@ -31,14 +31,14 @@ PRIOR = BeamPatternPrior()
 class BeamPattern(eqx.Module):
     """Detection probability of direct echoes as a function of the direction of arrival."""
 
-    centre: Float[Array, " sensors"]
-    """Centre of the beam of each sensor, counter-clockwise from its heading, radians."""
+    center: Float[Array, " sensors"]
+    """Center of the beam of each sensor, counter-clockwise from its heading, radians."""
     half_width: Float[Array, ""]
-    """Angle from the centre at which the detection probability is half of that at the centre, radians."""
+    """Angle from the center at which the detection probability is half of that at the center, radians."""
     log_rolloff_width: Float[Array, ""]
     """Logarithm of the angle over which the probability falls, radians."""
     detection_log_odds: Float[Array, ""]
-    """Log odds of the detection at the centre."""
+    """Log odds of the detection at the center."""
 
 
 @jax.jit
@@ -94,9 +94,9 @@ def beam_negative_log_likelihood(
         detected: whether the sensor reported the echo.
         valid: False for padding.
     """
-    inside = (beams.half_width - jnp.abs(angle - beams.centre[sensor])) / jnp.exp(beams.log_rolloff_width)
+    inside = (beams.half_width - jnp.abs(angle - beams.center[sensor])) / jnp.exp(beams.log_rolloff_width)
     log_detected = jax.nn.log_sigmoid(beams.detection_log_odds) + jax.nn.log_sigmoid(inside)
     log_missed = jnp.log1p(-jnp.exp(jnp.minimum(log_detected, -1e-6)))
     log_likelihood = jnp.where(valid, jnp.where(detected, log_detected, log_missed), 0).sum()
     rolloff = (beams.log_rolloff_width - jnp.log(PRIOR.rolloff_width)) / PRIOR.log_rolloff_sd
-    return 0.5 * ((beams.centre**2).sum() / PRIOR.centre_sd**2 + rolloff**2) - log_likelihood
+    return 0.5 * ((beams.center**2).sum() / PRIOR.center_sd**2 + rolloff**2) - log_likelihood

@@ -152,7 +152,7 @@ def linearize(
 
     Args:
         problem: echoes and odometry; weights are not used.
-        unknowns: the point of linearisation.
+        unknowns: the point of linearization.
         scan: row of each selected echo.
         echo: its column.
     """

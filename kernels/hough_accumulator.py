@@ -129,7 +129,7 @@ def soft_accumulate(
 ) -> Float[Array, "theta rho"]:
     """Weighted votes by bilinear interpolation: differentiable in rho, theta and weight.
 
-    The votes of a line in the four cells around it sum to its weight. A line at the centre of a cell votes for this
+    The votes of a line in the four cells around it sum to its weight. A line at the center of a cell votes for this
     cell only, as in ``accumulate``.
     """
     rows, columns = settings.theta_cells, settings.rho_cells

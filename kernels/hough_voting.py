@@ -1,4 +1,4 @@
-"""From the echoes of scans to highly occupied cells: the compiled step before the labelling (paper, section 4)."""
+"""From the echoes of scans to highly occupied cells: the compiled step before the labeling (paper, section 4)."""
 
 from collections.abc import Callable
 from functools import partial

@@ -169,7 +169,7 @@ def edge_from_midpoint(point: Float[Array, "2"], path: EchoPaths) -> RangeAndBea
 def start_of_point(
     line: Float[Array, "2"], midpoint: Float[Array, "echoes 2"], score: Float[Array, " echoes"]
 ) -> Float[Array, "2"]:
-    """First guess of a corner or an edge: the centre of what a fitted plane explains, metres."""
+    """First guess of a corner or an edge: the center of what a fitted plane explains, metres."""
     footpoint = midpoint @ tangent(line[1])
     mean = (score * footpoint).sum() / jnp.maximum(score.sum(), 1e-6)
     return line[0] * normal(line[1]) + mean * tangent(line[1])

@@ -23,7 +23,7 @@ STEP = 0.2, 0.4
 """Minimum and maximum distance between scans, metres."""
 
 CLEARANCE = 0.45
-"""Minimum distance from the centre of the robot candidates walls and poles, metres."""
+"""Minimum distance from the center of the robot candidates walls and poles, metres."""
 
 FIRST_ORDER = (EchoKind.PLANE, EchoKind.CORNER, EchoKind.EDGE, EchoKind.POLE)
 """Kinds of first-order echoes."""

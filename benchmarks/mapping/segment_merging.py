@@ -65,18 +65,18 @@ def building(
     size = np.linalg.norm(walls[wall, 1] - walls[wall, 0], axis=-1)
     wall_length = length[: len(wall)]
     place = wall_length / 2 + rng.random(len(wall)) * (size - wall_length)
-    centre = (
+    center = (
         walls[wall, 0]
         + place[:, None] * along
         + rng.normal(0, SETTINGS.segments.offset_sd, len(wall))[:, None] * normal
     )
     theta = np.arctan2(normal[:, 1], normal[:, 0]) + rng.normal(0, SETTINGS.segments.theta_sd, len(wall))
-    centre = np.concatenate([centre, rng.uniform(0, 1, (clutter, 2)) * (corner.max(axis=0) + ROOM)])
+    center = np.concatenate([center, rng.uniform(0, 1, (clutter, 2)) * (corner.max(axis=0) + ROOM)])
     theta = np.concatenate([theta, rng.uniform(-np.pi, np.pi, clutter)])
     order = rng.permutation(segments)
     row = np.arange(segments)
     observed = WallSegments(
-        centre=centre[order],
+        center=center[order],
         theta=wrap_angle(theta[order]),
         extent=0.5 * length[order, None] * np.array([-1.0, 1.0]),
         info_offset=np.full(segments, SETTINGS.segments.offset_sd**-2),
@@ -98,11 +98,11 @@ def true_walls_found(observed: WallSegments, walls: np.ndarray) -> int:
         return 0
     along = walls[:, 1] - walls[:, 0]
     size = np.linalg.norm(along, axis=-1)
-    near = KDTree(long.centre).query_ball_point(walls.mean(axis=1), 0.3 * float(ROOM.max()))
+    near = KDTree(long.center).query_ball_point(walls.mean(axis=1), 0.3 * float(ROOM.max()))
     found = 0
     for k, rows in enumerate(near):
         rows_near = np.asarray(rows, dtype=np.int64)
-        across = np.abs(((long.centre[rows_near] - walls[k, 0]) * [along[k, 1], -along[k, 0]]).sum(-1)) / size[k]
+        across = np.abs(((long.center[rows_near] - walls[k, 0]) * [along[k, 1], -along[k, 0]]).sum(-1)) / size[k]
         turn = np.abs(np.sin(long.theta[rows_near] - math.atan2(-along[k, 0], along[k, 1])))
         covers = np.abs(long.length[rows_near] / size[k] - 1) < 0.3
         found += bool(((across < NEAR) & (turn < math.sin(NEAR_ANGLE)) & covers).any())

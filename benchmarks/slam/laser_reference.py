@@ -73,8 +73,8 @@ def measures_at(ring: Ring, log: Log, laser: LaserRecording, poses: Float[np.nda
 
 def thicknesses(points: Float[np.ndarray, "points 2"]) -> list[tuple[float, int]]:
     """RMS distance (metres) and number of the points near each of the lines with the most points."""
-    centre, thickness_and_count = points.mean(axis=0), []
-    points = points - centre
+    center, thickness_and_count = points.mean(axis=0), []
+    points = points - center
     theta = np.arange(0.0, np.pi, _THETA_STEP)
     for _ in range(WALLS):
         sample = points[::_SUBSAMPLE]

@@ -35,7 +35,7 @@ SCAN_ROTATION = float(np.radians(15.0))
 CURVE_RADIUS = 0.8
 """Radius of curves, metres."""
 CLEARANCE = 0.35
-"""Minimum distance from the centre of the robot to walls, metres; the ring has a radius of 0.28 m."""
+"""Minimum distance from the center of the robot to walls, metres; the ring has a radius of 0.28 m."""
 DOOR_WIDTH, WALL_THICKNESS = (1.0, 1.2), 0.15
 """Widths of doors, and thickness of the walls between corridors and rooms, metres."""
 
@@ -171,10 +171,10 @@ class _Plan:
     """A building with a ring corridor."""
 
     floor: Polygon
-    centre: np.ndarray  # (corners, 2) of the centre line of the corridor, in order
+    center: np.ndarray  # (corners, 2) of the center line of the corridor, in order
     rooms: tuple[
         tuple[int, float, float], ...
-    ]  # side of the ring, metres along it, metres to the left of the centre line
+    ]  # side of the ring, metres along it, metres to the left of the center line
 
 
 def _ring_plan(rng: np.random.Generator, *, length: float) -> _Plan:
@@ -202,14 +202,14 @@ def _furnish(
     """Add doors, bays, pilasters and rooms along one wall of a corridor.
 
     Returns:
-        The floor, and (along, across) of the centres of rooms, metres.
+        The floor, and (along, across) of the centers of rooms, metres.
     """
     length, rooms = float(np.linalg.norm(end - start)), []
     tangent = (end - start) / length
     corridor = floor
 
     def box(low: float, high: float, near: float, far: float) -> Polygon:
-        """A rectangle, in metres along the corridor and away from its centre line."""
+        """A rectangle, in metres along the corridor and away from its center line."""
         normal = left * np.array([-tangent[1], tangent[0]])
         return Polygon(
             [start + a * tangent + b * normal for a, b in ((low, near), (high, near), (high, far), (low, far))]
@@ -278,15 +278,15 @@ def _without_collinear(ring: np.ndarray) -> np.ndarray:
 
 def _around(plan: _Plan, rng: np.random.Generator, *, laps: int, visited: int, beyond: float) -> np.ndarray:
     """Corners of a route around the ring from the middle of its first side, with detours into some rooms."""
-    count = len(plan.centre)
-    begin = (plan.centre[0] + plan.centre[1]) / 2
-    tangent = (plan.centre[1] - plan.centre[0]) / np.linalg.norm(plan.centre[1] - plan.centre[0])
+    count = len(plan.center)
+    begin = (plan.center[0] + plan.center[1]) / 2
+    tangent = (plan.center[1] - plan.center[0]) / np.linalg.norm(plan.center[1] - plan.center[0])
     chosen = rng.permutation(len(plan.rooms))[:visited]
     route = [begin]
-    first = float(np.linalg.norm(begin - plan.centre[0]))
+    first = float(np.linalg.norm(begin - plan.center[0]))
     for k in range(laps * count + 1):
         side, last = k % count, k == laps * count
-        start, end = plan.centre[side], plan.centre[(side + 1) % count]
+        start, end = plan.center[side], plan.center[(side + 1) % count]
         along = (end - start) / np.linalg.norm(end - start)
         entered = sorted(plan.rooms[room][1:] for room in chosen if plan.rooms[room][0] == side)
         for at, across in entered:
@@ -379,8 +379,8 @@ def _rounded(corners: np.ndarray, radius: float) -> np.ndarray:
         begin = corners[k] - cut * unit(heading[k - 1])
         angle = heading[k - 1] + turn * np.linspace(0.0, 1.0, 16)
         sign = np.sign(turn)
-        centre = begin + sign * bend * unit(heading[k - 1] + np.pi / 2)
-        parts.append(centre + bend * unit(angle - sign * np.pi / 2))
+        center = begin + sign * bend * unit(heading[k - 1] + np.pi / 2)
+        parts.append(center + bend * unit(angle - sign * np.pi / 2))
     return np.concatenate([*parts, corners[-1:]])
 
 

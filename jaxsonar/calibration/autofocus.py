@@ -67,7 +67,7 @@ SETTINGS = AutofocusSettings()
 def autofocus_ring(
     ring: Ring, log: Log, *, poses: bool, speed: bool, scans: int = 40, settings: AutofocusSettings = SETTINGS
 ) -> Ring:
-    """The ring whose relative range offsets, and speed of sound, maximise the focus measure of its echoes.
+    """The ring whose relative range offsets, and speed of sound, maximize the focus measure of its echoes.
 
     The mean range offset does not change. Without poses, each scan has an accumulator of its own; offsets that are
     equivalent to a displacement of the whole ring are then hardly observable and change little. The given ring, the

@@ -25,7 +25,7 @@ class HeadingSettings:
     initial_rolloff_width: float = 0.1
     """Initial width of the rolloff of the beam, radians."""
     initial_log_odds: float = 2.0
-    """Initial log odds of a detection at the centre of the beam."""
+    """Initial log odds of a detection at the center of the beam."""
     gradient_tolerance: float = 1e-3
     """Convergence: largest component of the gradient, nats per radian. A heading with a standard deviation of 3 deg
     (a curvature of 365 nats per square radian) is then within 1e-4 standard deviations of the optimum."""
@@ -48,9 +48,9 @@ class _Observations(NamedTuple):
 def estimate_headings(
     ring: Ring, data: BatchData, found: AdjustmentResult, *, settings: HeadingSettings = SETTINGS
 ) -> tuple[Ring, Float[np.ndarray, " sensors"]]:
-    """The ring with headings in the centres of the beams, and their standard deviations, radians.
+    """The ring with headings in the centers of the beams, and their standard deviations, radians.
 
-    Width and rolloff of the beams, and the detection probability in their centre, are estimated as well; all sensors
+    Width and rolloff of the beams, and the detection probability in their center, are estimated as well; all sensors
     share them. To be called with 64-bit floats enabled.
 
     Args:
@@ -93,7 +93,7 @@ def estimate_headings(
     if np.linalg.eigvalsh(hessian).min() <= 0:
         raise SonarError("calibration: headings: the echoes do not determine the edges of the beams; hold the headings")
     variance = np.diag(np.linalg.inv(hessian))[: ring.count]
-    heading = np.asarray(ring.heading) + np.asarray(unravel(jnp.asarray(solution.x)).centre)
+    heading = np.asarray(ring.heading) + np.asarray(unravel(jnp.asarray(solution.x)).center)
     return replace(ring, heading=heading), np.sqrt(variance)
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.detection.arc_tables import ArcTables
-from jaxsonar.geometry.se2 import unit
+from jaxsonar.geometry.se2 import perpendicular, unit
 from jaxsonar.scans.echo_batches import EchoBatch
 
 
@@ -162,8 +162,7 @@ def sensor_positions(arcs: kernels.RingArcs, batch: EchoBatch) -> Float[np.ndarr
         return sensor
     pose = batch.pose[: len(batch.scans)]
     along = unit(pose[..., 2])
-    across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
-    return pose[..., :2] + sensor[..., :1] * along + sensor[..., 1:] * across
+    return pose[..., :2] + sensor[..., :1] * along + sensor[..., 1:] * perpendicular(along)
 
 
 def _segment_endpoints(
@@ -172,7 +171,7 @@ def _segment_endpoints(
     sensors: Float[np.ndarray, "scans echoes 2"],
     involved: Bool[np.ndarray, "scans components echoes"],
 ) -> Float[np.ndarray, "scans components 2 2"]:
-    """Endpoints of each line, the second one counter-clockwise from the first as seen from the origin (section 5)."""
+    """``kernels.segment_endpoints`` of many lines in NumPy, without a row for the echoes that are not involved."""
     segments = np.full((rho.size, 2, 2), np.nan, np.float32)
     line, echo = np.divmod(np.flatnonzero(involved), involved.shape[2])
     if len(line):

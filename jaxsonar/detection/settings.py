@@ -38,6 +38,9 @@ SETTINGS = DecisionSettings()
 MIN_SIGMA = kernels.DetectionSettings().min_sigma
 """Smallest standard deviation of ranges, metres; ranges have single precision."""
 
+DEFAULT_SIGMA = 0.003
+"""Standard deviation of ranges that is assumed where a local model has no estimate, metres; chosen by hand."""
+
 
 def check_method(method: str) -> None:
     """Raise a SonarError for an unknown detection method."""

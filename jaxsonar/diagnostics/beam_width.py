@@ -9,8 +9,8 @@ from jaxsonar.diagnostics.settings import SETTINGS
 
 _CONES = SETTINGS.cones
 _EDGES = np.arange(-_CONES.bins // 2, _CONES.bins // 2 + 1) * _CONES.bin_width
-BIN_CENTRES = (_EDGES[1:] + _EDGES[:-1]) / 2
-"""Centres of the bins of off-axis angles, radians."""
+BIN_CENTERS = (_EDGES[1:] + _EDGES[:-1]) / 2
+"""Centers of the bins of off-axis angles, radians."""
 
 
 def count_by_angle(
@@ -33,9 +33,9 @@ def count_by_angle(
     row = np.flatnonzero(usable & (table.tx == table.rx) & near)
     angle = table.off_axis[row] * (beam.mean() / beam[table.tx[row]])
     bin_ = np.digitize(angle, _EDGES) - 1
-    inside = (bin_ >= 0) & (bin_ < len(BIN_CENTRES))
+    inside = (bin_ >= 0) & (bin_ < len(BIN_CENTERS))
     row, bin_ = row[inside], bin_[inside]
-    expected_count = np.zeros((len(beam), len(BIN_CENTRES)), np.int64)
+    expected_count = np.zeros((len(beam), len(BIN_CENTERS)), np.int64)
     detected_count = np.zeros_like(expected_count)
     np.add.at(expected_count, (table.tx[row], bin_), 1)
     np.add.at(detected_count, (table.tx[row], bin_), detected[row])
@@ -62,7 +62,7 @@ def fit_cone(
         return unknown
 
     def negative_log_likelihood(x: np.ndarray) -> float:
-        p = np.clip(detection_probability(x, BIN_CENTRES), 1e-4, 1 - 1e-4)
+        p = np.clip(detection_probability(x, BIN_CENTERS), 1e-4, 1 - 1e-4)
         return -float(detected @ np.log(p) + (expected - detected) @ np.log(1 - p))
 
     # Several starting points: the likelihood has local maxima.
@@ -71,11 +71,11 @@ def fit_cone(
     fits = (minimize(negative_log_likelihood, start, method="L-BFGS-B", bounds=bounds) for start in starts)
     best = min(fits, key=lambda fit: fit.fun).x
     # Standard deviation from the Fisher information, reduced by the observed scatter.
-    p = np.clip(detection_probability(best, BIN_CENTRES), 0.01, 0.99)
+    p = np.clip(detection_probability(best, BIN_CENTERS), 0.01, 0.99)
     steps = np.diag([1e-3, 1e-3, 1e-3, 1e-3])
     jacobian = np.stack(
         [
-            (detection_probability(best + step, BIN_CENTRES) - detection_probability(best - step, BIN_CENTRES)) / 2e-3
+            (detection_probability(best + step, BIN_CENTERS) - detection_probability(best - step, BIN_CENTERS)) / 2e-3
             for step in steps
         ]
     )
@@ -84,7 +84,7 @@ def fit_cone(
     information = (jacobian * (expected / (p * (1 - p)))) @ jacobian.T / overdispersion
     prior = np.diag([3.6, 130.0, 4.0, 25.0])  # standard deviations of 30 deg, 5 deg, 0.5 and 0.2
     error = float(np.sqrt(np.linalg.inv(information + prior)[0, 0]))
-    outside, inside = np.abs(BIN_CENTRES) > best[0], np.abs(BIN_CENTRES) < best[0]
+    outside, inside = np.abs(BIN_CENTERS) > best[0], np.abs(BIN_CENTERS) < best[0]
     least = _CONES.min_per_side
     if expected[outside].sum() < least or expected[inside].sum() < least or error > _CONES.max_error:
         return unknown
@@ -106,10 +106,10 @@ def fit_each_cone(
         return np.full((sensors, 2), np.nan), np.full((sensors, 2), np.nan)
     half_width = np.radians(np.arange(3, 90, 1.0))
     direction = np.radians(np.arange(-30, 30.5, 0.5))
-    outside = np.abs(BIN_CENTRES - direction[:, None])[None] - half_width[:, None, None]
+    outside = np.abs(BIN_CENTERS - direction[:, None])[None] - half_width[:, None, None]
     rolloff = 1 / (1 + np.exp(np.clip(outside / max(curve[1], _CONES.bin_width / 2), -50, 50)))
     # A sensor that detects less in all directions does not have a narrower cone: scale its curve.
-    usual = expected @ detection_probability(curve, BIN_CENTRES)
+    usual = expected @ detection_probability(curve, BIN_CENTERS)
     level = np.clip(detected.sum(axis=1) / np.maximum(usual, 1), 0.2, 1 / curve[2]) * curve[2]
     estimates: tuple[list[tuple[float, float]], list[tuple[float, float]]] = ([], [])
     for n, k, inside in zip(expected, detected, level, strict=True):

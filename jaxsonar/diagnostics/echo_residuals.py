@@ -8,10 +8,11 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.diagnostics.reference_scene import ReferenceScene, predict_reports
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.geometry.se2 import tangent_of, unit
+from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import is_fresh_reading
-from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
+from jaxsonar.sensors.ring import Ring
 
 
 class ResidualTable(NamedTuple):

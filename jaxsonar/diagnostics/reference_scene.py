@@ -11,12 +11,13 @@ from jaxsonar import kernels
 from jaxsonar.detection.ml_detector import ml_detections
 from jaxsonar.detection.settings import hough_settings
 from jaxsonar.diagnostics.settings import SETTINGS
-from jaxsonar.geometry.se2 import tangent_of, unit
+from jaxsonar.geometry.se2 import rotate, tangent_of, unit
+from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.kernels.detection_cones import predict_all_echoes
 from jaxsonar.mapping.build_map import build_map
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
-from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
+from jaxsonar.sensors.ring import Ring
 
 
 class ReferenceScene(NamedTuple):
@@ -113,9 +114,7 @@ def scene_from_map(ring: Ring, log: Log) -> ReferenceScene:
         return empty_scene(ring, len(log))
     has_pose = np.all(np.isfinite(log.pose), axis=1)
     pose = np.where(has_pose[:, None], log.pose, 0.0)
-    c, s = np.cos(pose[:, 2])[:, None, None], np.sin(pose[:, 2])[:, None, None]
-    offset = segments[None] - pose[:, None, None, :2]
-    p_robot = np.stack([c * offset[..., 0] + s * offset[..., 1], c * offset[..., 1] - s * offset[..., 0]], axis=-1)
+    p_robot = rotate(segments[None] - pose[:, None, None, :2], -pose[:, None, None, 2])
     along = p_robot[:, :, 1] - p_robot[:, :, 0]
     theta = np.arctan2(-along[..., 0], along[..., 1])
     rho = (p_robot[:, :, 0] * unit(theta)).sum(axis=-1)

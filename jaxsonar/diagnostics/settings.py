@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jaxsonar.detection.settings import MIN_SIGMA
+
 
 @dataclass(frozen=True)
 class ReferenceSettings:
@@ -25,7 +27,7 @@ class ReferenceSettings:
     """Walls of a map farther than the maximum range by more than this are left out, metres."""
     default_sigma: float = 0.01
     """Standard deviation of the ranges where it is unknown, metres."""
-    min_sigma: float = 1e-4
+    min_sigma: float = MIN_SIGMA
     """Lower limit of the noise where it is unknown, metres."""
     end_margin: float = 0.25
     """Length that a wall is assumed to extend beyond its outermost footpoints, unless another wall ends it, metres."""

@@ -1,4 +1,4 @@
-"""Multifrontal block Cholesky factorisation of sparse normal equations, and marginal covariances of every block.
+"""Multifrontal block Cholesky factorization of sparse normal equations, and marginal covariances of every block.
 
 A block is a pose, a landmark, or a group of parameters on which all terms depend. A pose is connected to the few
 landmarks around it. In a fill-reducing order of elimination each block therefore has few neighbors left, and time and
@@ -125,7 +125,7 @@ class SymbolicFactorization:
         return out
 
     def factorize(self, values: Float[np.ndarray, " nnz"]) -> "BlockCholesky":
-        """Factorise a positive definite normal matrix.
+        """Factorize a positive definite normal matrix.
 
         Raises:
             numpy.linalg.LinAlgError: the matrix is not positive definite.
@@ -158,10 +158,10 @@ class SymbolicFactorization:
 
 
 class BlockCholesky:
-    """Factorised normal equations.
+    """Factorized normal equations.
 
     Args:
-        structure: the symbolic factorisation.
+        structure: the symbolic factorization.
         inverse: inverse of the pivot block of each front.
         coupling: inverse of the pivot block times the rest of its rows, for each front.
     """

@@ -1,7 +1,7 @@
 """The damping loop of Levenberg and Marquardt, for any structure of the normal equations.
 
 Bundle adjustment (``sparse_adjustment``, for calibration and smoothing) and the pose graph (``pose_graph``) share this
-loop. Each of them supplies its linearisation and its linear solver as a ``LeastSquares``.
+loop. Each of them supplies its linearization and its linear solver as a ``LeastSquares``.
 """
 
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ def minimize(
     start: Point,
     settings: LevenbergMarquardtSettings,
 ) -> Minimum[Point]:
-    """Minimise a sum of squares from a start within the basin of attraction.
+    """Minimize a sum of squares from a start within the basin of attraction.
 
     Args:
         problem: cost, normal equations and linear solver.

@@ -3,7 +3,7 @@
 Poses are world_from_node: (x, y, theta) in metres and radians. The first node is fixed. The information matrix of a
 factor may be singular: parallel walls do not determine the displacement along them.
 
-The normal equations are factorised by SuperLU. The multifrontal factorisation of ``block_cholesky`` would also yield
+The normal equations are factorized by SuperLU. The multifrontal factorization of ``block_cholesky`` would also yield
 all marginal covariances, but it runs in Python, and graphs are solved often with few nodes.
 """
 
@@ -255,7 +255,7 @@ class _PoseGraphProblem:
         return _NormalMatrix(values, diagonal)
 
     def factorize(self, matrix: _NormalMatrix, damping: float = 0.0) -> SuperLU:
-        """Factorise with the diagonal raised by this fraction of it; a SonarError if the matrix is singular."""
+        """Factorize with the diagonal raised by this fraction of it; a SonarError if the matrix is singular."""
         undetermined = SonarError(
             "pose graph: the factors do not determine all poses; every node needs a chain of factors of full rank"
         )

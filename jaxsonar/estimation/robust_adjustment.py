@@ -78,7 +78,7 @@ def gnc_adjust(
     state, noise = job.anneal(state, initial_scale, sigma)
     parameters = int(np.linalg.matrix_rank(basis.columns)) if basis.columns.any() else 0
     for _ in range(settings.final_rounds):
-        # 2. Associate with a fixed gate and minimise.
+        # 2. Associate with a fixed gate and minimize.
         found = job.reassociate(state, noise)
         # 3. Estimate the noise from the residuals.
         landmarks = len(np.unique(np.asarray(found.problem.factors.reflection.first)[found.used]))
@@ -176,7 +176,7 @@ class _GncJob:
             gate = settings.loss_gate * scale
             used, _, reflection = self._associate(state, gate=gate, ambiguity=0.0)
             residual = self._residual(state, reflection)
-            # Geman-McClure weights, normalised so that an echo within the scale counts as one within the gate.
+            # Geman-McClure weights, normalized so that an echo within the scale counts as one within the gate.
             weight = used / (1 + (residual / scale) ** 2) ** 2 * (settings.gate_sigmas / scale) ** 2
             state, _, _ = self._adjust(state, reflection, weight)
             residual = self._residual(state, reflection)

@@ -68,7 +68,7 @@ def adjust(
     absolute_tolerance: float = 0.0,
     settings: SparseAdjustmentSettings = SETTINGS,
 ) -> AdjustmentSolution:
-    """Minimise ``kernels.cost`` from a start within the basin of attraction.
+    """Minimize ``kernels.cost`` from a start within the basin of attraction.
 
     Args:
         problem: echoes, odometry and priors.
@@ -203,7 +203,7 @@ class _SparseProblem:
         return echoes, odometry
 
     def _structure(self, sizes: Int[np.ndarray, " blocks"]) -> tuple[SymbolicFactorization, list[_Product]]:
-        """The symbolic factorisation, and where the products of Jacobians are stored in the normal matrix."""
+        """The symbolic factorization, and where the products of Jacobians are stored in the normal matrix."""
         common = []
         for kind, group in enumerate(self.dependencies):
             for first in range(len(group)):
@@ -247,7 +247,7 @@ class _SparseProblem:
     def linearize(
         self, point: _Point, evaluation: tuple[_Factors, _Factors]
     ) -> tuple[Float[np.ndarray, " stored"], Float[np.ndarray, " unknowns"]]:
-        """The normal matrix as the symbolic factorisation stores it, and the negative gradient of the cost."""
+        """The normal matrix as the symbolic factorization stores it, and the negative gradient of the cost."""
         structure = self.structure
         # 1. Products of the Jacobians of echoes and odometry.
         index, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]

@@ -78,11 +78,11 @@ def polygonal_model(
 
 def fit_segment(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "2 2"]:
     """The total least squares segment between the outermost projections, directed from the first to the last point."""
-    centre = points.mean(axis=0)
-    tangent = np.linalg.svd(points - centre, full_matrices=False)[2][0]
+    center = points.mean(axis=0)
+    tangent = np.linalg.svd(points - center, full_matrices=False)[2][0]
     tangent = tangent if tangent @ (points[-1] - points[0]) >= 0 else -tangent
-    along = (points - centre) @ tangent
-    return centre + np.array([[along.min()], [along.max()]]) * tangent
+    along = (points - center) @ tangent
+    return center + np.array([[along.min()], [along.max()]]) * tangent
 
 
 def split_and_merge(

@@ -12,7 +12,7 @@ Design decisions:
   excludes a wall at a position with a normal. Each cell of the floor stores, for 36 directions, the times of the three
   latest scans that saw through it.
 - **Fusion instead of clustering by default.** The lines of a long wall differ by centimetres in rho far from the
-  cluster's centre (3 deg x 3 m), so the paper's cells split it. Segments that agree where they meet are not split. The
+  cluster's center (3 deg x 3 m), so the paper's cells split it. Segments that agree where they meet are not split. The
   paper's merging can be selected.
 - **Single linkage through a Delaunay triangulation.** Its edges contain the minimum spanning tree, so the cost is
   O(n log n) however dense the midpoints are, unlike enumerating all pairs within a distance.

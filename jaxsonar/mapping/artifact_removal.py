@@ -27,7 +27,7 @@ def remove_corner_lines(segments: WallSegments, walls: WallSegments) -> WallSegm
     artifact = np.zeros(len(segments), dtype=bool)
     if not len(vertices) or not len(short):
         return segments
-    row, vertex = neighbor_pairs(vertices, segments.centre[short], settings.corner_radius)
+    row, vertex = neighbor_pairs(vertices, segments.center[short], settings.corner_radius)
     segment = short[row]
     angle = angle_between_lines(segments.theta[segment][:, None], walls.theta[owners[vertex]])
     free_end = owners[vertex, 0] == owners[vertex, 1]
@@ -47,7 +47,7 @@ def is_pole_line(walls: WallSegments) -> Bool[np.ndarray, " walls"]:
     short = np.flatnonzero(walls.length < settings.min_wall_length)
     artifact = np.zeros(len(walls), dtype=bool)
     if len(short) > 1:
-        pairs = KDTree(walls.centre[short]).query_pairs(settings.corner_radius, output_type="ndarray")
+        pairs = KDTree(walls.center[short]).query_pairs(settings.corner_radius, output_type="ndarray")
         a, b = short[pairs.reshape(-1, 2).T]
         crossed = angle_between_lines(walls.theta[a], walls.theta[b]) > settings.same_direction
         artifact[a[crossed]] = artifact[b[crossed]] = True
@@ -71,7 +71,7 @@ def remove_seen_through(
     segment = np.repeat(np.arange(len(segments)), samples)
     number = np.arange(len(segment)) - np.repeat(np.cumsum(samples) - samples, samples)
     along = segments.extent[segment, 0] + (number + 0.5) * (segments.length / samples)[segment]
-    position = segments.centre[segment] + along[:, None] * segments.tangent[segment]
+    position = segments.center[segment] + along[:, None] * segments.tangent[segment]
     # The oldest remembered time is that of the third latest scan that saw through the sample.
     seen_through = free_space.query_neighborhood(position, segments.theta[segment])[:, -1]
     gone = seen_through > segments.last_seen[segment]
@@ -85,7 +85,7 @@ def remove_seen_through(
     begins, stops = (np.searchsorted(wall_of[order], wall, side=side) for side in ("left", "right"))
     for k, sample in enumerate(suspects):
         mates = order[begins[k] : stops[k]]
-        at = ((position[sample] - segments.centre[mates]) * segments.tangent[mates]).sum(-1)
+        at = ((position[sample] - segments.center[mates]) * segments.tangent[mates]).sum(-1)
         covers = (at >= segments.extent[mates, 0]) & (at <= segments.extent[mates, 1])
         last_seen[k] = segments.last_seen[mates[covers]].max(initial=-np.inf)
     gone[suspects] = seen_through[suspects] > last_seen
@@ -117,14 +117,14 @@ def find_openings(
         free_space: where walls would have been heard and were not.
     """
     settings = SETTINGS.artifacts
-    viewpoint = segments.centre - segments.viewing_distance[:, None] * segments.normal
+    viewpoint = segments.center - segments.viewing_distance[:, None] * segments.normal
     length = np.linalg.norm(gaps[:, 1] - gaps[:, 0], axis=-1)
     share = (np.arange(settings.gap_samples) + 0.5) / settings.gap_samples
     position = gaps[:, :1] + share[:, None] * (gaps[:, 1:] - gaps[:, :1])
     times = free_space.query(position.reshape(-1, 2), np.repeat(theta, settings.gap_samples))[:, 0]
     free_share = np.isfinite(times.reshape(-1, settings.gap_samples)).mean(axis=1)
     free = free_share * length > settings.min_opening
-    seen_through = np.array([_crosses(gap, viewpoint, segments.centre) for gap in gaps], dtype=bool)
+    seen_through = np.array([_crosses(gap, viewpoint, segments.center) for gap in gaps], dtype=bool)
     return free | seen_through
 
 
@@ -154,7 +154,7 @@ def _vertices(
     ends, own = ends.reshape(-1, 2), np.repeat(long, 4)
     if len(long) < 2:
         return ends, np.stack([own, own], axis=-1)
-    tree = KDTree(walls.centre[long])
+    tree = KDTree(walls.center[long])
     radius = 2 * settings.max_extension + float(walls.length[long].max())
     pairs = tree.query_pairs(radius, output_type="ndarray").reshape(-1, 2)
     a, b = segments[pairs[:, 0]], segments[pairs[:, 1]]

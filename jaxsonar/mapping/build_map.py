@@ -147,10 +147,10 @@ def _confirmed_points(observations: PointLandmarks, min_scans: int, systematic_e
 
 def _as_global_map(walls: WallSegments, points: PointLandmarks) -> GlobalMap:
     """Walls and points with standard deviations that include the observed scatter, sorted by number of echoes."""
-    walls = walls.take(np.lexsort((walls.centre[:, 1], walls.centre[:, 0], -walls.echoes)))
+    walls = walls.take(np.lexsort((walls.center[:, 1], walls.center[:, 0], -walls.echoes)))
     points = points.take(np.lexsort((points.position[:, 1], points.position[:, 0], -points.echoes)))
-    rho = (walls.normal * walls.centre).sum(-1)
-    moment_arm = (walls.tangent * walls.centre).sum(-1)
+    rho = (walls.normal * walls.center).sum(-1)
+    moment_arm = (walls.tangent * walls.center).sum(-1)
     # The variance factor comes from the scatter of the segments about their wall; the expected one counts once more.
     variance_factor = (walls.chi_squared + 2) / (2 * walls.count)
     sigma_theta = np.sqrt(variance_factor / walls.info_theta)

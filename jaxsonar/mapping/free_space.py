@@ -186,9 +186,9 @@ def _free_cells(
     toward, distance = ray.reshape(-1, 2)[ray_of], distances[step]
     cell_x = np.floor((from_x + distance * toward[:, 0]) / _FREE.cell)
     cell_y = np.floor((from_y + distance * toward[:, 1]) / _FREE.cell)
-    # The centre of the cell must be closer than the echo, too.
-    to_centre = np.hypot((cell_x + 0.5) * _FREE.cell - from_x, (cell_y + 0.5) * _FREE.cell - from_y)
-    near = to_centre < free_until.ravel()[ray_of]
+    # The center of the cell must be closer than the echo, too.
+    to_center = np.hypot((cell_x + 0.5) * _FREE.cell - from_x, (cell_y + 0.5) * _FREE.cell - from_y)
+    near = to_center < free_until.ravel()[ray_of]
     cell_x, cell_y = cell_x[near].astype(np.int64), cell_y[near].astype(np.int64)
     return np.stack([who[near], cell_x, cell_y, direction.ravel()[ray_of[near]]]), sensor_row[near]
 

@@ -32,7 +32,7 @@ def merge_by_hough(segments: WallSegments, *, linkage_distance: float) -> WallSe
     cluster = single_linkage(midpoint, linkage_distance)
     size = np.bincount(cluster)
     origin = np.stack([np.bincount(cluster, midpoint[:, k]) for k in (0, 1)], axis=-1) / size[:, None]
-    rho = (segments.normal * (segments.centre - origin[cluster])).sum(-1)
+    rho = (segments.normal * (segments.center - origin[cluster])).sum(-1)
     part, line = np.zeros(len(segments), dtype=np.int64), np.stack([rho, segments.theta], axis=-1)
     for settings, rows, column, row in _batches(cluster, size, rho):
         shape = bucket_size(int(row[-1]) + 1, least=2), bucket_size(int(column.max()) + 1, least=16)
@@ -145,7 +145,7 @@ def _walls_on_lines(
     alone = np.bincount(group) == 1
     walls = replace(
         fused,
-        centre=footpoint + middle[:, None] * tangent,
+        center=footpoint + middle[:, None] * tangent,
         theta=theta,
         extent=np.stack([first - middle, last - middle], axis=-1),
     )

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from jaxsonar.detection.local_model import LocalModel
-from jaxsonar.geometry.se2 import perpendicular, transform_points
+from jaxsonar.geometry.se2 import perpendicular, tangent_of, transform_points, unit
 from jaxsonar.mapping.observations import Observations, unique_pairs
 from jaxsonar.mapping.segment_fusion import mutual_best
 from jaxsonar.mapping.settings import SETTINGS
@@ -98,8 +98,7 @@ def aggregate_points(models: Sequence[LocalModel], poses: Float[np.ndarray, "mod
     found = [(k, point) for k, model in enumerate(models) if has_pose[k] for point in model.points]
     model = np.array([k for k, _ in found], dtype=np.int64)
     position = np.array([transform_points(poses[k], np.array([[p.x, p.y]]))[0] for k, p in found]).reshape(-1, 2)
-    c, s = np.cos(poses[model, 2]), np.sin(poses[model, 2])
-    rotation = np.stack([c, -s, s, c], axis=-1).reshape(-1, 2, 2)
+    rotation = np.stack([unit(poses[model, 2]), tangent_of(poses[model, 2])], axis=-1)
     cov = rotation @ np.array([p.cov for _, p in found], dtype=np.float64).reshape(-1, 2, 2) @ rotation.swapaxes(1, 2)
     # The true uncertainty region is an arc around the robot. Its curvature turns a bearing error into a range error.
     sight = position - poses[model, :2]

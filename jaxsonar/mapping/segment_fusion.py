@@ -50,7 +50,7 @@ def fuse_segments(
         # New matches involve a changed segment. First search the nearest neighbors, finally all of them.
         nearest = None if exhaustive else SETTINGS.fusion.nearest
         new = _candidate_pairs(walls, changed, gap, systematic_error, nearest=nearest)
-        badness, between = _compare(walls, new, gap, systematic_error)
+        badness, between = compare_segments(walls, new, gap, systematic_error)
         if near_wall:
             offset = _largest_offset(walls, new)
             badness = np.minimum(badness, np.maximum(offset / near_wall, between / gap))
@@ -109,8 +109,8 @@ def robust_refit(
 ) -> WallSegments:
     """The walls, estimated again with outlying segments down-weighted (iteratively reweighted least squares).
 
-    A line with echoes of another reflector is farther off than its covariance indicates. If a segment deviates from its wall
-    by more than ``outlier_gate`` standard deviations, its information is divided by the square of the excess.
+    A line with echoes of another reflector is farther off than its covariance indicates. If a segment deviates from its
+    wall by more than ``outlier_gate`` standard deviations, its information is divided by the square of the excess.
 
     Args:
         segments: wall segments.
@@ -123,7 +123,7 @@ def robust_refit(
     offset_variance = segments.count / segments.info_offset + slack**2
     theta_variance = segments.count / segments.info_theta + (settings.angle_per_offset * slack) ** 2
     for _ in range(settings.refit_iterations):
-        offset = ((segments.centre - walls.centre[wall_of]) * walls.normal[wall_of]).sum(-1)
+        offset = ((segments.center - walls.center[wall_of]) * walls.normal[wall_of]).sum(-1)
         angle = (segments.theta - walls.theta[wall_of] + np.pi / 2) % np.pi - np.pi / 2
         squared = offset**2 / offset_variance + angle**2 / theta_variance
         weight = np.minimum(1, settings.outlier_gate**2 / np.maximum(squared, 1e-9))
@@ -132,15 +132,20 @@ def robust_refit(
     return walls
 
 
-def mismatch(segments: WallSegments, pairs: Int[np.ndarray, "pairs 2"], *, gap: float) -> Float[np.ndarray, " pairs"]:
-    """How badly the segments of each pair agree: 0 for identical segments, 1 at the first gate, more beyond it."""
-    return _compare(segments, pairs, gap, SETTINGS.fusion.offset_floor)[0]
-
-
-def _compare(
+def compare_segments(
     segments: WallSegments, pairs: Int[np.ndarray, "pairs 2"], gap: float, systematic_error: float
 ) -> tuple[Float[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]:
-    """The mismatch of each pair, and the length of the gap between its segments, metres (0 if they overlap)."""
+    """How badly the segments of each pair agree, and the length of the gap between them.
+
+    Args:
+        segments: the segments.
+        pairs: rows of the segments of each pair.
+        gap: longest gap between segments of one wall, metres.
+        systematic_error: offset between segments of one wall that does not average out, metres.
+
+    Returns:
+        Mismatch: 0 for identical segments, 1 at the first gate, more beyond it. Gap, metres: 0 if they overlap.
+    """
     settings = SETTINGS.fusion
     a, b = pairs.T
     angle = wrap_angle(segments.theta[b] - segments.theta[a])
@@ -152,11 +157,11 @@ def _compare(
     offset_floor = systematic_error**2 + np.maximum(single[a], single[b])
     theta_floor = settings.angle_per_offset**2 * offset_floor
 
-    # The common line, as WallSegments.fuse would place it, and the distance of both centres across it.
+    # The common line, as WallSegments.fuse would place it, and the distance of both centers across it.
     share = segments.info_theta[b] / (segments.info_theta[a] + segments.info_theta[b])
     theta = segments.theta[a] + share * angle
     tangent, normal = tangent_of(theta), unit(theta)
-    offset = segments.centre[b] - segments.centre[a]
+    offset = segments.center[b] - segments.center[a]
     along, across = (offset * tangent).sum(-1), (offset * normal).sum(-1)
     info_a, info_b = segments.info_offset[a], segments.info_offset[b]
     info_both = info_a * info_b / (info_a + info_b)
@@ -164,8 +169,8 @@ def _compare(
     apart = np.abs(across + rotation * along)
     # The gap between the two, along the common line.
     endpoints = segments.endpoints
-    first = ((endpoints[a] - segments.centre[a][:, None]) * tangent[:, None]).sum(-1)
-    second = ((endpoints[b] - segments.centre[a][:, None]) * tangent[:, None]).sum(-1)
+    first = ((endpoints[a] - segments.center[a][:, None]) * tangent[:, None]).sum(-1)
+    second = ((endpoints[b] - segments.center[a][:, None]) * tangent[:, None]).sum(-1)
     between = np.maximum(first.min(-1) - second.max(-1), second.min(-1) - first.max(-1))
     between = np.maximum(between, 0)
     # Angles by which each must be rotated onto the common line, and the angle between both, as fractions of the gate.
@@ -182,7 +187,7 @@ def _largest_offset(segments: WallSegments, pairs: Int[np.ndarray, "pairs 2"]) -
     """Larger distance of the two ends of the shorter segment of each pair from the line of the longer one, metres."""
     a, b = pairs.T
     a, b = np.where(segments.length[a] < segments.length[b], [b, a], [a, b])
-    offset = segments.endpoints[b] - segments.centre[a][:, None]
+    offset = segments.endpoints[b] - segments.center[a][:, None]
     return np.abs((offset * segments.normal[a][:, None]).sum(-1)).max(axis=-1)
 
 

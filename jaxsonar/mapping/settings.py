@@ -19,7 +19,7 @@ class SegmentSettings:
     theta_sd: float = float(np.radians(3.0))
     """Standard deviation of the direction of such a line, radians."""
     merge_cell: float = 0.05
-    """Segments whose centres lie in one square cell of this size are stored as one fused segment, metres."""
+    """Segments whose centers lie in one square cell of this size are stored as one fused segment, metres."""
     merge_angle: float = float(np.radians(6.0))
     """Size of the cells in direction, radians."""
 
@@ -40,7 +40,7 @@ class PointSettings:
     max_normalized_misfit: float = 2.0
     """A point whose observations scatter by more than this (chi-squared per degree of freedom) is not static."""
     min_range: float = 0.1
-    """Smallest distance between a point and the robot's centre, metres. Guards a division."""
+    """Smallest distance between a point and the robot's center, metres. Guards a division."""
     min_kind_probability: float = 1e-4
     """Probability that a single observation leaves to the other kind at least."""
 
@@ -107,7 +107,7 @@ class ArtifactSettings:
     min_wall_length: float = 0.6
     """Segments of at least this length are always walls, metres."""
     corner_radius: float = 0.15
-    """Largest distance between a corner and the centre of the short line that it causes, metres."""
+    """Largest distance between a corner and the center of the short line that it causes, metres."""
     same_direction: float = float(np.radians(12.0))
     """Lines that differ by less than this have the same direction, radians."""
     perpendicular: float = float(np.radians(10.0))

@@ -72,7 +72,7 @@ def _constrain_to_points(
     zero = np.zeros(len(end))
     constraint = replace(
         walls.take(wall),
-        centre=points.position[point],
+        center=points.position[point],
         extent=np.zeros((len(end), 2)),
         info_offset=1 / variance,
         info_theta=zero,
@@ -83,7 +83,7 @@ def _constrain_to_points(
     )
     walls = concatenate([walls, constraint]).fuse(np.append(np.arange(len(walls)), wall))
     extent = walls.extent.copy()
-    extent[wall, side] = ((points.position[point] - walls.centre[wall]) * walls.tangent[wall]).sum(-1)
+    extent[wall, side] = ((points.position[point] - walls.center[wall]) * walls.tangent[wall]).sum(-1)
     return replace(walls, extent=extent)
 
 
@@ -124,7 +124,7 @@ def detached_points(walls: WallSegments, points: PointLandmarks) -> Bool[np.ndar
     detached = np.zeros(len(points), dtype=bool)
     for k, p in zip(wall, point, strict=True):
         other = angle_between_lines(walls.theta, walls.theta[[k]]) > SETTINGS.artifacts.same_direction
-        offset = points.position[p] - walls.centre
+        offset = points.position[p] - walls.center
         along = (offset * walls.tangent).sum(-1)
         meets = np.abs((offset * walls.normal).sum(-1)) <= margin
         meets &= (along >= walls.extent[:, 0] - margin) & (along <= walls.extent[:, 1] + margin)
@@ -157,7 +157,7 @@ def _relative_position(
 
     The gate is that of point observations, with ``offset_floor`` (metres) added in quadrature.
     """
-    offset, normal = points.position[point] - walls.centre[wall], walls.normal[wall]
+    offset, normal = points.position[point] - walls.center[wall], walls.normal[wall]
     along, across = (offset * walls.tangent[wall]).sum(-1), (offset * normal).sum(-1)
     variance = np.einsum("pi,pij,pj->p", normal, points.inflated_cov[point], normal)
     variance += 1 / walls.info_offset[wall] + along**2 / walls.info_theta[wall]

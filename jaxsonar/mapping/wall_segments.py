@@ -17,16 +17,16 @@ from jaxsonar.mapping.settings import SETTINGS
 class WallSegments(Observations):
     """Straight wall segments, world frame, one per row.
 
-    The line of a segment is parametrized at ``centre``, the point where the errors of its offset (perpendicular to the
+    The line of a segment is parametrized at ``center``, the point where the errors of its offset (perpendicular to the
     line) and of its direction are uncorrelated.
     """
 
-    centre: Float[np.ndarray, "segments 2"]
+    center: Float[np.ndarray, "segments 2"]
     """Point on the line, metres."""
     theta: Float[np.ndarray, " segments"]
     """Direction of the normal, pointing away from the robot that observed it, radians, in [-pi, pi)."""
     extent: Float[np.ndarray, "segments 2"]
-    """Start and end of the segment along its tangent, measured from ``centre``, metres."""
+    """Start and end of the segment along its tangent, measured from ``center``, metres."""
     info_offset: Float[np.ndarray, " segments"]
     """Inverse variance of the offset, 1 / m^2."""
     info_theta: Float[np.ndarray, " segments"]
@@ -47,7 +47,7 @@ class WallSegments(Observations):
     @property
     def endpoints(self) -> Float[np.ndarray, "segments 2 2"]:
         """Start and end points, world frame, metres."""
-        return self.centre[:, None] + self.extent[..., None] * self.tangent[:, None]
+        return self.center[:, None] + self.extent[..., None] * self.tangent[:, None]
 
     @property
     def length(self) -> Float[np.ndarray, " segments"]:
@@ -57,16 +57,16 @@ class WallSegments(Observations):
     def grid_cells(self) -> Int[np.ndarray, "segments 3"]:
         """Cell of each segment in position (5 cm) and direction (6 degrees)."""
         cell, angle = SETTINGS.segments.merge_cell, SETTINGS.segments.merge_angle
-        return np.column_stack([np.floor(self.centre / cell), np.floor(self.theta / angle)]).astype(np.int64)
+        return np.column_stack([np.floor(self.center / cell), np.floor(self.theta / angle)]).astype(np.int64)
 
     def fuse(self, group: Int[np.ndarray, " segments"]) -> "WallSegments":
         """One segment per group: the line that fits its members best, between their outermost projected ends.
 
-        A line through the common centre with normal n has the cost
+        A line through the common center with normal n has the cost
 
             sum of info_offset (d . n)^2 + info_theta (t . n)^2   =   n' M n,
 
-        where d is the centre of a member relative to the common centre and t its tangent. The minimum is the
+        where d is the center of a member relative to the common center and t its tangent. The minimum is the
         eigenvector of M with the smaller eigenvalue: segments far apart along a wall determine its direction better
         than any of them alone. Rotating the line by b raises the cost by (difference of the eigenvalues) sin(b)^2,
         which is the information that the result stores. Therefore information adds up, to rounding; the ends differ by
@@ -80,11 +80,11 @@ class WallSegments(Observations):
         def total(values: np.ndarray) -> np.ndarray:
             return np.bincount(group, values, groups)
 
-        # The common centre, relative to any member, which avoids cancellation far from the world's origin.
+        # The common center, relative to any member, which avoids cancellation far from the world's origin.
         first = np.zeros(groups, dtype=np.int64)
         first[group] = np.arange(len(group))
-        origin = self.centre[first]
-        d, t, w, v = self.centre - origin[group], self.tangent, self.info_offset, self.info_theta
+        origin = self.center[first]
+        d, t, w, v = self.center - origin[group], self.tangent, self.info_offset, self.info_theta
         info = total(w)
         middle = np.stack([total(w * d[:, 0]), total(w * d[:, 1])], axis=-1) / info[:, None]
         d = d - middle[group]
@@ -102,13 +102,13 @@ class WallSegments(Observations):
         facing = (self.normal[leader] * normal).sum(-1)
         theta = wrap_angle(theta + np.where(facing < 0, np.pi, 0.0))
 
-        centre = origin + middle
-        start, end = outermost_projections(self.endpoints, group, centre, tangent_of(theta))
+        center = origin + middle
+        start, end = outermost_projections(self.endpoints, group, center, tangent_of(theta))
         last_seen = np.full(groups, -np.inf)
         np.maximum.at(last_seen, group, self.last_seen)
         count = total(self.count)
         fused = WallSegments(
-            centre=centre,
+            center=center,
             theta=theta,
             extent=np.stack([start, end], axis=-1),
             info_offset=info,
@@ -138,11 +138,11 @@ def aggregate_segments(models: Sequence[LocalModel], poses: Float[np.ndarray, "m
     in_robot = np.array([line.segment for _, line in lines], dtype=np.float64).reshape(-1, 2, 2)
     in_world = [transform_points(poses[k], ends) for k, ends in zip(model, in_robot, strict=True)]
     endpoints = np.array(in_world).reshape(-1, 2, 2)
-    centre, info_offset, info_theta = _uncorrelated_centre(lines, endpoints, theta)
-    extent = ((endpoints - centre[:, None]) * tangent_of(theta)[:, None]).sum(-1)
+    center, info_offset, info_theta = _uncorrelated_center(lines, endpoints, theta)
+    extent = ((endpoints - center[:, None]) * tangent_of(theta)[:, None]).sum(-1)
     seen = np.array([(row, scan) for row, (_, line) in enumerate(lines) for scan in line.scans], dtype=np.int64)
     return WallSegments(
-        centre=centre,
+        center=center,
         theta=wrap_angle(theta),
         extent=np.sort(extent, axis=1),
         info_offset=info_offset,
@@ -161,7 +161,7 @@ def observation_times(models: Sequence[LocalModel]) -> Float[np.ndarray, " model
     return np.array([m.scan if np.isnan(m.stamp) else m.stamp for m in models], dtype=np.float64)
 
 
-def _uncorrelated_centre(
+def _uncorrelated_center(
     lines: Sequence[tuple[int, Line]], endpoints: Float[np.ndarray, "lines 2 2"], theta: Float[np.ndarray, " lines"]
 ) -> tuple[Float[np.ndarray, "lines 2"], Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
     """The point of each line where the errors of offset and direction are uncorrelated, and their inverse variances.
@@ -170,7 +170,7 @@ def _uncorrelated_centre(
     d_rho - s d_theta. It is uncorrelated with d_theta at s = cov(rho, theta) / var(theta). A line without covariance
     gets the default one at the middle of its footpoints.
     """
-    centre = endpoints.mean(axis=1)
+    center = endpoints.mean(axis=1)
     info_offset = np.full(len(lines), SETTINGS.segments.offset_sd**-2)
     info_theta = np.full(len(lines), SETTINGS.segments.theta_sd**-2)
     has_cov = np.array([k for k, (_, line) in enumerate(lines) if line.cov is not None], dtype=np.int64)
@@ -182,10 +182,10 @@ def _uncorrelated_centre(
         own = np.array([line.theta for line in chosen])
         middle_along = middle[:, 1] * np.cos(own) - middle[:, 0] * np.sin(own)
         shift = cov[:, 0, 1] / cov[:, 1, 1] - middle_along
-        centre[has_cov] += shift[:, None] * tangent_of(own + heading)
+        center[has_cov] += shift[:, None] * tangent_of(own + heading)
         info_offset[has_cov] = 1 / (cov[:, 0, 0] - cov[:, 0, 1] ** 2 / cov[:, 1, 1])
         info_theta[has_cov] = 1 / cov[:, 1, 1]
-    return centre, info_offset, info_theta
+    return center, info_offset, info_theta
 
 
 def outermost_projections(

@@ -102,7 +102,7 @@ def inverse_sensor_model(
         sector = ((off_axis / width[beam] + 1) * (sectors / 2)).astype(int)
         visible = distance < visible_until[beam, np.minimum(sector, sectors - 1)]
     off_axis, unexplained = np.abs(off_axis), visible & ~explained[beam]
-    # Half the diagonal of a cell: the largest distance of a curve through a cell from the cell's centre.
+    # Half the diagonal of a cell: the largest distance of a curve through a cell from the cell's center.
     tolerance = resolution / np.sqrt(2)
     # Cells that the inner cone touches count as free, so that no ring of unknown cells remains around the robot.
     touched = distance * np.sin(np.maximum(off_axis - certain, 0)) <= tolerance

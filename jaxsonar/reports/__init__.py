@@ -1,7 +1,7 @@
 """Reports: figures, tables for the terminal, and HTML pages.
 
 Entry points: one function per figure in ``plot_scan``, ``plot_map``, ``plot_slam``, ``plot_calibration`` and
-``plot_health``; colours, plan views and ``save_figure`` in ``plot_style``; ``*_table`` in ``terminal_tables``;
+``plot_health``; colors, plan views and ``save_figure`` in ``plot_style``; ``*_table`` in ``terminal_tables``;
 ``save_report`` in ``html_page``.
 
 Design decisions:

@@ -22,7 +22,7 @@ from jaxsonar.reports.plot_style import (
 )
 
 _MAX_LINES = 7
-"""Maximum number of text lines for findings."""
+"""Maximum number of text lines for findings; more do not fit into the panel."""
 
 
 def health_figure(health: Health) -> Figure:

@@ -37,11 +37,11 @@ from jaxsonar.reports.text import plural
 from jaxsonar.sensors.ring import Ring
 
 MAX_NUMBERED_POSES = 40
-"""Up to this many robot positions are numbered; more are drawn as a trajectory."""
+"""Up to this many robot positions are numbered; more are drawn as a trajectory. Chosen by hand."""
 _POINT_SIZES = {"corner": 5.5, "edge": 4.5}
 """Marker sizes, points."""
 _MARGIN = 0.25
-"""Margin around the shown points of a detail, metres."""
+"""Margin around the shown points of a detail, metres. Chosen by hand."""
 
 
 def modeling_figure(
@@ -61,7 +61,7 @@ def modeling_figure(
         models: local model of each scan.
         poses: world_from_robot (x, y, theta) of each scan.
         scans: indices of the models to draw.
-        near: centre (x, y) of a detail in the world frame, metres; by default everything is drawn.
+        near: center (x, y) of a detail in the world frame, metres; by default everything is drawn.
         within: maximum distance of a segment's middle from ``near``, metres.
         room: the true walls, if known.
     """

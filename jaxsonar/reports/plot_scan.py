@@ -178,8 +178,8 @@ def accumulator_figure(
             )
             figure.colorbar(drawn, ax=axes, pad=0.01, aspect=35, label="points")
     palette = ListedColormap(PALETTE)
-    labelled = np.ma.masked_equal(labels.T, 0)
-    panels[2].imshow((labelled - 1) % 6, origin="lower", extent=box, aspect="auto", cmap=palette, vmin=-0.5, vmax=5.5)
+    labeled = np.ma.masked_equal(labels.T, 0)
+    panels[2].imshow((labeled - 1) % 6, origin="lower", extent=box, aspect="auto", cmap=palette, vmin=-0.5, vmax=5.5)
     for line in model.lines:
         panels[2].plot(np.degrees(line.theta), line.rho, "+", color=ROBOT_COLOR, ms=9, mew=1.6)
     panels[2].legend(

@@ -29,14 +29,15 @@ from jaxsonar.reports.plot_style import (
 from jaxsonar.reports.text import plural
 
 ELLIPSE_SIGMAS = 2
-"""Standard deviations from the centre of a covariance ellipse to its border."""
+"""Standard deviations from the center of a covariance ellipse to its border."""
 ELLIPSE_PROBABILITY = 1 - np.exp(-(ELLIPSE_SIGMAS**2) / 2)
 """Probability that a normally distributed position is inside its ellipse: 86 %."""
 MAX_ELLIPSES = 24
 """Number of ellipses along the trajectory. Chosen by hand."""
 _MIN_ELLIPSE = 0.008
-"""Minimum half axis relative to the size of the trajectory; smaller ellipses are enlarged."""
+"""Minimum half axis relative to the size of the trajectory; smaller ellipses are enlarged. Chosen by hand."""
 _ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+"""Factors by which ellipses may be enlarged: round numbers, because the legend names the factor."""
 _ODOMETRY_COLOR, _TRUTH_COLOR, _CLOSURE_COLOR, _WITHDRAWN_COLOR = WALL_COLOR, ROBOT_COLOR, PALETTE[2], CROSS_COLOR
 _POINT_SIZES = {"corner": 3.5, "edge": 3.0}
 """Marker sizes, points."""

@@ -1,4 +1,4 @@
-"""Common parts of all figures: colours and style, plan views in metres, legends, and saving.
+"""Common parts of all figures: colors and style, plan views in metres, legends, and saving.
 
 Each function of the other ``plot_*`` modules draws one figure and returns it; ``save_figure`` writes it.
 """
@@ -25,7 +25,7 @@ from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.sensors.ring import Ring
 
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
-"""Colours of Okabe and Ito, distinct for colour-blind readers."""
+"""Colours of Okabe and Ito, distinct for color-blind readers."""
 DIRECT_COLOR, CROSS_COLOR = PALETTE[0], PALETTE[1]
 """Direct and cross echoes."""
 LINE_COLOR = "#B5123E"

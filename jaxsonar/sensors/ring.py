@@ -13,9 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.hardware.errors import SonarError
-
-REFERENCE_SPEED_OF_SOUND = 343.2
-"""Metres per second, air at 20 deg C. A log's range is half the time of flight times this, at any temperature."""
+from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 
 AnyArray = np.ndarray | jax.Array
 """NumPy arrays as a rule; JAX arrays or tracers where a loss is differentiated with respect to the ring."""

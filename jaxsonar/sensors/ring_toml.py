@@ -13,7 +13,8 @@ from msgspec import Meta
 
 from jaxsonar.fileio.atomic_files import atomic_write, read_toml, shown
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
+from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
+from jaxsonar.sensors.ring import Ring
 
 DATA = Path(__file__).parents[1] / "data"
 

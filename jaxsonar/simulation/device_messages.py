@@ -9,10 +9,10 @@ from jaxtyping import Float, Int
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.hardware.messages import ECHO, Group, Message, Pose
+from jaxsonar.hardware.messages import ECHO, REFERENCE_SPEED_OF_SOUND, Group, Message, Pose
 from jaxsonar.hardware.protocol import MAX_ANGLE, MAX_POSITION, MAX_TIME_OF_FLIGHT_US
 from jaxsonar.scans.scan_log import Log
-from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
+from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.simulator import simulate
 
 NUMBER_LIMITS = {"scan": 2**32, "echo": 2**8}

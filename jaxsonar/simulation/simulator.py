@@ -13,8 +13,9 @@ from jaxtyping import Float, Int
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.scans.scan_log import Log
-from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND, Ring
+from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.acoustics import Acoustics, amplitudes, ranks, unblanked
 from jaxsonar.simulation.echo_tracing import trace_echoes
 from jaxsonar.simulation.traced_echoes import EchoKind
@@ -22,7 +23,7 @@ from jaxsonar.simulation.traced_echoes import EchoKind
 SCAN_PERIOD = 0.1
 """Time between scans without stamps, seconds: about the period of the paper's ring (8 firing groups of 11.7 ms)."""
 MIN_CLUTTER_RANGE = 0.1
-"""Smallest range of false echoes, metres."""
+"""Smallest range of false echoes, metres; chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +116,7 @@ def simulate(
     times = np.arange(len(poses)) * SCAN_PERIOD if stamps is None else np.array(stamps, dtype=np.float64)
     _check(poses, times, sigma, drift, drift_time, dropout, clutter, seed, max_echoes, blanking, chunk)
     # Trace the echoes and detect those above the threshold.
-    array = _SensorArray.of(ring)
+    array = _TransducerArray.of(ring)
     parts = [_Echoes.empty()]
     for begin in range(0, len(poses), chunk):
         detected = _detect(array, room, poses[begin : begin + chunk], acoustics, max_echoes, blanking)
@@ -171,7 +172,7 @@ class _Echoes(NamedTuple):
         return _Echoes(*(column[order] for column in self))
 
 
-class _SensorArray(NamedTuple):
+class _TransducerArray(NamedTuple):
     """A ring as plain arrays. (i, j) and (j, i) give the same echoes, so each unordered pair is traced once."""
 
     position: Float[np.ndarray, "sensors 2"]
@@ -189,7 +190,7 @@ class _SensorArray(NamedTuple):
     """Paths in both directions; -1 if the ring has none."""
 
     @classmethod
-    def of(cls, ring: Ring) -> "_SensorArray":
+    def of(cls, ring: Ring) -> "_TransducerArray":
         heading, beam, offset = (np.asarray(x, dtype=np.float64) for x in (ring.heading, ring.beam, ring.range_offset))
         tx, rx = ring.paths.T
         pairs, pair = np.unique(np.sort(ring.paths, axis=1), axis=0, return_inverse=True)
@@ -216,7 +217,7 @@ class _SensorArray(NamedTuple):
 
 
 def _detect(
-    array: _SensorArray,
+    array: _TransducerArray,
     room: Room,
     poses: Float[np.ndarray, "scans 3"],
     acoustics: Acoustics,
@@ -240,7 +241,7 @@ def _detect(
     return _Echoes(found.group, found.pair, found.length / 2, amplitude, found.kind, found.reflector, found.second)
 
 
-def _both_directions(array: _SensorArray, echoes: _Echoes) -> _Echoes:
+def _both_directions(array: _TransducerArray, echoes: _Echoes) -> _Echoes:
     """Echoes of pairs as echoes of both paths; in the opposite direction the order of the walls is reversed."""
     forward, backward = array.paths_of_pair[echoes.path].T
     last_wall = np.where(echoes.kind == EchoKind.SECOND_ORDER, echoes.second, echoes.reflector)
@@ -250,7 +251,7 @@ def _both_directions(array: _SensorArray, echoes: _Echoes) -> _Echoes:
 
 
 def _clutter(
-    array: _SensorArray, echoes: _Echoes, scans: int, clutter: float, threshold: float, rng: np.random.Generator
+    array: _TransducerArray, echoes: _Echoes, scans: int, clutter: float, threshold: float, rng: np.random.Generator
 ) -> _Echoes:
     """False echoes of all scans."""
     if not len(array.overlapping):

@@ -12,7 +12,8 @@ from jaxsonar.geometry.segments import crossings, point_to_segments
 from jaxsonar.simulation.traced_echoes import TracedEchoes
 
 TOLERANCE = 1e-9
-"""Rounding error that is allowed when a point lies on a wall or at its end, metres."""
+"""Rounding error that is allowed when a point lies on a wall or at its end, metres; double precision of coordinates
+of some metres leaves 1e-15."""
 
 
 class WallFrames(NamedTuple):

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from jaxsonar.hardware.drop_oldest_queue import DropOldestQueue
 from jaxsonar.hardware.messages import ECHO, Group, Pose
-from jaxsonar.hardware.scan_assembler import REFERENCE_SPEED_OF_SOUND, SETTINGS, ScanAssembler
-from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND as RING_REFERENCE
+from jaxsonar.hardware.scan_assembler import SETTINGS, ScanAssembler
 
 GROUPS, PERIOD_US = 8, 11_700
 
@@ -227,7 +226,6 @@ def test_scans_without_echoes_have_temperature_and_ranges():
     assert len(silent.echoes) == len(silent.ranges) == 0
     assert silent.temperature == 21.5
     np.testing.assert_allclose(heard.ranges, 1001e-6 * 343.2 / 2)
-    assert REFERENCE_SPEED_OF_SOUND == RING_REFERENCE
 
 
 def test_echoes_are_sorted_by_path(faw_ring):

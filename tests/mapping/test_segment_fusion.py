@@ -11,7 +11,7 @@ from support.segments import moved, same, segments_at
 
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.mapping.observations import concatenate
-from jaxsonar.mapping.segment_fusion import fuse_segments, mismatch
+from jaxsonar.mapping.segment_fusion import compare_segments, fuse_segments
 from jaxsonar.mapping.settings import SETTINGS
 
 NOISE = SETTINGS.segments
@@ -48,6 +48,10 @@ def seen_walls(rng, walls, each, *, noise=1.0, reach=0.2):
 
 def every_pair(count):
     return np.array(list(combinations(range(count), 2)), np.int64).reshape(-1, 2)
+
+
+def mismatch(segments, pairs, gap=GAP):
+    return compare_segments(segments, pairs, gap, SETTINGS.fusion.offset_floor)[0]
 
 
 def least_mismatch(walls, gap=GAP):
