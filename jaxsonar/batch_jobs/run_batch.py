@@ -106,7 +106,7 @@ def batch(
     logs = find_inputs(inputs)
     check_extras(logs)
     job = job_spec(ring, method=method, settings=settings, sigma=sigma)
-    # 3. Open the manifest: it knows what an earlier run has finished.
+    # 3. Open the manifest: it lists what an earlier run has finished.
     with open_manifest(output, _run_record(job, method, sigma, settings, shard_scans)) as manifest:
         manifest.check_inputs(log.source for log in logs)
         # 4. Split the logs into shards; this depends on the logs alone.

@@ -1,4 +1,4 @@
-"""Width and direction of the detection cones, from which walls were heard at which off-axis angle."""
+"""Width and direction of the detection cones, from which walls were detected at which off-axis angle."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int

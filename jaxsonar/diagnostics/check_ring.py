@@ -133,7 +133,7 @@ def _reference_walls(
         return part, scene, "scans", ""
     if not (np.asarray(ring.corrected(part.range, part.tx, part.rx)) < ring.max_range).any():
         if not len(log.range):
-            return part, scene, "", "no scan heard anything"
+            return part, scene, "", "no echo in any scan"
         reach = f"none of the {len(log.range)} echoes is within the maximum range, {ring.max_range:g} m"
         return part, scene, "", f"{reach}: are ranges half path lengths in metres?"
     if np.isfinite(part.pose).all(axis=1).sum() < 2:
@@ -169,8 +169,8 @@ def _count_well_inside(
     direct = table.tx == table.rx
     columns = ((table.tx, inside & direct), (table.tx, inside & ~direct), (table.rx, inside & ~direct))
     expected = [np.bincount(sensor[rows], minlength=sensors) for sensor, rows in columns]
-    heard = [np.bincount(sensor[rows & detected], minlength=sensors) for sensor, rows in columns]
-    return np.stack(expected, axis=-1), np.stack(heard, axis=-1)
+    detected_count = [np.bincount(sensor[rows & detected], minlength=sensors) for sensor, rows in columns]
+    return np.stack(expected, axis=-1), np.stack(detected_count, axis=-1)
 
 
 def _residual_statistics(

@@ -48,14 +48,14 @@ def _silent_sensors(health: Health) -> Iterator[Finding]:
     echoes = health.direct + health.cross
     others = float(np.median(echoes))
     for k in range(health.ring.count):
-        expected, heard = health.expected[k], health.heard[k]
-        low = _is_low(expected, heard, usual, _FINDINGS.dead_rate)
+        expected, detected = health.expected[k], health.heard[k]
+        low = _is_low(expected, detected, usual, _FINDINGS.dead_rate)
         few_cross = expected[1:].min() < _FINDINGS.min_expected
         if low[0] and (np.isnan(usual[1]) or low[1:].all() or few_cross):
-            amount = "nothing" if heard.sum() == 0 else "hardly anything"
+            amount = "nothing" if detected.sum() == 0 else "hardly anything"
             elsewhere = f", and reports {echoes[k]} echoes elsewhere" if echoes[k] > 0.3 * others else ""
             yield Finding(
-                f"sensor {k} hears {amount}: {heard[0]} of {expected[0]} expected direct echoes, the others "
+                f"sensor {k} hears {amount}: {detected[0]} of {expected[0]} expected direct echoes, the others "
                 f"{100 * usual[0]:.0f} %{elsewhere}",
                 {k: "hears no wall" if elsewhere else "dead"},
                 exclusive=True,
@@ -68,7 +68,7 @@ def _silent_sensors(health: Health) -> Iterator[Finding]:
                 (1, "mute", "no other sensor hears it") if low[1] else (2, "deaf", "it hears no other sensor")
             )
             yield Finding(
-                f"sensor {k} is {remark}, {meaning}: {heard[role]} of {expected[role]} expected cross echoes, the "
+                f"sensor {k} is {remark}, {meaning}: {detected[role]} of {expected[role]} expected cross echoes, the "
                 f"others {100 * usual[role]:.0f} %",
                 {k: remark},
                 exclusive=True,
@@ -142,15 +142,15 @@ def _weak_or_turned_sensors(health: Health) -> Iterator[Finding]:
     """Sensors that detect little, or point in another direction."""
     usual = _usual_rates(health)
     for k in range(health.ring.count):
-        expected, heard = health.expected[k], health.heard[k]
-        if _is_low(expected, heard, usual, _FINDINGS.weak_rate)[0] and expected[0] >= 2 * _FINDINGS.min_expected:
+        expected, detected = health.expected[k], health.heard[k]
+        if _is_low(expected, detected, usual, _FINDINGS.weak_rate)[0] and expected[0] >= 2 * _FINDINGS.min_expected:
             yield Finding(
-                f"sensor {k} hears {heard[0]} of {expected[0]} expected direct echoes, the others "
+                f"sensor {k} hears {detected[0]} of {expected[0]} expected direct echoes, the others "
                 f"{100 * usual[0]:.0f} %",
                 {k: "weak"},
             )
         turn, error = np.degrees(health.center[k])
-        # Not against a map: its walls end where they were heard.
+        # Not against a map: its walls end where they were detected.
         if abs(turn) > max(_FINDINGS.min_turn_deg, 4 * error) and health.source == "scans":
             side = "left" if turn > 0 else "right"
             yield Finding(f"sensor {k} points {abs(turn):.0f} ± {error:.0f} deg too far to the {side}", {k: "turned"})
@@ -198,10 +198,10 @@ def _usual_rates(health: Health) -> Float[np.ndarray, " 3"]:
 
 
 def _is_low(
-    expected: Int[np.ndarray, " 3"], heard: Int[np.ndarray, " 3"], usual: Float[np.ndarray, " 3"], fraction: float
+    expected: Int[np.ndarray, " 3"], detected: Int[np.ndarray, " 3"], usual: Float[np.ndarray, " 3"], fraction: float
 ) -> Bool[np.ndarray, " 3"]:
     """Whether the detection rates are below this fraction of the usual ones, and significantly (4 sigma, binomial)."""
     usual = np.minimum(usual, 0.9)
     sigma = np.sqrt(usual * (1 - usual) * np.maximum(expected, 1))
     enough = expected >= _FINDINGS.min_expected
-    return enough & (heard < fraction * usual * expected) & (usual * expected - heard > 4 * sigma)
+    return enough & (detected < fraction * usual * expected) & (usual * expected - detected > 4 * sigma)

@@ -19,7 +19,7 @@ UNUSED = -1
 
 
 def concatenate_landmarks(parts: Sequence[Landmarks]) -> Landmarks:
-    """Landmarks of one frame in one container; none of no parts."""
+    """Landmarks of one frame in one container; an empty one without parts."""
     return Landmarks(
         kind=np.concatenate([np.zeros(0, np.int32), *(part.kind for part in parts)]).astype(np.int32),
         parameters=np.concatenate([np.zeros((0, 2)), *(part.parameters for part in parts)]),

@@ -62,7 +62,7 @@ def remove_seen_through(
     Args:
         segments: wall segments.
         wall_of: number of the wall that each belongs to.
-        free_space: where walls would have been heard and were not.
+        free_space: where walls would have been detected and were not.
     """
     if not len(segments) or not free_space.tiles:
         return segments
@@ -108,13 +108,13 @@ def find_openings(
     segments: WallSegments,
     free_space: DirectionalFreeSpace,
 ) -> Bool[np.ndarray, " gaps"]:
-    """Which gaps in walls are openings: something was observed through them, or a wall there would have been heard.
+    """Which gaps in walls are openings: something was observed through them, or a wall there would have been detected.
 
     Args:
         gaps: both ends of each gap, metres.
         theta: normals of the walls, radians.
         segments: observed segments, each from ``viewing_distance`` in front of it.
-        free_space: where walls would have been heard and were not.
+        free_space: where walls would have been detected and were not.
     """
     settings = SETTINGS.artifacts
     viewpoint = segments.center - segments.viewing_distance[:, None] * segments.normal

@@ -1,9 +1,9 @@
-"""Directional free space: where a wall with a given normal would have been heard and was not.
+"""Directional free space: where a wall with a given normal would have been detected and was not.
 
 A sensor without an echo does not prove that its whole cone is empty, because a smooth wall reflects sound back only if
 it faces the sensor. A missing echo excludes walls at a position with a direction. Therefore the map of free space has a
 cell for every position on the floor and every direction of a wall's normal. Each cell stores the times of the latest
-scans that would have heard a wall there.
+scans that would have detected a wall there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -106,7 +106,7 @@ def observe_free_space(
     distance: Float[np.ndarray, " echoes"],
     walls: Sequence[Float[np.ndarray, "_ 2 2"]],
 ) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, " cells"]]:
-    """Cells in which each scan would have heard a wall and did not.
+    """Cells in which each scan would have detected a wall and did not.
 
     Only direct paths contribute. A cell is free for a sensor that faces it if its first echo comes from farther away.
     If the cones cover every direction at least twice, two sensors must agree within 20 cm. Cells that the echo arc of
@@ -227,7 +227,7 @@ def _distance_to_walls(
     toward = np.einsum("srk,wk->srw", ray, normal)
     distance = (offset * normal).sum(-1)[:, None] / np.where(np.abs(toward) > 1e-9, toward, np.nan)
     position = distance * np.einsum("srk,wk->srw", ray, tangent) - (offset * tangent).sum(-1)[:, None]
-    # A ray that faces the wall would have heard the extension, so the extension occludes nothing from it.
+    # A ray that faces the wall would have detected the extension, so the extension occludes nothing from it.
     extension = np.where(np.abs(toward) < np.cos(_FREE.facing), _FREE.extension, 0.0)
     meets = (distance > 0) & (position > -extension) & (position < length + extension)
     return np.where(meets, distance, np.inf).min(axis=-1)

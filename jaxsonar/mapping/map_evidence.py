@@ -20,7 +20,7 @@ from jaxsonar.sensors.ring import Ring
 
 @dataclass(frozen=True, eq=False)
 class MapEvidence:
-    """Observed segments and points, and the free space in which walls were not heard.
+    """Observed segments and points, and the free space in which walls were not detected.
 
     The evidence of two logs is the union of their evidence; the order of the scans does not matter.
     """
@@ -30,7 +30,7 @@ class MapEvidence:
     points: PointLandmarks
     """Corners and edges of local models, world frame."""
     free_space: DirectionalFreeSpace
-    """Where walls would have been heard and were not."""
+    """Where walls would have been detected and were not."""
     robot_cells: Int[np.ndarray, "cells 2"]
     """Cells (5 cm) of the robot's positions at which local models were made, without repetition."""
     models: int

@@ -159,7 +159,7 @@ class FreeSpaceSettings:
     margin: float = 0.10
     """A wall must be closer than the first echo by this much before it counts as missed, metres."""
     certain: float = 0.85
-    """Fraction of the cone's width, and of the maximum range, within which a wall is always heard."""
+    """Fraction of the cone's width, and of the maximum range, within which a wall is always detected."""
     extension: float = 1.0
     """Length by which a wall is assumed to extend beyond its ends, where it occludes what is behind it, metres."""
     facing: float = float(np.radians(15.0))

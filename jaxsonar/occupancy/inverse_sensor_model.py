@@ -1,4 +1,4 @@
-"""The inverse sensor model: what the direct echoes of one scan say about the grid cells around the robot."""
+"""The inverse sensor model: the evidence of the direct echoes of one scan for the grid cells around the robot."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -86,7 +86,7 @@ def inverse_sensor_model(
     half_width, first_echo = sensors.half_width[listening], first_echo[listening]
     explained = explained_by_walls(position, heading, half_width, first_echo, walls) | (first_echo <= 0)
 
-    # Cells of each beam. An echo of a known wall says nothing about the cells behind the wall, so the beam ends there.
+    # Cells of each beam. An echo of a known wall is no evidence for the cells behind the wall, so the beam ends there.
     limit = np.where(explained, np.minimum(first_echo, max_range), max_range)
     polar, in_square = _polar_cells(max_range, resolution, size), position / resolution - corner
     width = half_width + SETTINGS.shadow

@@ -147,8 +147,8 @@ def occupancy(
 ) -> OccupancyGrid:
     """The occupancy grid of a log, from its direct echoes and known walls.
 
-    A sensor without an echo counts as having heard nothing, and its cone as free. If a log leaves out readings that
-    were merely not renewed, pass the sensors that fired.
+    A sensor without an echo counts as one that received nothing, and its cone as free. If a log leaves out readings
+    that were merely not renewed, pass the sensors that fired.
 
     Args:
         ring: the sensors.

@@ -21,17 +21,17 @@ class OccupancySettings:
     explained: float = 0.08
     """An echo within this distance of the range of a known wall, wall end or corner is attributed to it, metres."""
     beyond_end: float = 0.3
-    """Known walls also reflect this far beyond their mapped ends, metres: a map knows them up to the outermost
+    """Known walls also reflect this far beyond their mapped ends, metres: a map has them up to the outermost
     footpoint (paper, section 5)."""
     beyond_cone: float = float(np.radians(5.0))
-    """A wall is strong enough to be heard this far outside the cone, radians."""
+    """A wall is strong enough to be detected this far outside the cone, radians."""
     max_extension: float = 1.0
     """Length by which a wall may extend beyond its end, and occlude what is behind, where no sensor could hear it,
     metres."""
     touches: float = 0.05
     """A wall whose end is this close to another wall ends there, metres."""
     no_wall: float = 0.2
-    """If a sensor would have heard a wall and did not, there is none within this distance of its footpoint, metres."""
+    """If a sensor should detect a wall and does not, there is none within this distance of its footpoint, metres."""
     footprint_weight: int = 20
     """Number of free beams that the robot's own footprint counts as: the robot stood there."""
     viewpoint_cell: float = 0.2

@@ -90,14 +90,14 @@ def estimate_extensions(
     """Largest length by which each wall can extend beyond its start and its end, metres, according to one scan.
 
     A map contains walls up to the outermost footpoint. If the extended wall would have a footpoint of a sensor, but the
-    sensor heard nothing, then the wall has ended before. So an open door stays open for a robot that looks through it
-    at a right angle.
+    sensor received nothing, then the wall has ended before. So an open door stays open for a robot that looks through
+    it at a right angle.
 
     Args:
         position: of the sensors, world frame, metres.
         heading: of the sensors, radians.
-        half_width: half of the part of each cone in which a wall is always heard, radians.
-        silent_until: range up to which nothing was heard, metres.
+        half_width: half of the part of each cone in which a wall is always detected, radians.
+        silent_until: range up to which nothing was received, metres.
         walls: the known walls.
     """
     foot, along, length = _footpoints(position, walls)

@@ -97,7 +97,7 @@ def _is_newer(filename: str | os.PathLike[str], other: str | os.PathLike[str]) -
 
 
 def _without_last_scan(text: bytes) -> bytes:
-    """The rows before the last scan, which may be incomplete in a file that is shorter than its marker says."""
+    """The rows before the last scan, which may be incomplete in a file that is shorter than its marker states."""
     rows = text.splitlines(keepends=True)
     if rows and not rows[-1].endswith(b"\n"):
         rows.pop()

@@ -170,7 +170,7 @@ def test_a_stuck_sensor_is_named(log):
 def test_the_reason_for_missing_walls_is_reported(log, rng):
     silent = check(RING, only(log, log.tx < 0))
     far = check(RING, dataclasses.replace(log, range=log.range + 3))
-    assert silent.empty == "no scan heard anything"
+    assert silent.empty == "no echo in any scan"
     assert "within the maximum range, 2 m: are ranges half path lengths in metres?" in far.empty
     fullest = only(log, log.echo_scan == np.bincount(log.echo_scan).argmax())
     few = check(RING, dataclasses.replace(fullest, range=rng.uniform(0.3, 2, len(fullest.range))))

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.echo_paths import paths_between
+from support.tracing import trace_between
 
 from jaxsonar import Room
 from jaxsonar.kernels import detection_cones, measurement_model
-from jaxsonar.simulation.echo_tracing import trace_between
 from jaxsonar.simulation.traced_echoes import EchoKind
 
 PATHS = 64

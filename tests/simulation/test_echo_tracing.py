@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.rooms import loop, places, room_of_exact_angles, turned
+from support.tracing import trace_between
 
 from jaxsonar import Room, random_room
-from jaxsonar.simulation.echo_tracing import trace_between
 from jaxsonar.simulation.traced_echoes import EchoKind, TracedEchoes
 
 seeds = st.integers(0, 2**32 - 1)

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.rooms import loop, some_poses, turned
+from support.tracing import trace_between
 
 from jaxsonar import Room, random_room
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.acoustics import Acoustics
-from jaxsonar.simulation.echo_tracing import trace_between
 from jaxsonar.simulation.simulator import Simulation, simulate
 from jaxsonar.simulation.traced_echoes import EchoKind
 
