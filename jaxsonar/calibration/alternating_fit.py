@@ -20,7 +20,7 @@ from jaxsonar.estimation.batch_data import BatchData
 from jaxsonar.estimation.landmark_map import landmark_map_of, map_with_tentative_points
 from jaxsonar.estimation.odometry_noise import ProportionalNoise
 from jaxsonar.estimation.robust_adjustment import gnc_adjust
-from jaxsonar.estimation.sparse_adjustment import adjust, marginal_covariances
+from jaxsonar.estimation.sparse_adjustment import marginal_covariances, solve_adjustment
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.registration.sequential_registration import register_scans
@@ -148,7 +148,7 @@ class CalibrationProblem:
         with jax.enable_x64(True):
             problem = eqx.tree_at(lambda p: p.basis, found.problem, jnp.zeros_like(found.problem.basis))
             start = found.state._replace(coordinates=np.zeros_like(found.state.coordinates))
-            fitted = adjust(problem, start.unknowns(), poses_free=self.poses_free)
+            fitted = solve_adjustment(problem, start.unknowns(), poses_free=self.poses_free)
             return np.asarray(kernels.residuals(problem, fitted.unknowns))
 
     @property
@@ -185,7 +185,7 @@ class CalibrationProblem:
                 large = [poses for poses, size in zip(clusters, sizes, strict=True) if size >= self.settings.min_scans]
                 registered += [replace(log, pose=poses) for poses in large]
                 odometry += [log.pose] * len(large)
-        check_poses(registered)
+        check_calibration_poses(registered)
         return registered, odometry
 
     def _fit_registered(self, ring: Ring, logs: list[Log], odometry: list[Float[np.ndarray, "_ 3"]]) -> CalibrationFit:
@@ -233,7 +233,7 @@ def _parameter_change(ring: Ring, other: Ring) -> Float[np.ndarray, " parameters
     )
 
 
-def check_poses(logs: Sequence[Log], *, min_scans: int = SETTINGS.min_scans) -> None:
+def check_calibration_poses(logs: Sequence[Log], *, min_scans: int = SETTINGS.min_scans) -> None:
     """Raise a SonarError if too few scans have a pose."""
     if not logs:
         raise SonarError(

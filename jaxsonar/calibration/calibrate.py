@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxsonar.calibration.alternating_fit import CalibrationFit, CalibrationProblem, check_poses
+from jaxsonar.calibration.alternating_fit import CalibrationFit, CalibrationProblem, check_calibration_poses
 from jaxsonar.calibration.autofocus import autofocus_ring
 from jaxsonar.calibration.beam_headings import estimate_headings
 from jaxsonar.calibration.calibration_result import Calibration
@@ -70,7 +70,7 @@ def calibrate(
         prior_ring, speed_sd = replace(ring, speed_of_sound=speed_of_sound(temperature)), PRIOR.measured_speed_sd
     basis = parameter_basis(prior_ring, free, poses_free=poses_free, speed_sd=speed_sd)
     if not poses_free:
-        check_poses(logs)
+        check_calibration_poses(logs)
     problem = CalibrationProblem(prior_ring, basis, poses_free, odometry, sigma, window, progress)
     # 2. Autofocus: bring a ring with large errors close enough for echoes to be associated with walls.
     start = prior_ring

@@ -17,6 +17,7 @@ from jaxsonar.geometry.landmarks import (
     pad_landmarks,
 )
 from jaxsonar.geometry.se2 import unit
+from jaxsonar.geometry.segments import perpendicular_intersections
 from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
 from jaxsonar.mapping.build_map import assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
@@ -160,18 +161,11 @@ def _wall_intersections(
     map_: GlobalMap, settings: LandmarkMapSettings = SETTINGS
 ) -> tuple[list[tuple[int, int]], Bool[np.ndarray, " points"]]:
     """Pairs of walls that form a corner of about a right angle, and which points of the map are such corners."""
-    a, b = np.triu_indices(len(map_), k=1)
-    perpendicular = np.abs(np.sin(map_.theta[a] - map_.theta[b])) > np.cos(settings.max_skew)
-    a, b = a[perpendicular], b[perpendicular]
-    normals = np.stack([unit(map_.theta)[a], unit(map_.theta)[b]], axis=1)
-    crossing = np.linalg.solve(normals, np.stack([map_.rho[a], map_.rho[b]], axis=-1)[..., None])[..., 0]
-    meet = np.ones(len(a), dtype=bool)
-    for wall in (a, b):
-        gap = np.linalg.norm(map_.segments[wall] - crossing[:, None], axis=-1).min(axis=1)
-        meet &= gap < settings.max_corner_gap
-    distance = np.linalg.norm(map_.points[:, None] - crossing[meet][None], axis=-1).min(axis=1, initial=np.inf)
+    crossing = perpendicular_intersections(map_.theta, map_.segments, max_skew=settings.max_skew)
+    meet = (crossing.gap < settings.max_corner_gap).all(axis=1)
+    distance = np.linalg.norm(map_.points[:, None] - crossing.point[meet], axis=-1).min(axis=1, initial=np.inf)
     is_corner = np.array([kind == "corner" for kind in map_.point_kinds], dtype=bool)
-    pairs = list(zip(a[meet].tolist(), b[meet].tolist(), strict=True))
+    pairs = list(zip(crossing.first[meet].tolist(), crossing.second[meet].tolist(), strict=True))
     return pairs, is_corner & (distance < settings.corner_radius)
 
 

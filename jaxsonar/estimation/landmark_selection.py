@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsonar import kernels
 from jaxsonar.estimation.adjustment_state import AdjustmentResult, AdjustmentState
-from jaxsonar.estimation.sparse_adjustment import adjust
+from jaxsonar.estimation.sparse_adjustment import solve_adjustment
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def reclassify_points(found: AdjustmentResult, settings: LandmarkSelectionSettin
             kernels.apply_parameters(problem.sensors, problem.basis @ jnp.asarray(state.coordinates)),
         ),
     )
-    fitted = adjust(alternative, state.unknowns(), poses_free=False).unknowns
+    fitted = solve_adjustment(alternative, state.unknowns(), poses_free=False).unknowns
     residual = np.where(used, np.asarray(kernels.residuals(alternative, fitted)), 0)
     # 2. The sums of squares of both hypotheses, point by point.
     counted = used & first_order

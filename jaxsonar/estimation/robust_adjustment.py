@@ -17,7 +17,7 @@ from jaxsonar import kernels
 from jaxsonar.estimation.adjustment_state import AdjustmentResult, AdjustmentState
 from jaxsonar.estimation.batch_data import BatchData
 from jaxsonar.estimation.landmark_selection import reclassify_points, remove_misfitting_points
-from jaxsonar.estimation.sparse_adjustment import AdjustmentSolution, adjust
+from jaxsonar.estimation.sparse_adjustment import AdjustmentSolution, solve_adjustment
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import ParameterBasis
 
@@ -246,7 +246,7 @@ class _GncJob:
         self, state: AdjustmentState, reflection: kernels.Reflection, weight: Float[np.ndarray, "scans echoes"]
     ) -> tuple[AdjustmentState, kernels.LeastSquaresProblem, AdjustmentSolution]:
         problem = least_squares_problem(self.ring, self.data, self.basis, state, reflection, weight)
-        solution = adjust(
+        solution = solve_adjustment(
             problem,
             state.unknowns(),
             poses_free=self.poses_free,

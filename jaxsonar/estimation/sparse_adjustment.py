@@ -59,7 +59,7 @@ class MarginalCovariances(NamedTuple):
     """Of ``Landmarks.parameters`` of each landmark."""
 
 
-def adjust(
+def solve_adjustment(
     problem: kernels.LeastSquaresProblem,
     start: kernels.Unknowns,
     *,

@@ -44,16 +44,20 @@ def rotate(
 
 
 def transform_points(
-    a_from_b: Float[np.ndarray, "3"], p_b: Float[np.ndarray, "*batch 2"]
-) -> Float[np.ndarray, "*batch 2"]:
-    """Points of frame b in frame a, metres."""
-    return p_b @ rotation(a_from_b[2]).T + a_from_b[:2]
+    a_from_b: Float[np.ndarray, "*#batch 3"], p_b: Float[np.ndarray, "*#batch 2"]
+) -> Float[np.ndarray, "... 2"]:
+    """Points of frame b in frame a, metres; one pose for all points, or poses and points broadcast."""
+    if a_from_b.ndim == 1:
+        return p_b @ rotation(a_from_b[2]).T + a_from_b[:2]
+    return rotate(p_b, a_from_b[..., 2]) + a_from_b[..., :2]
 
 
-def compose(a_from_b: Float[np.ndarray, "3"], b_from_c: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """a_from_c: the group product of one pose with one or more others; theta in [-pi, pi)."""
+def compose(
+    a_from_b: Float[np.ndarray, "*#batch 3"], b_from_c: Float[np.ndarray, "*#batch 3"]
+) -> Float[np.ndarray, "... 3"]:
+    """a_from_c: the group product, row by row or broadcast; theta in [-pi, pi)."""
     position = transform_points(a_from_b, b_from_c[..., :2])
-    return np.concatenate([position, wrap_angle(b_from_c[..., 2:] + a_from_b[2])], axis=-1)
+    return np.concatenate([position, wrap_angle(b_from_c[..., 2:] + a_from_b[..., 2:])], axis=-1)
 
 
 def relative(

@@ -1,7 +1,11 @@
 """Planar line segments, (segments, 2, 2): two end points (x, y) each, metres."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float, Int
+
+from jaxsonar.geometry.se2 import unit
 
 
 def cross(u: Float[np.ndarray, "*#batch 2"], v: Float[np.ndarray, "*#batch 2"]) -> Float[np.ndarray, "..."]:
@@ -39,6 +43,39 @@ def crossings(
     determinant = cross(u, v)
     determinant = np.where(np.abs(determinant) > 1e-12, determinant, np.nan)
     return cross(offset, v) / determinant, cross(offset, u) / determinant
+
+
+class PerpendicularIntersections(NamedTuple):
+    """Where the lines of walls cross at about a right angle."""
+
+    first: Int[np.ndarray, " pairs"]
+    """Row of the first wall of each pair; the pairs are in lexicographic order."""
+    second: Int[np.ndarray, " pairs"]
+    """Row of the second wall, after the first one."""
+    point: Float[np.ndarray, "pairs 2"]
+    """Intersection of the two lines, metres."""
+    gap: Float[np.ndarray, "pairs 2"]
+    """Distance of the nearer end of each of the two walls from the intersection, metres."""
+
+
+def perpendicular_intersections(
+    theta: Float[np.ndarray, " walls"], segments: Float[np.ndarray, "walls 2 2"], *, max_skew: float
+) -> PerpendicularIntersections:
+    """Intersections of the lines of all pairs of walls that are about perpendicular.
+
+    Args:
+        theta: directions of the normals, radians.
+        segments: the observed parts, metres.
+        max_skew: largest deviation from a right angle, radians; below 90 degrees.
+    """
+    first, second = np.triu_indices(len(theta), k=1)
+    is_perpendicular = np.abs(np.sin(theta[first] - theta[second])) > np.cos(max_skew)
+    pair = np.stack([first[is_perpendicular], second[is_perpendicular]], axis=-1)
+    normal = unit(theta[pair])
+    offset = (normal * segments.mean(axis=1)[pair]).sum(-1)
+    point = np.linalg.solve(normal, offset[..., None])[..., 0]
+    gap = np.linalg.norm(segments[pair] - point[:, None, None], axis=-1).min(axis=-1)
+    return PerpendicularIntersections(pair[:, 0], pair[:, 1], point, gap)
 
 
 def sample_segments(

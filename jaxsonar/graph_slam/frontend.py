@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.detection.local_model import LocalModel
+from jaxsonar.detection.settings import DEFAULT_SIGMA
 from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
 from jaxsonar.geometry.landmarks import concatenate_landmarks, transform_landmarks
 from jaxsonar.geometry.se2 import diagonal_covariance, propagate, relative, tangent_of, transform_points
@@ -28,11 +29,11 @@ class FrontendSettings:
     """Constants of the front end; chosen by hand unless stated otherwise."""
 
     submap_length: float = 3.0
-    """Metres from its origin at which a submap is closed."""
+    """Metres from its origin at which a submap is finished."""
     max_landmarks: int = 48
-    """Number of landmarks beyond which a submap is closed."""
+    """Number of landmarks beyond which a submap is finished."""
     min_scans: int = 2
-    """Least number of scans that observed a landmark of a closed submap."""
+    """Least number of scans that observed a landmark of a finished submap."""
     max_dead_reckoned: int = 3
     """Longest run of scans without odometry that the odometry before and after it bridges."""
     track_loss_scans: int = 3
@@ -42,7 +43,7 @@ class FrontendSettings:
     new_landmark_sd: tuple[float, float] = (0.5, 0.3)
     """Standard deviations of a new landmark's (distance, theta) before its first update, metres and radians; the first
     one holds for both coordinates of points."""
-    default_sigma: float = 0.003
+    default_sigma: float = DEFAULT_SIGMA
     """Standard deviation of the ranges where the local model has no estimate, metres."""
     sigma_prior_echoes: float = 30.0
     """Number of echoes that the first estimate of the standard deviation of the ranges is worth."""
@@ -107,13 +108,13 @@ class SubmapState:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the submap is large enough to be closed."""
+        """Whether the submap is large enough to be finished."""
         far = bool(np.hypot(*self.pose[:2]) > SETTINGS.submap_length)
         return far or len(self.scan_counts) > SETTINGS.max_landmarks
 
     @property
     def track_lost(self) -> bool:
-        """Whether the robot is not where its pose says."""
+        """Whether the estimated pose is wrong, because the robot was moved by hand."""
         return self.track_loss_count >= SETTINGS.track_loss_scans
 
 
@@ -241,7 +242,7 @@ def update(
     )
 
 
-def close_submap(state: SubmapState) -> Submap:
+def finish_submap(state: SubmapState) -> Submap:
     """The submap that ends here, without the landmarks that too few scans observed.
 
     If the track is lost, the covariance of the last pose is increased.

@@ -1,19 +1,22 @@
 """Data association of one scan's features with the landmarks of a submap.
 
-Candidates are mutual nearest neighbors in Mahalanobis distance; those that are jointly compatible are accepted (Neira
-and Tardos 2001, with a greedy search, which mutual nearest neighbors allow).
+Candidates are mutual nearest neighbors in Mahalanobis distance; those that are jointly compatible are accepted
+(``estimation.joint_compatibility``).
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import chi2
 
 from jaxsonar import kernels
 from jaxsonar.detection.local_model import LocalModel
+from jaxsonar.estimation.joint_compatibility import (
+    chi2_bound,
+    jointly_compatible_pairs,
+    mutual_nearest_neighbors,
+)
 from jaxsonar.geometry.landmarks import (
     concatenate_landmarks,
     landmarks_from_points,
@@ -31,8 +34,8 @@ class AssociationSettings:
     """Standard deviations of (rho, theta) of lines without a covariance (method hough), metres and radians."""
     covariance_factor: float = 1.5
     """Inflation of the covariances of features; those of local models are lower bounds."""
-    gate_probability: float = 0.999
-    """Probability with which a correct pair, or a correct set of pairs, passes its chi-square gate."""
+    rejection_probability: float = 0.001
+    """Probability with which the chi-square gate rejects a correct pair, or a correct set of pairs."""
     max_pairs: int = 40
     """Largest number of pairs of one scan."""
     wall_gap: float = 0.3
@@ -133,17 +136,14 @@ def associate_features(
     beside = _lies_along(belief, features)
     comparable = (features.kind[:, None] == landmarks.kind) & beside
     comparable &= (expected[:, 0] > 0) | (landmarks.kind != kernels.PLANE)
-    within_gate = comparable & (squared < _chi2_gate(1))
+    within_gate = comparable & (squared < chi2_bound(2, SETTINGS.rejection_probability))
     # Mutual nearest neighbors, the best first.
-    cost = np.where(within_gate, squared, np.inf)
-    nearest_landmark, nearest_feature = cost.argmin(axis=1), cost.argmin(axis=0)
-    mutual = np.isfinite(cost.min(axis=1)) & (nearest_feature[nearest_landmark] == np.arange(count))
-    feature = np.flatnonzero(mutual)
-    landmark = nearest_landmark[feature]
-    order = np.argsort(cost[feature, landmark], kind="stable")[: SETTINGS.max_pairs]
+    feature, landmark = mutual_nearest_neighbors(np.where(within_gate, squared, np.inf))
+    order = np.argsort(squared[feature, landmark], kind="stable")[: SETTINGS.max_pairs]
     feature, landmark = feature[order], landmark[order]
     # Joint compatibility.
-    accepted = _jointly_compatible(belief, features, jacobian, innovation[feature, landmark], feature, landmark)
+    joint = _joint_innovation_covariance(belief, features, jacobian, feature, landmark)
+    accepted = jointly_compatible_pairs(innovation[feature, landmark], joint, SETTINGS.rejection_probability)
     associated = unassociated.copy()
     associated[feature[accepted]] = landmark[accepted]
     # A feature near a landmark is not new, although it is not associated with it.
@@ -160,43 +160,24 @@ def _own_covariances(belief: kernels.Belief) -> Float[np.ndarray, "landmarks 5 5
     return np.asarray(belief.covariance)[column[:, :, None], column[:, None, :]]
 
 
-@lru_cache(maxsize=64)
-def _chi2_gate(pairs: int) -> float:
-    return float(chi2.ppf(SETTINGS.gate_probability, 2 * pairs))
-
-
-def _jointly_compatible(
+def _joint_innovation_covariance(
     belief: kernels.Belief,
     features: FeatureMeasurements,
     jacobian: Float[np.ndarray, "landmarks 2 5"],
-    innovation: Float[np.ndarray, "pairs 2"],
     feature: Int[np.ndarray, " pairs"],
     landmark: Int[np.ndarray, " pairs"],
-) -> list[int]:
-    """Pairs that pass the joint chi-square gate; a pair that is incompatible with those before it is rejected."""
+) -> Float[np.ndarray, "rows rows"]:
+    """Joint covariance of the innovations of pairs, two rows for each."""
     pairs = len(feature)
-    if not pairs:
-        return []
     design = np.zeros((pairs, 2, len(belief.covariance)))
     design[:, :, :3] = jacobian[landmark, :, :3]
     for k in (0, 1):
         design[np.arange(pairs), :, 3 + 2 * landmark + k] = jacobian[landmark, :, 3 + k]
-    design = design.reshape(2 * pairs, -1)
+    design = design.reshape(2 * pairs, len(belief.covariance))
     joint = design @ belief.covariance @ design.T
     for k in range(pairs):
         joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += SETTINGS.covariance_factor * features.covariance[feature[k]]
-    if _squared_mahalanobis(joint, innovation.ravel()) < _chi2_gate(pairs):
-        return list(range(pairs))
-    accepted: list[int] = []
-    for pair in range(pairs):
-        rows = np.concatenate([[2 * k, 2 * k + 1] for k in (*accepted, pair)])
-        if _squared_mahalanobis(joint[np.ix_(rows, rows)], innovation.ravel()[rows]) < _chi2_gate(len(accepted) + 1):
-            accepted.append(pair)
-    return accepted
-
-
-def _squared_mahalanobis(cov: Float[np.ndarray, "n n"], innovation: Float[np.ndarray, " n"]) -> float:
-    return float(innovation @ np.linalg.solve(cov, innovation))
+    return joint
 
 
 def _innovations(

@@ -17,10 +17,18 @@ from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
-MAX_POSITION_CHANGE = 0.005
-"""Metres; evidence of a submap that moved farther is gathered again. Chosen by hand."""
-MAX_HEADING_CHANGE = float(np.radians(0.1))
-"""Radians; the same for rotations."""
+
+@dataclass(frozen=True)
+class SubmapEvidenceSettings:
+    """Constants of the map evidence of submaps; chosen by hand."""
+
+    max_position_change: float = 0.005
+    """Evidence of a submap that moved farther is gathered again, metres."""
+    max_heading_change: float = float(np.radians(0.1))
+    """The same for rotations, radians."""
+
+
+SETTINGS = SubmapEvidenceSettings()
 
 SubmapScans = tuple[tuple[Scan, LocalModel], ...]
 """Scans that were first taken in one submap, with their local models."""
@@ -64,7 +72,7 @@ class SubmapEvidence:
             world_from_submap = compose(self.tracker_state.world_from_first, self.tracker_state.graph.poses[number])
             cached = self.cache.get(number)
             is_current = cached is not None and cached.scan_count == len(scans)
-            if cached is None or not is_current or _has_moved(world_from_submap, cached.world_from_submap):
+            if cached is None or not is_current or _is_stale(world_from_submap, cached.world_from_submap):
                 evidence = self._gather(ring, number, world_from_submap)
                 cached = self.cache[number] = CachedEvidence(world_from_submap, len(scans), evidence)
             union = cached.evidence if union is None else union.union(cached.evidence)
@@ -80,6 +88,6 @@ class SubmapEvidence:
         return gather_evidence(ring, Log.from_scans(scans), [model for _, model in pairs])
 
 
-def _has_moved(pose: Float[np.ndarray, "3"], before: Float[np.ndarray, "3"]) -> bool:
+def _is_stale(pose: Float[np.ndarray, "3"], before: Float[np.ndarray, "3"]) -> bool:
     x, y, heading = subtract_poses(pose, before)
-    return bool(np.hypot(x, y) > MAX_POSITION_CHANGE or abs(heading) > MAX_HEADING_CHANGE)
+    return bool(np.hypot(x, y) > SETTINGS.max_position_change or abs(heading) > SETTINGS.max_heading_change)

@@ -15,7 +15,7 @@ from jaxsonar.geometry.se2 import compose, compose_with_covariance, rotate_covar
 from jaxsonar.graph_slam.frontend import (
     SETTINGS,
     SubmapState,
-    close_submap,
+    finish_submap,
     predict,
     start_submap,
     update,
@@ -35,7 +35,7 @@ class TrackerState:
     submap: SubmapState
     """The submap around the robot."""
     graph: SubmapGraph
-    """All closed submaps. Never changed in place: a step that adds to it works on a copy."""
+    """All finished submaps. Never changed in place: a step that adds to it works on a copy."""
     world_from_first: Float[np.ndarray, "3"]
     """Pose of the first scan: its odometry, or the origin."""
     scan_count: int
@@ -118,10 +118,10 @@ class Tracker:
         else:
             predicted = predict(submap, scan.pose, self.odometry_noise)
             submap = update(self.ring, predicted, scan, model, **options)
-        # 3. Close a complete submap, or do a part of the pending work on loop closures.
+        # 3. Finish a complete submap, or do a part of the pending work on loop closures.
         if not bridged and (submap.is_complete or submap.track_lost):
             graph = graph.copy()
-            decisions = graph.add(close_submap(submap))
+            decisions = graph.add(finish_submap(submap))
             # The next submap starts with the same scan, because the pose in its frame must be known exactly.
             submap = update(self.ring, start_submap(submap), scan, model, **options)
         elif graph.has_pending_work:
@@ -134,12 +134,12 @@ class Tracker:
         return state, TrackerStep(model, pose, covariance, decisions)
 
     def finish(self, state: TrackerState) -> TrackerState:
-        """Close the last submap and finish all work on loop closures; the next scan starts a new submap."""
+        """Finish the last submap and all work on loop closures; the next scan starts a new submap."""
         graph = state.graph.copy()
         graph.process_all()
         if len(state.submap.rows) < 2:  # a single scan is also in the submap before
             return replace(state, graph=graph)
-        graph.add(close_submap(state.submap))
+        graph.add(finish_submap(state.submap))
         graph.process_all()
         return replace(state, submap=start_submap(state.submap), graph=graph)
 

@@ -9,15 +9,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
-from jaxsonar.geometry.se2 import (
-    diagonal_covariance,
-    propagate,
-    relative,
-    rotate,
-    subtract_poses,
-    wrap_angle,
-    wrap_pose,
-)
+from jaxsonar.geometry.se2 import compose, diagonal_covariance, propagate, relative, subtract_poses, wrap_pose
 from jaxsonar.graph_slam.frontend import SubmapState, update
 from jaxsonar.localization.known_map import KnownMap
 from jaxsonar.localization.settings import SETTINGS
@@ -117,7 +109,7 @@ class HypothesisTracker:
             # Two features determine a pose; one wall alone does not.
             poses = pose_hypotheses(scan, known, np.zeros(3))[1 + len(scan.theta) * len(known.theta) :]
             if start is not None:
-                poses = poses[_is_near(_compose_all(poses, back), start)]
+                poses = poses[_is_near(compose(poses, back), start)]
             if not len(poses):
                 continue
             poses = thin_poses(poses, SETTINGS.hypothesis_cell)
@@ -126,14 +118,14 @@ class HypothesisTracker:
             best = poses[np.argsort(-score, kind="stable")[: 4 * SETTINGS.max_hypotheses]]
             steps = SETTINGS.refinement_steps
             best = refine_poses(known, scan, best, information, prior_mean=best, steps=steps)
-            candidates.append(_compose_all(best, back))
+            candidates.append(compose(best, back))
         if not candidates:
             return []
         # 2. Scores by all of these scans, with their odometry; the best that differ from each other.
         poses = thin_poses(np.concatenate(candidates), SETTINGS.hypothesis_cell)
         score = np.zeros(len(poses))
         for row, scan in scans.items():
-            moved = _compose_all(poses, relative(first, self.odometry[row]))
+            moved = compose(poses, relative(first, self.odometry[row]))
             score = score + pose_log_likelihood(known, scan, moved).log_likelihood
         kept: list[Float[np.ndarray, 3]] = []
         position, heading = SETTINGS.same_pose
@@ -237,12 +229,6 @@ def _merged(hypotheses: Sequence[TrackedHypothesis]) -> list[TrackedHypothesis]:
         elif one.is_start:
             kept[twin] = one
     return kept
-
-
-def _compose_all(poses: Float[np.ndarray, "poses 3"], step: Float[np.ndarray, "3"]) -> Float[np.ndarray, "poses 3"]:
-    """All poses after the same step."""
-    position = poses[:, :2] + rotate(np.broadcast_to(step[:2], (len(poses), 2)), poses[:, 2])
-    return np.column_stack([position, wrap_angle(poses[:, 2] + step[2])])
 
 
 def _is_near(poses: Float[np.ndarray, "poses 3"], start: Float[np.ndarray, "3"]) -> np.ndarray:

@@ -10,6 +10,7 @@ from jaxsonar import kernels
 from jaxsonar.estimation.landmark_map import map_landmarks
 from jaxsonar.geometry.landmarks import concatenate_landmarks, landmarks_from_points
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
+from jaxsonar.geometry.segments import perpendicular_intersections
 from jaxsonar.localization.settings import SETTINGS
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.registration.features import Features, landmark_features
@@ -106,16 +107,14 @@ def _wall_corners(
     world: GlobalMap, wall_covariance: Float[np.ndarray, "walls 2 2"]
 ) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 2"]]:
     """Points where walls meet at right angles, and their covariances."""
-    middle = world.segments.mean(axis=1)
-    gap = np.linalg.norm(world.segments[:, None, :, None] - world.segments[None, :, None], axis=-1).min(axis=(2, 3))
-    right_angle = np.abs(np.cos(world.theta[:, None] - world.theta)) < np.sin(SETTINGS.corner_angle)
-    points, covariances = [], []
-    for pair in np.argwhere(np.triu((gap < SETTINGS.corner_gap) & right_angle, 1)):
-        normal = unit(world.theta[pair])
-        point = np.linalg.solve(normal, (normal * middle[pair]).sum(-1))
-        along = ((point - middle[pair]) * tangent_of(world.theta[pair])).sum(-1)
+    crossing = perpendicular_intersections(world.theta, world.segments, max_skew=SETTINGS.corner_angle)
+    middle, covariances = world.segments.mean(axis=1), []
+    # At a right angle the distance between the ends is the hypotenuse of their distances from the intersection.
+    meet = np.flatnonzero(np.hypot(*crossing.gap.T) < SETTINGS.corner_gap)
+    for row in meet:
+        pair = np.array([crossing.first[row], crossing.second[row]])
+        along = ((crossing.point[row] - middle[pair]) * tangent_of(world.theta[pair])).sum(-1)
         across = wall_covariance[pair, 0, 0] + along**2 * wall_covariance[pair, 1, 1]
-        inverse = np.linalg.inv(normal)
-        points.append(point)
+        inverse = np.linalg.inv(unit(world.theta[pair]))
         covariances.append(inverse @ np.diag(across) @ inverse.T)
-    return np.array(points).reshape(-1, 2), np.array(covariances).reshape(-1, 2, 2)
+    return crossing.point[meet], np.array(covariances).reshape(-1, 2, 2)

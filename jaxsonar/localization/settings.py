@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxsonar.detection.settings import DEFAULT_SIGMA
+
 
 @dataclass(frozen=True)
 class AcceptanceSettings:
@@ -56,7 +58,7 @@ class LocalizationSettings:
     """Squared Mahalanobis distance up to which two hypotheses are the same."""
     max_pose_sd: tuple[float, float] = (0.03, float(np.radians(2.0)))
     """Largest standard deviations of a determined pose: position (m), heading (rad)."""
-    default_sigma: float = 0.003
+    default_sigma: float = DEFAULT_SIGMA
     """Standard deviation of the ranges if no local model has an estimate, metres."""
     echo_weight: float = 0.25
     """Weight of the log-likelihood of one echo; echoes of one wall are not independent."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
-from scipy.special import chdtri
 
+from jaxsonar.estimation.joint_compatibility import chi2_bound
 from jaxsonar.estimation.pose_graph import BetweenFactor, PoseGraph
 from jaxsonar.geometry.se2 import relative, relative_jacobians, subtract_poses
 from jaxsonar.loop_closure.closure_detection import ClosureMeasurement
@@ -23,7 +23,7 @@ class ClosureCandidate:
     newest: int
     measurement: ClosureMeasurement
     position: Float[np.ndarray, "2"]
-    """Centre of the common reflectors, in the frame of the earlier node, metres."""
+    """Center of the common reflectors, in the frame of the earlier node, metres."""
     state: str = PROPOSED
 
     @property
@@ -63,6 +63,6 @@ def innovation_chi2(graph: PoseGraph, candidate: ClosureCandidate) -> float:
     return float(residual @ np.linalg.solve(covariance, residual))
 
 
-def chi2_bound(candidates: list[ClosureCandidate], probability: float) -> float:
+def candidates_chi2_bound(candidates: list[ClosureCandidate], probability: float) -> float:
     """Chi-square that correct candidates exceed with this probability."""
-    return float(chdtri(sum(one.dof for one in candidates), probability))
+    return chi2_bound(sum(one.dof for one in candidates), probability)

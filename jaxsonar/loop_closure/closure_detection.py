@@ -40,7 +40,7 @@ class ClosureMeasurement(NamedTuple):
     """Metres and radians."""
     information: Float[np.ndarray, "3 3"]
     """Inverse covariance; zero along parallel walls."""
-    free: Float[np.ndarray, "2"] | None
+    undetermined_direction: Float[np.ndarray, "2"] | None
     """Direction that is not determined, a unit vector of the earlier frame, or None."""
     pairs: Pairs
     chi2: float
@@ -57,7 +57,7 @@ class ClosureMeasurement(NamedTuple):
     @property
     def basis(self) -> Float[np.ndarray, "3 rank"]:
         """Orthonormal basis of the directions of (x, y, theta) that are determined."""
-        return _basis(self.free)
+        return _basis(self.undetermined_direction)
 
 
 class _AlignedPair(NamedTuple):
@@ -107,13 +107,19 @@ def detect_closure(
     poses = np.array([fit.pose for _, fit in fits.values()])
     against = _negative_evidence(views, poses, reach)
     aligned = [
-        _AlignedPair(pairs, fit, _log_likelihood_ratio(earlier, newest, pairs, fit, prior), float(nats), _is_redundant(earlier, pairs))
+        _AlignedPair(
+            pairs,
+            fit,
+            _log_likelihood_ratio(earlier, newest, pairs, fit, prior),
+            float(nats),
+            _is_redundant(earlier, pairs),
+        )
         for (pairs, fit), nats in zip(fits.values(), against, strict=True)
     ]
     # 3. The best against all others and against perceptual aliasing.
     best = max(aligned, key=lambda one: one.log_likelihood_ratio - one.negative_evidence)
     measured = _compare(best, aligned, views, prior, reach)
-    if measured is None and best.fit.free is None:
+    if measured is None and best.fit.undetermined_direction is None:
         # Where doors repeat, the walls of a corridor still determine the distance from them.
         corridor = _corridor_alignment(earlier, newest, views, best, prior, reach)
         measured = None if corridor is None else _compare(corridor, aligned, views, prior, reach)
@@ -184,9 +190,9 @@ def _compare(
     reach: float,
 ) -> ClosureMeasurement | None:
     """The closure with its alternatives, or None if another alignment comes near it."""
-    fit, basis = best.fit, _basis(best.fit.free)
+    fit, basis = best.fit, _basis(best.fit.undetermined_direction)
     # 1. Enough pairs that determine the pose redundantly, and little negative evidence.
-    full = fit.free is None
+    full = fit.undetermined_direction is None
     min_pairs = SETTINGS.min_pairs if full else SETTINGS.min_corridor_pairs
     if best.log_likelihood_ratio < (SETTINGS.min_log_likelihood_ratio if full else 0.0) or len(best.pairs) < min_pairs:
         return None
@@ -199,25 +205,27 @@ def _compare(
     rivals = [one for one in aligned if one is not best and _is_distinct(one.fit.pose, fit, basis)]
     poses = np.array([one.fit.pose for one in rivals]).reshape(-1, 3)
     nats = prior.log_density(poses, basis) - np.array([one.negative_evidence for one in rivals])
-    nats += np.array([min(0.0, one.log_likelihood_ratio - SETTINGS.similarity * best.log_likelihood_ratio) for one in rivals])
+    ratio = np.array([one.log_likelihood_ratio for one in rivals])
+    nats += np.minimum(0.0, ratio - SETTINGS.similarity * best.log_likelihood_ratio)
     if log_sum_exp(nats) > log_weight - SETTINGS.margin:
         return None
     # 3. Places that look alike and were never observed.
     offset, density, grid = enumerate_alternatives(fit, *views, prior, reach=reach)
     distance = np.linalg.norm(offset, axis=-1) if full else np.abs(offset @ basis[:2]).max(axis=-1)
     out = distance > SETTINGS.alternative_distance
-    copies = density[out] + np.log(SETTINGS.aliasing_probability) - (2 if full else 1) * np.log(SETTINGS.aliasing_spacing)
-    copies += _log_rarity(offset[out], _normal_between_walls(best, views[0].own))
+    aliased = density[out] + np.log(SETTINGS.aliasing_probability)
+    aliased -= (2 if full else 1) * np.log(SETTINGS.aliasing_spacing)
+    aliased += _log_rarity(offset[out], _normal_between_walls(best, views[0].own))
     alternatives = AlternativeHypotheses(
         np.concatenate([poses[:, :2] - fit.pose[:2], offset[out]]),
-        np.concatenate([nats, copies]),
+        np.concatenate([nats, aliased]),
         np.arange(len(rivals) + int(out.sum())) >= len(rivals),
     )
     log_odds = min(log_weight - log_sum_exp(alternatives.log_weight), SETTINGS.max_log_odds)
     return ClosureMeasurement(
         earlier_from_newest=fit.pose,
         information=fit.information,
-        free=fit.free,
+        undetermined_direction=fit.undetermined_direction,
         pairs=best.pairs,
         chi2=fit.chi2,
         dof=fit.dof,
@@ -284,7 +292,7 @@ def _corridor_alignment(
     kept = wall[parallel[(parallel @ length).argmax()]]
     pairs = Pairs(best.pairs.earlier[kept], best.pairs.newest[kept])
     found = fit_compatible_pairs(earlier, newest, pairs, best.fit.pose, least=2)
-    if found is None or found[1].free is None:
+    if found is None or found[1].undetermined_direction is None:
         return None
     against = float(_negative_evidence(views, found[1].pose[None], reach)[0])
     return _AlignedPair(*found, _log_likelihood_ratio(earlier, newest, *found, prior), against, True)

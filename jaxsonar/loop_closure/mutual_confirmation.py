@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxsonar.estimation.pose_graph import PoseGraph
 from jaxsonar.geometry.se2 import rotate, transform_points
-from jaxsonar.loop_closure.closure_candidate import ClosureCandidate, chi2_bound, innovation
+from jaxsonar.loop_closure.closure_candidate import ClosureCandidate, candidates_chi2_bound, innovation
 from jaxsonar.loop_closure.perceptual_aliasing import log_sum_exp
 from jaxsonar.loop_closure.settings import SETTINGS
 
@@ -21,8 +21,12 @@ def confirmed_log_odds(graph: PoseGraph, candidate: ClosureCandidate, others: li
     positions = [transform_points(graph.poses[candidate.earlier], candidate.position)]
     cost, corridors = 0.0, 0
     for other in others:
-        by_corridor = other.measurement.free is not None
-        if other is candidate or (by_corridor and measured.free is not None) or not _agree(graph, candidate, other):
+        by_corridor = other.measurement.undetermined_direction is not None
+        if (
+            other is candidate
+            or (by_corridor and measured.undetermined_direction is not None)
+            or not _agree(graph, candidate, other)
+        ):
             continue
         theirs = other.measurement.grid.at(rotate(world_offset, -graph.poses[other.earlier, 2]))
         if by_corridor:
@@ -56,4 +60,6 @@ def _agree(graph: PoseGraph, first: ClosureCandidate, second: ClosureCandidate) 
     both = float(residual @ np.linalg.solve(cov, residual))
     last = both - float(alone @ np.linalg.solve(own, alone))
     probability = SETTINGS.refusal_probability
-    return both <= chi2_bound([first, second], probability) and last <= chi2_bound([second], probability)
+    return both <= candidates_chi2_bound([first, second], probability) and last <= candidates_chi2_bound(
+        [second], probability
+    )

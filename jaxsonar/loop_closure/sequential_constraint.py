@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtri
 
+from jaxsonar.estimation.joint_compatibility import chi2_bound, remove_incompatible_pairs
 from jaxsonar.estimation.pose_graph import BetweenFactor
 from jaxsonar.geometry.se2 import diagonal_covariance, subtract_poses, wrap_pose
 from jaxsonar.loop_closure.pose_candidates import PosePrior, pose_candidates
@@ -54,8 +54,12 @@ def sequential_factor(previous: Submap, following: Submap, number: int = 0) -> B
     for one in updates:
         differs = (np.abs(subtract_poses(one.pose, best.pose)) > np.array([position, position, heading])).any()
         # Where doors repeat, fewer pairs prove nothing; the distance from the exit pose does.
-        gain = min(0.0, one.log_likelihood_ratio - SETTINGS.sequential_similarity * best.log_likelihood_ratio) - one.chi2 / 2 + best.chi2 / 2
-        if differs and gain > -SETTINGS.sequential_margin:
+        advantage = (
+            min(0.0, one.log_likelihood_ratio - SETTINGS.sequential_similarity * best.log_likelihood_ratio)
+            - one.chi2 / 2
+            + best.chi2 / 2
+        )
+        if differs and advantage > -SETTINGS.sequential_margin:
             return alone
     return BetweenFactor(number, number + 1, best.pose, np.linalg.inv(best.covariance))
 
@@ -65,47 +69,57 @@ class _Update(NamedTuple):
 
     pose: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"]
-    log_likelihood_ratio: float
-    """Log-likelihood ratio of the pairs against chance if their residuals were zero, nats."""
     chi2: float
+    """Of the innovation."""
+    chi2_contribution: Float[np.ndarray, " pairs"]
+    """Contribution of each pair to it."""
+    log_likelihood_ratio: float = 0.0
+    """Log-likelihood ratio of the pairs against chance if their residuals were zero, nats."""
+
+    @property
+    def is_compatible(self) -> bool:
+        """Whether the pairs are jointly compatible."""
+        return self.chi2 <= chi2_bound(2 * len(self.chi2_contribution), SETTINGS.rejection_probability)
 
 
 def _update_from(previous: Submap, following: Submap, pose: Float[np.ndarray, "3"]) -> _Update | None:
-    """Update with the pairs near a pose; the worst is removed until the rest is jointly compatible."""
+    """Update with the jointly compatible pairs near a pose; None where there are too few."""
     pairs = nearest_pairs(previous, following, pose, diagonal_covariance(SETTINGS.sequential_pose_sd))
-    fewest = max(1, int(np.ceil(2 * len(pairs) / 3)))
-    while len(pairs) >= fewest:
-        found, cov, chi2, share = _kalman_update(previous, following, pairs)
-        if chi2 <= chdtri(2 * len(pairs), SETTINGS.compatibility_probability):
-            gain = float(log_likelihood_ratios(previous, following, pairs, found).sum())
-            return _Update(found, cov, gain, chi2)
-        pairs = pairs.without(int(share.argmax()))
-    return None
+    found = remove_incompatible_pairs(
+        len(pairs),
+        lambda rows: _kalman_update(previous, following, pairs.take(rows)),
+        least=1,
+        least_fraction=SETTINGS.min_compatible_fraction,
+    )
+    if found is None:
+        return None
+    rows, update = found
+    ratio = log_likelihood_ratios(previous, following, pairs.take(rows), update.pose).sum()
+    return update._replace(log_likelihood_ratio=float(ratio))
 
 
-def _kalman_update(
-    previous: Submap, following: Submap, pairs: Pairs
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float, Float[np.ndarray, " pairs"]]:
-    """Exit pose after the update, its covariance, chi-square of the innovation, and the share of each pair in it."""
+def _kalman_update(previous: Submap, following: Submap, pairs: Pairs) -> _Update:
+    """Exit pose after the iterated Kalman update with some pairs."""
     count = len(pairs)
     unknown = np.concatenate([np.arange(3), (3 + 2 * pairs.earlier[:, None] + np.arange(2)).ravel()])
     known = previous.covariance[np.ix_(unknown, unknown)]
     mine = following.joint_covariance(pairs.newest)
     pose, change = previous.exit_pose, np.zeros(len(unknown))
-    chi2, share, cov = 0.0, np.zeros(count), known
+    chi2, contribution, cov = 0.0, np.zeros(count), known
     for step in range(SETTINGS.sequential_steps):
         found = pair_residuals(previous, following, pairs.earlier, pairs.newest, pose)
-        by_pose = found.by_pose.reshape(-1, 3)
+        by_pose = found.d_residual_d_pose.reshape(-1, 3)
         design = np.concatenate([by_pose, -np.eye(2 * count)], axis=1)
         # Only the pose is linearized anew; the reflectors stay at their prior mean.
         innovation = found.residual.ravel() - by_pose @ change[:3]
-        innovation_cov = design @ known @ design.T + found.covariance_by_newest(mine)
+        innovation_cov = design @ known @ design.T + found.covariance_from_newest(mine)
         gain = np.linalg.solve(innovation_cov, design @ known).T
         if not step:
             weighted = np.linalg.solve(innovation_cov, innovation)
-            chi2, share = float(innovation @ weighted), (innovation * weighted).reshape(-1, 2).sum(-1)
+            chi2 = float(innovation @ weighted)
+            contribution = (innovation * weighted).reshape(-1, 2).sum(-1)
         change = -gain @ innovation
         pose = previous.exit_pose + change[:3]
         cov = known - gain @ design @ known
     cov = cov[:3, :3]
-    return wrap_pose(pose), (cov + cov.T) / 2, chi2, share
+    return _Update(wrap_pose(pose), (cov + cov.T) / 2, chi2, contribution)

@@ -14,8 +14,8 @@ class LoopClosureSettings:
     """Number of earlier submaps that are compared with a new one."""
     max_considered: int = 12
     """Number of nearest submaps among which they are selected."""
-    recent: int = 5
-    """Submaps with at most this difference of numbers take at most half of the places."""
+    recent_submaps: int = 5
+    """Submaps up to this number before the new one. Of the compared submaps, at most half are recent."""
     enough_closures: int = 2
     """Stop after this many accepted closures per submap."""
     neighbors: int = 2
@@ -46,8 +46,10 @@ class LoopClosureSettings:
     """Largest squared Mahalanobis distance of a pair."""
     max_wall_gap: float = 1.0
     """Largest gap between the observed parts of one wall, metres."""
-    compatibility_probability: float = 0.005
-    """Pairs are jointly incompatible if their chi-square is less probable."""
+    rejection_probability: float = 0.005
+    """Probability with which the chi-square test of joint compatibility rejects correct pairs."""
+    min_compatible_fraction: float = 2 / 3
+    """Least fraction of the pairs that must be jointly compatible."""
     parallel_angle: float = float(np.radians(10.0))
     """Walls that differ by less in direction do not determine the position along them, radians."""
     max_pair_log_likelihood_ratio: float = 4.0
@@ -65,7 +67,7 @@ class LoopClosureSettings:
     sequential_distinct: tuple[float, float] = (0.04, float(np.radians(1.5)))
     """Two constraints differ if their poses differ by more: position (m), heading (rad)."""
     sequential_similarity: float = 0.5
-    """A rival counts fully if its pairs have this fraction of the gain of the best."""
+    """A rival counts fully if its pairs have this fraction of the log-likelihood ratio of the best."""
     sequential_margin: float = 4.0
     """Log-likelihood ratio by which one constraint must beat all that differ, nats."""
 
@@ -89,7 +91,7 @@ class LoopClosureSettings:
     max_negative_evidence: float = 4.0
     """Largest negative evidence against a closure, nats."""
     similarity: float = 0.4
-    """A rival counts fully if its pairs have this fraction of the gain of the best."""
+    """A rival counts fully if its pairs have this fraction of the log-likelihood ratio of the best."""
     distinct_pose: tuple[float, float] = (0.08, float(np.radians(3.0)))
     """Poses that differ by more are rivals: position (m), heading (rad)."""
     distinct_chi2: float = 25.0
@@ -103,7 +105,7 @@ class LoopClosureSettings:
 
     # Perceptual aliasing
     aliasing_probability: float = 0.3
-    """Probability that another place looks like a given one."""
+    """Probability that another place looks like a given one (perceptual aliasing)."""
     aliasing_spacing: float = 5.0
     """Distance between such places, metres."""
     max_log_odds: float = 9.0
@@ -139,7 +141,7 @@ class LoopClosureSettings:
     crossing_border: float = 0.1
     """A line is not surely blocked within this distance of the ends of the wall, metres."""
     robot_radius: float = 0.1
-    """No wall is nearer to the centre of the robot, metres."""
+    """No wall is nearer to the center of the robot, metres."""
     min_range: float = 0.2
     """Nearer reflectors need not be detected, metres."""
     same_wall_angle: float = float(np.radians(15.0))

@@ -168,13 +168,13 @@ def overlap_candidates(
     possible = distance[considered] - overlap[considered] < SETTINGS.overlap_sd * sd
     order = np.argsort(np.where(possible, score, np.inf), kind="stable")[: int(possible.sum())]
     chosen = considered[order]
-    recent = newest - chosen <= SETTINGS.recent
+    recent = newest - chosen <= SETTINGS.recent_submaps
     kept = ~recent | (np.cumsum(recent) <= max(max_compared // 2, 1))
     return chosen[kept][:max_compared]
 
 
 def _extent(submap: Submap) -> tuple[Float[np.ndarray, "2"], float]:
-    """Centre of the trajectory of a submap, and approximate distance of its farthest reflector, metres."""
+    """Center of the trajectory of a submap, and approximate distance of its farthest reflector, metres."""
     radius, margin = SETTINGS.default_radius
     if not len(submap.poses):
         return np.zeros(2), radius

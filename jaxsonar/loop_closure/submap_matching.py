@@ -1,16 +1,16 @@
 """Reflectors of two submaps: residuals, matched pairs, and the least-squares fit of the relative pose.
 
-The pose is earlier_from_newest: (x, y, theta), metres and radians. Pairs must be jointly compatible (Neira and Tardos
-2001): the chi-square of all pairs under their joint covariance is tested, not only that of each pair.
+The pose is earlier_from_newest: (x, y, theta), metres and radians. Pairs must be jointly compatible
+(``estimation.joint_compatibility``).
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import chdtri
 
 from jaxsonar import kernels
+from jaxsonar.estimation.joint_compatibility import chi2_bound, mutual_nearest_neighbors, remove_incompatible_pairs
 from jaxsonar.geometry.landmarks import transform_parameters, wall_segments
 from jaxsonar.geometry.se2 import tangent_of, transform_points, wrap_angle, wrap_pose
 from jaxsonar.loop_closure.settings import SETTINGS
@@ -27,25 +27,27 @@ class Pairs(NamedTuple):
     def __len__(self) -> int:
         return len(self.earlier)
 
-    def without(self, row: int) -> "Pairs":
-        """All pairs but one."""
-        return Pairs(np.delete(self.earlier, row), np.delete(self.newest, row))
+    def take(self, rows: Int[np.ndarray, " some"]) -> "Pairs":
+        """Select some of the pairs."""
+        return Pairs(self.earlier[rows], self.newest[rows])
 
 
 class PairResiduals(NamedTuple):
     """Differences of the newest submap's reflectors from the earlier submap's, in the parameters of the latter."""
 
     residual: Float[np.ndarray, "*pairs 2"]
-    by_pose: Float[np.ndarray, "*pairs 2 3"]
+    d_residual_d_pose: Float[np.ndarray, "*pairs 2 3"]
     """Derivative by earlier_from_newest."""
-    by_newest: Float[np.ndarray, "*pairs 2 2"]
+    d_residual_d_newest: Float[np.ndarray, "*pairs 2 2"]
     """Derivative by the newest submap's parameters; that by the earlier submap's is minus the identity."""
 
-    def covariance_by_newest(self, joint: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    def covariance_from_newest(self, joint: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
         """Covariance of all residuals due to the newest submap, from the joint covariance of its parameters."""
-        count = len(self.by_newest)
+        count = len(self.d_residual_d_newest)
         blocks = joint.reshape(count, 2, count, 2)
-        return np.einsum("aij,ajbk,blk->aibl", self.by_newest, blocks, self.by_newest).reshape(joint.shape)
+        return np.einsum("aij,ajbk,blk->aibl", self.d_residual_d_newest, blocks, self.d_residual_d_newest).reshape(
+            joint.shape
+        )
 
 
 class PoseFit(NamedTuple):
@@ -55,18 +57,18 @@ class PoseFit(NamedTuple):
     """earlier_from_newest."""
     information: Float[np.ndarray, "3 3"]
     """Zero in the direction that the pairs do not determine."""
-    free: Float[np.ndarray, "2"] | None
+    undetermined_direction: Float[np.ndarray, "2"] | None
     """This direction, a unit vector of the earlier frame, or None."""
     chi2: float
     dof: int
     """Degrees of freedom of the chi-square."""
-    share: Float[np.ndarray, " pairs"]
+    chi2_contribution: Float[np.ndarray, " pairs"]
     """Contribution of each pair to the chi-square."""
 
     @property
     def is_compatible(self) -> bool:
         """Whether the pairs are jointly compatible."""
-        return bool(self.chi2 <= chdtri(max(self.dof, 1), SETTINGS.compatibility_probability))
+        return self.chi2 <= chi2_bound(max(self.dof, 1), SETTINGS.rejection_probability)
 
 
 def pair_residuals(
@@ -99,11 +101,16 @@ def log_likelihood_ratios(
     """Log-likelihood ratio of each pair against chance, nats, if its residual were zero."""
     found = pair_residuals(earlier, newest, pairs.earlier, pairs.newest, pose)
     mine = newest.landmark_covariances[pairs.newest]
-    cov = found.by_newest @ mine @ found.by_newest.swapaxes(1, 2) + earlier.landmark_covariances[pairs.earlier]
+    cov = (
+        found.d_residual_d_newest @ mine @ found.d_residual_d_newest.swapaxes(1, 2)
+        + earlier.landmark_covariances[pairs.earlier]
+    )
     wall = np.log(2 * FEATURE_SETTINGS.wall_offset_range) - np.log(2 * np.pi * cov[:, 0, 0]) / 2
     point = np.log(FEATURE_SETTINGS.point_area / (2 * np.pi)) - np.linalg.slogdet(cov)[1] / 2
     is_wall = newest.landmarks.kind[pairs.newest] == kernels.PLANE
-    return np.minimum(np.where(is_wall, wall, FEATURE_SETTINGS.point_weight * point), SETTINGS.max_pair_log_likelihood_ratio)
+    return np.minimum(
+        np.where(is_wall, wall, FEATURE_SETTINGS.point_weight * point), SETTINGS.max_pair_log_likelihood_ratio
+    )
 
 
 def nearest_pairs(
@@ -121,15 +128,15 @@ def nearest_pairs(
         return Pairs(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     rows, others = np.arange(len(earlier))[:, None], np.arange(len(newest))
     found = pair_residuals(earlier, newest, rows, others, pose)
-    cov = found.by_newest @ newest.landmark_covariances @ found.by_newest.swapaxes(-1, -2)
+    cov = found.d_residual_d_newest @ newest.landmark_covariances @ found.d_residual_d_newest.swapaxes(-1, -2)
     cov = cov + earlier.landmark_covariances[:, None]
-    cov = cov + found.by_pose @ pose_covariance @ found.by_pose.swapaxes(-1, -2)
+    cov = cov + found.d_residual_d_pose @ pose_covariance @ found.d_residual_d_pose.swapaxes(-1, -2)
     distance = (found.residual * np.linalg.solve(cov, found.residual[..., None])[..., 0]).sum(-1)
     distance[earlier.landmarks.kind[:, None] != newest.landmarks.kind] = np.inf
     distance[_wall_gaps(earlier, newest, pose) > SETTINGS.max_wall_gap] = np.inf
-    best, back = distance.argmin(axis=0), distance.argmin(axis=1)
-    mutual = (back[best] == others) & (distance[best, others] < SETTINGS.pair_gate)
-    return Pairs(best[mutual], others[mutual])
+    distance[distance >= SETTINGS.pair_gate] = np.inf
+    paired, mine = mutual_nearest_neighbors(distance.T)
+    return Pairs(mine, paired)
 
 
 def _wall_gaps(earlier: Submap, newest: Submap, pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "earlier newest"]:
@@ -154,7 +161,7 @@ def fit_pose(earlier: Submap, newest: Submap, pairs: Pairs, pose: Float[np.ndarr
         pairs: at least one.
         pose: earlier_from_newest, near the solution.
     """
-    free = _free_direction(earlier, newest, pairs)
+    free = _undetermined_direction(earlier, newest, pairs)
     projection = np.eye(3)
     if free is not None:
         projection[:2, :2] -= np.outer(free, free)
@@ -163,8 +170,8 @@ def fit_pose(earlier: Submap, newest: Submap, pairs: Pairs, pose: Float[np.ndarr
     step, information, residual, weighted_residual = np.ones(3), np.zeros((3, 3)), np.zeros(0), np.zeros(0)
     for _ in range(SETTINGS.fit_steps):
         found = pair_residuals(earlier, newest, pairs.earlier, pairs.newest, pose)
-        design, residual = found.by_pose.reshape(-1, 3) @ projection, found.residual.ravel()
-        weighted = np.linalg.solve(known + found.covariance_by_newest(mine), np.column_stack([design, residual]))
+        design, residual = found.d_residual_d_pose.reshape(-1, 3) @ projection, found.residual.ravel()
+        weighted = np.linalg.solve(known + found.covariance_from_newest(mine), np.column_stack([design, residual]))
         information, weighted_residual = design.T @ weighted[:, :3], weighted[:, 3]
         if np.abs(step).max() < SETTINGS.fit_tolerance:
             break
@@ -174,14 +181,14 @@ def fit_pose(earlier: Submap, newest: Submap, pairs: Pairs, pose: Float[np.ndarr
     return PoseFit(
         pose=wrap_pose(pose),
         information=(information + information.T) / 2,
-        free=free,
+        undetermined_direction=free,
         chi2=float(residual @ weighted_residual),
         dof=2 * len(pairs) - rank,
-        share=(residual * weighted_residual).reshape(-1, 2).sum(-1),
+        chi2_contribution=(residual * weighted_residual).reshape(-1, 2).sum(-1),
     )
 
 
-def _free_direction(earlier: Submap, newest: Submap, pairs: Pairs) -> Float[np.ndarray, "2"] | None:
+def _undetermined_direction(earlier: Submap, newest: Submap, pairs: Pairs) -> Float[np.ndarray, "2"] | None:
     """Direction along walls that are all parallel; None if a point or another wall determines it."""
     if not (newest.landmarks.kind[pairs.newest] == kernels.PLANE).all():
         return None
@@ -197,12 +204,12 @@ def fit_compatible_pairs(
 ) -> tuple[Pairs, PoseFit] | None:
     """Remove the worst pair until the rest is jointly compatible, and fit the pose.
 
-    None where fewer than ``least`` pairs remain, or fewer than two thirds of them.
+    None where fewer than ``least`` pairs remain, or a smaller fraction than ``min_compatible_fraction``.
     """
-    fewest = max(least, int(np.ceil(2 * len(pairs) / 3)))
-    while len(pairs) >= fewest:
-        fit = fit_pose(earlier, newest, pairs, pose)
-        if fit.is_compatible:
-            return pairs, fit
-        pairs = pairs.without(int(fit.share.argmax()))
-    return None
+    found = remove_incompatible_pairs(
+        len(pairs),
+        lambda rows: fit_pose(earlier, newest, pairs.take(rows), pose),
+        least=least,
+        least_fraction=SETTINGS.min_compatible_fraction,
+    )
+    return None if found is None else (pairs.take(found[0]), found[1])

@@ -6,7 +6,7 @@ All functions evaluate many poses at once. What each submap observed is compared
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsonar.geometry.se2 import compose, inverse, rotate, wrap_angle
+from jaxsonar.geometry.se2 import compose, inverse, transform_points, wrap_angle
 from jaxsonar.loop_closure.settings import SETTINGS
 from jaxsonar.loop_closure.submap_view import SubmapNeighborhood, SubmapView
 from jaxsonar.registration.features import crosses_walls
@@ -59,9 +59,8 @@ def neighborhood_negative_evidence(
     for stays, mine in earlier.all:
         for moves, yours in newest.all:
             row = np.flatnonzero(nats < limit)
-            there = np.concatenate([_transform(poses[row], moves[None, :2])[:, 0], poses[row, 2:] + moves[2]], axis=-1)
-            pose = compose(inverse(stays), there)
-            distance = np.linalg.norm(_transform(pose, yours.center[None])[:, 0] - mine.center, axis=-1)
+            pose = compose(inverse(stays), compose(poses[row], moves))
+            distance = np.linalg.norm(transform_points(pose, yours.center) - mine.center, axis=-1)
             close = distance < mine.radius + yours.radius + reach
             row, pose = row[close], pose[close]
             found = submap_negative_evidence(mine, yours, pose, tolerance=tolerance, reach=reach)
@@ -82,7 +81,9 @@ def _one_sided(
     if not len(walls.theta):
         return np.zeros(len(poses))
     # 1. Walls across the trajectory and across lines of sight.
-    viewpoint, start, end = (_transform(poses, part) for part in (viewer.viewpoint, viewer.sight_start, viewer.sight_end))
+    viewpoint, start, end = (
+        transform_points(poses[:, None], part) for part in (viewer.viewpoint, viewer.sight_start, viewer.sight_end)
+    )
     blocked_trajectory = _crosses(other, viewpoint[:, :-1], viewpoint[:, 1:], tolerance).any(axis=1).sum(-1)
     blocked_sight = _crosses(other, start, end, tolerance).any(axis=-1).sum(-1)
     nats = SETTINGS.blocked_trajectory_nats * blocked_trajectory + SETTINGS.blocked_sight_nats * blocked_sight
@@ -98,7 +99,7 @@ def _one_sided(
     offset = walls.point - viewpoint[:, :, None]
     distance = np.linalg.norm(offset, axis=-1)
     due = (distance > SETTINGS.min_range) & (distance < reach) & (other.point_factor > 0)
-    own = _transform(poses, viewer.features.point)
+    own = transform_points(poses[:, None], viewer.features.point)
     nearest = np.linalg.norm(own[:, :, None] - walls.point, axis=-1).min(axis=1, initial=np.inf)
     due &= ~(nearest < tolerance + 0.1)[:, None]
     missed = _missed_nats(viewer, other, back, viewpoint, viewpoint[:, :, None] + 0.9 * offset, due)
@@ -119,18 +120,12 @@ def _missed_nats(
         at, end = viewpoint[pose, view], target[pose, view, which]
         hidden = _crosses(other, at[:, None], end[:, None], 0.0).any(axis=(1, 2))
         away = back[pose]
-        own = [rotate(part, away[:, 2]) + away[:, :2] for part in (at, end)]
+        own = [transform_points(away, part) for part in (at, end)]
         if len(viewer.features.theta):
             hidden |= _crosses(viewer, own[0][:, None], own[1][:, None], 0.0).any(axis=(1, 2))
         due[pose[hidden], view[hidden], which[hidden]] = False
     missed = np.array(SETTINGS.missed_nats)
     return missed[np.minimum(due.sum(axis=1), len(missed) - 1)]
-
-
-def _transform(
-    poses: Float[np.ndarray, "poses 3"], points: Float[np.ndarray, "points 2"]
-) -> Float[np.ndarray, "poses points 2"]:
-    return rotate(points, poses[:, 2, None]) + poses[:, None, :2]
 
 
 def _has_wall(
@@ -139,7 +134,7 @@ def _has_wall(
     """Whether the viewer observed each wall of the other."""
     own, walls = viewer.features, other.features
     turn = wrap_angle(own.theta[:, None] - walls.theta + poses[:, 2, None, None])
-    offset = _transform(poses, own.reference)[:, :, None] - walls.reference
+    offset = transform_points(poses[:, None], own.reference)[:, :, None] - walls.reference
     across, along = (offset * walls.normal).sum(-1), (offset * walls.tangent).sum(-1)
     # The directions may differ a little: the distance is taken where the two walls face each other.
     half = walls.half_length

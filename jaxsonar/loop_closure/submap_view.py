@@ -17,7 +17,7 @@ class SubmapView(NamedTuple):
     row: Int[np.ndarray, " walls"]
     """Row of each wall in the submap."""
     features: Features
-    """Walls with their centres as references, and points."""
+    """Walls with their centers as references, and points."""
     is_certain: Bool[np.ndarray, " walls"]
     """Whether enough scans observed the wall."""
     point_factor: Float[np.ndarray, " points"]
@@ -31,7 +31,7 @@ class SubmapView(NamedTuple):
 
     @property
     def center(self) -> Float[np.ndarray, "2"]:
-        """Centre of the bounding box of the viewpoints."""
+        """Center of the bounding box of the viewpoints."""
         return (self.viewpoint.min(axis=0) + self.viewpoint.max(axis=0)) / 2
 
     @property

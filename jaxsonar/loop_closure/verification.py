@@ -15,7 +15,7 @@ from jaxsonar.loop_closure.closure_candidate import (
     REFUSED,
     WITHDRAWN,
     ClosureCandidate,
-    chi2_bound,
+    candidates_chi2_bound,
     innovation_chi2,
 )
 from jaxsonar.loop_closure.mutual_confirmation import confirmed_log_odds
@@ -69,7 +69,7 @@ class ClosureVerifier:
         self.candidates.append(candidate)
         # 1. Refuse what the graph contradicts.
         chi2 = innovation_chi2(graph, candidate)
-        refused = chi2 > chi2_bound([candidate], SETTINGS.refusal_probability)
+        refused = chi2 > candidates_chi2_bound([candidate], SETTINGS.refusal_probability)
         state = REFUSED if refused else PROPOSED
         self._decide(submap, number, state, candidate.measurement.log_odds, chi2)
         if refused:
@@ -85,7 +85,9 @@ class ClosureVerifier:
     @property
     def _undecided(self) -> list[int]:
         """The latest undecided candidates."""
-        return [number for number, one in enumerate(self.candidates) if one.state == PROPOSED][-SETTINGS.max_undecided :]
+        return [number for number, one in enumerate(self.candidates) if one.state == PROPOSED][
+            -SETTINGS.max_undecided :
+        ]
 
     def _accept_if_sure(self, graph: PoseGraph, submap: int, number: int, chi2: float) -> None:
         candidate = self.candidates[number]

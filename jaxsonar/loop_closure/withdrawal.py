@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar.estimation.pose_graph import BetweenFactor, PoseGraph, solve_pose_graph
-from jaxsonar.loop_closure.closure_candidate import ClosureCandidate, chi2_bound
+from jaxsonar.loop_closure.closure_candidate import ClosureCandidate, candidates_chi2_bound
 from jaxsonar.loop_closure.settings import SETTINGS
 
 
@@ -40,7 +40,7 @@ def solve_and_withdraw(
     graph = solve_pose_graph(poses, chain + [one.factor for one in remaining])
     while True:
         chi2 = graph.chi2[len(chain) :]
-        bounds = [chi2_bound([one], SETTINGS.withdrawal_probability) for one in remaining]
+        bounds = [candidates_chi2_bound([one], SETTINGS.withdrawal_probability) for one in remaining]
         if not (chi2 > np.array(bounds)).any():
             return graph, withdrawn
         trials = np.argsort(-chi2, kind="stable")[: SETTINGS.max_withdrawal_trials]

@@ -13,10 +13,10 @@ import numpy as np
 
 from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.geometry.se2 import inverse, relative
-from jaxsonar.registration.cluster_adjustment import adjust, adjust_poses, single_scan
+from jaxsonar.registration.cluster_adjustment import adjust_cluster, adjust_poses, single_scan
 from jaxsonar.registration.cluster_alignment import Alignment, align_clusters, nearest_scans, unambiguous_alignment
 from jaxsonar.registration.cluster_matching import are_distinct
-from jaxsonar.registration.echo_clusters import ScanObservations
+from jaxsonar.registration.echo_groups import ScanObservations
 from jaxsonar.registration.scan_cluster import ScanCluster
 from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS
 from jaxsonar.scans.scan_log import Log
@@ -80,8 +80,8 @@ def register_by_ranges(
 def _confirmed(observations: ScanObservations, cluster: ScanCluster) -> ScanCluster:
     """The cluster without the scans that the map of its other scans registers elsewhere."""
     for scan in cluster.rows if len(cluster.rows) > 2 else ():
-        rest, alone = cluster.without(observations.clusters.scan, scan), single_scan(observations, scan)
-        rest = adjust(observations, rest)
+        rest, alone = cluster.without(observations.groups.scan, scan), single_scan(observations, scan)
+        rest = adjust_cluster(observations, rest)
         alignments = [one for one in align_clusters(observations, rest, alone) if not one.is_undetermined]
         near = nearest_scans(rest, alone)[0]
         best = max(alignments, key=lambda one: one.total_evidence, default=None)

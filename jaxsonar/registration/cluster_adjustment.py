@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.geometry.se2 import perpendicular, rotate, wrap_angle
-from jaxsonar.registration.echo_clusters import ScanObservations
+from jaxsonar.registration.echo_groups import ScanObservations
 from jaxsonar.registration.reflector_fit import fit_reflectors
 from jaxsonar.registration.scan_cluster import ScanCluster
 from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS
@@ -19,18 +19,18 @@ from jaxsonar.sensors.range_models import plane_footpoint, predict_ranges
 
 
 def single_scan(observations: ScanObservations, scan: int | np.integer) -> ScanCluster:
-    """A cluster of one scan in its own frame, adjusted; every cluster of echoes is a reflector."""
-    clusters = observations.clusters
-    mine = np.flatnonzero(clusters.scan == scan)
+    """A cluster of one scan in its own frame, adjusted; every group of echoes is a reflector."""
+    groups = observations.groups
+    mine = np.flatnonzero(groups.scan == scan)
     poses = np.full((len(observations.ranges), 3), np.nan)
-    reflector = np.full(len(clusters.scan), -1)
+    reflector = np.full(len(groups.scan), -1)
     poses[scan], reflector[mine] = 0.0, np.arange(len(mine))
-    parameters = np.stack([clusters.plane[mine], clusters.point[mine], clusters.point[mine]], axis=1)
-    kind = clusters.log_prior[mine].argmax(axis=1).astype(np.int32)
-    return adjust(observations, ScanCluster.unadjusted(poses, reflector, kind, parameters))
+    parameters = np.stack([groups.plane[mine], groups.point[mine], groups.point[mine]], axis=1)
+    kind = groups.log_prior[mine].argmax(axis=1).astype(np.int32)
+    return adjust_cluster(observations, ScanCluster.unadjusted(poses, reflector, kind, parameters))
 
 
-def adjust(observations: ScanObservations, cluster: ScanCluster, *, fixed: int | None = None) -> ScanCluster:
+def adjust_cluster(observations: ScanObservations, cluster: ScanCluster, *, fixed: int | None = None) -> ScanCluster:
     """Estimate kinds, poses and reflectors.
 
     Args:
@@ -67,10 +67,10 @@ def adjust_poses(
         widest: scale of the first robust weights, in sigma; it is halved in every step until it reaches the gate.
         fixed: scan whose pose is held; the first one if left out.
     """
-    echoes, rows = observations.clustered, cluster.rows
-    mine = np.flatnonzero(cluster.reflector[echoes.cluster] >= 0)
-    scan, echo_cluster, measured = echoes.scan[mine], echoes.cluster[mine], echoes.range[mine]
-    row, every = cluster.reflector[echo_cluster], np.arange(len(mine))
+    echoes, rows = observations.grouped, cluster.rows
+    mine = np.flatnonzero(cluster.reflector[echoes.group] >= 0)
+    scan, group, measured = echoes.scan[mine], echoes.group[mine], echoes.range[mine]
+    row, every = cluster.reflector[group], np.arange(len(mine))
     column = np.searchsorted(rows, scan)
     pose_size, size = 3 * len(rows), 3 * len(rows) + 2 * len(cluster.kind)
     prior = np.full(size, SETTINGS.landmark_information)
@@ -108,7 +108,7 @@ def adjust_poses(
     cost = np.minimum(np.square(residual), SETTINGS.gate**2)
     prior_volume = np.where(cluster.is_wall, np.log(SETTINGS.plane_range), np.log(SETTINGS.point_area))
     own = np.flatnonzero(cluster.reflector >= 0)
-    log_prior = SETTINGS.kind_prior_weight * observations.clusters.log_prior[own, cluster.kind[cluster.reflector[own]]]
+    log_prior = SETTINGS.kind_prior_weight * observations.groups.log_prior[own, cluster.kind[cluster.reflector[own]]]
     log_determinant = np.linalg.slogdet(information)[1] - 3 * np.log(SETTINGS.fixed_information)
     volume = (size - 3) / 2 * np.log(2 * np.pi) - log_determinant / 2
     parameters_by_kind, pose_covariance = cluster.parameters_by_kind.copy(), np.full((len(poses), 3, 3), np.nan)
@@ -117,7 +117,7 @@ def adjust_poses(
     blocks = 3 * np.arange(len(rows))[:, None] + np.arange(3)
     pose_covariance[rows] = cov[blocks[:, :, None], blocks[:, None]]
     blocks = pose_size + 2 * np.arange(len(cluster.kind))[:, None] + np.arange(2)
-    squared = np.bincount(echo_cluster, weights=cost, minlength=len(cluster.reflector)).astype(np.float64)
+    squared = np.bincount(group, weights=cost, minlength=len(cluster.reflector)).astype(np.float64)
     return ScanCluster(
         poses=poses,
         reflector=cluster.reflector,
@@ -127,7 +127,7 @@ def adjust_poses(
         covariance=cov[blocks[:, :, None], blocks[:, None]],
         pose_covariance=pose_covariance,
         squared_residuals=squared,
-        observed=_observed_intervals(parameters[row], midpoint, base, echo_cluster, len(cluster.reflector)),
+        observed=_observed_intervals(parameters[row], midpoint, base, group, len(cluster.reflector)),
         evidence=float(volume - cost.sum() / 2 - prior_volume.sum() + log_prior.sum()),
     )
 
@@ -148,25 +148,25 @@ def _observed_intervals(
     plane: Float[np.ndarray, "echoes 2"],
     midpoint: Float[np.ndarray, "echoes 2"],
     half_baseline: Float[np.ndarray, "echoes 2"],
-    cluster: Int[np.ndarray, " echoes"],
-    clusters: int,
-) -> Float[np.ndarray, "clusters 2"]:
-    """Intervals between the outermost points of reflection of each cluster on its wall (``ScanCluster.observed``)."""
+    group: Int[np.ndarray, " echoes"],
+    group_count: int,
+) -> Float[np.ndarray, "groups 2"]:
+    """Intervals between the outermost points of reflection of each group on its wall (``ScanCluster.observed``)."""
     along = plane_footpoint(plane, midpoint, half_baseline, min_height=SETTINGS.corner_tolerance)
-    out = np.tile([np.inf, -np.inf], (clusters, 1))
-    np.minimum.at(out[:, 0], cluster, along)
-    np.maximum.at(out[:, 1], cluster, along)
+    out = np.tile([np.inf, -np.inf], (group_count, 1))
+    np.minimum.at(out[:, 0], group, along)
+    np.maximum.at(out[:, 1], group, along)
     return out
 
 
 def _select_kinds(observations: ScanObservations, cluster: ScanCluster, steps: int) -> ScanCluster:
     """Fit each reflector as every kind, with the poses held, and select the kind with the largest evidence."""
-    echoes = observations.clustered
-    mine = np.flatnonzero(cluster.reflector[echoes.cluster] >= 0)
+    echoes = observations.grouped
+    mine = np.flatnonzero(cluster.reflector[echoes.group] >= 0)
     _, midpoint, base = _transducers(
         cluster.poses, echoes.scan[mine], echoes.midpoint[mine], echoes.half_baseline[mine]
     )
-    row, gate = cluster.reflector[echoes.cluster[mine]], SETTINGS.gate
+    row, gate = cluster.reflector[echoes.group[mine]], SETTINGS.gate
     fit = fit_reflectors(
         cluster.parameters_by_kind,
         row,
@@ -183,7 +183,7 @@ def _select_kinds(observations: ScanObservations, cluster: ScanCluster, steps: i
     evidence = -cost / 2 - np.linalg.slogdet(fit.information)[1] / 2
     evidence -= np.log([SETTINGS.plane_range, SETTINGS.point_area, SETTINGS.point_area])
     own = np.flatnonzero(cluster.reflector >= 0)
-    log_prior = SETTINGS.kind_prior_weight * observations.clusters.log_prior[own]
+    log_prior = SETTINGS.kind_prior_weight * observations.groups.log_prior[own]
     np.add.at(evidence, cluster.reflector[own], log_prior)
     kind = evidence.argmax(axis=1).astype(np.int32)
     return replace(cluster, parameters_by_kind=fit.parameters, kind_evidence=evidence, kind=kind)

@@ -8,16 +8,16 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar.geometry.se2 import compose, inverse, relative, subtract_poses
-from jaxsonar.registration.cluster_adjustment import adjust, adjust_poses
+from jaxsonar.registration.cluster_adjustment import adjust_cluster, adjust_poses
 from jaxsonar.registration.cluster_matching import (
     are_distinct,
     implied_corner_evidence,
     initial_poses,
     matching_reflectors,
-    wall_gaps,
+    total_wall_gap,
 )
 from jaxsonar.registration.cluster_negative_evidence import cluster_negative_evidence, unassigned_evidence
-from jaxsonar.registration.echo_clusters import ScanObservations
+from jaxsonar.registration.echo_groups import ScanObservations
 from jaxsonar.registration.motion_prior import usual_motion
 from jaxsonar.registration.scan_cluster import ScanCluster, merge_clusters
 from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS
@@ -140,7 +140,7 @@ class _ClusterPair:
         step = relative(cluster.poses[self.first], cluster.poses[self.second])
         evidence = cluster.evidence - self.a.evidence - self.b.evidence + self._motion_log_density(cluster, step)
         evidence += unassigned_evidence(self.observations, cluster) - self._separate[1]
-        evidence -= implied_corner_evidence(cluster, pairs) + wall_gaps(self.a, self.b.transform(step), pairs)
+        evidence -= implied_corner_evidence(cluster, pairs) + total_wall_gap(self.a, self.b.transform(step), pairs)
         covariance = cluster.pose_covariance[self.second]
         return Alignment(cluster, step, covariance, tuple(pairs), evidence, self._negative_evidence(cluster))
 
@@ -157,7 +157,9 @@ class _ClusterPair:
         return replace(alignment, negative_evidence=least)
 
     def _merge(self, pose: Float[np.ndarray, "3"], pairs: Sequence[tuple[int, int]]) -> ScanCluster:
-        return adjust(self.observations, merge_clusters(self.a, self.b.transform(pose), pairs), fixed=self.first)
+        return adjust_cluster(
+            self.observations, merge_clusters(self.a, self.b.transform(pose), pairs), fixed=self.first
+        )
 
     def _negative_evidence(self, cluster: ScanCluster) -> float:
         """Negative evidence that neither cluster has alone."""

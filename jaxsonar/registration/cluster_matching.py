@@ -133,7 +133,7 @@ def implied_corner_evidence(cluster: ScanCluster, pairs: Sequence[tuple[int, int
     return float(np.maximum(np.log(SETTINGS.point_area) - volume, 0.0).sum())
 
 
-def wall_gaps(a: ScanCluster, b: ScanCluster, pairs: Sequence[tuple[int, int]]) -> float:
+def total_wall_gap(a: ScanCluster, b: ScanCluster, pairs: Sequence[tuple[int, int]]) -> float:
     """Sum of the gaps between the observed parts of common walls of two clusters in one frame, metres."""
     mine, its = (np.array(rows) for rows in zip(*pairs, strict=True))
     wall = (a.kind[mine] == kernels.PLANE) & (b.kind[its] == kernels.PLANE)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.geometry.se2 import perpendicular, rotate, tangent_of, unit
-from jaxsonar.registration.echo_clusters import PathGeometry, ScanObservations
+from jaxsonar.registration.echo_groups import ScanObservations
 from jaxsonar.registration.scan_cluster import ScanCluster
 from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS
 from jaxsonar.sensors.range_models import PredictedRange, predict_ranges
@@ -20,7 +20,7 @@ def cluster_negative_evidence(observations: ScanObservations, cluster: ScanClust
     poses, wall = cluster.poses[cluster.rows], cluster.is_wall
     # Paths that should detect a reflector: it is inside the cones, in range, and not an edge, whose echoes are weak.
     wide = observations.wide_paths
-    view = _ReflectorView.of(cluster, poses[:, None], observations.paths.take(wide))
+    view = _ReflectorView.of(cluster, poses[:, None], observations.paths_at(wide))
     reach = SETTINGS.reach_factor * float(observations.ring.max_range)
     due = view.in_front & (view.off_axis < SETTINGS.inner_cone) & (view.prediction.range < reach)
     due &= ~wall[:, None, None] | _is_observed(cluster, view.along, SETTINGS.due_margin)
@@ -32,7 +32,7 @@ def cluster_negative_evidence(observations: ScanObservations, cluster: ScanClust
     missed, count = (due & ~detected.any(axis=-1)).sum(axis=-1), due.sum(axis=-1)
     own = np.zeros((len(cluster.kind), len(cluster.poses)), dtype=bool)
     mine = np.flatnonzero(cluster.reflector >= 0)
-    own[cluster.reflector[mine], observations.clusters.scan[mine]] = True
+    own[cluster.reflector[mine], observations.groups.scan[mine]] = True
     own = own[:, cluster.rows]
     blocked = _sight_is_blocked(cluster, poses, _expected_reflection(cluster, poses, view.along, due))
     counts = (missed >= SETTINGS.min_due_paths) & (missed > SETTINGS.missed_fraction * count) & ~own & ~blocked
@@ -49,7 +49,7 @@ def unassigned_evidence(observations: ScanObservations, cluster: ScanCluster) ->
     mine = np.flatnonzero(cluster.registered[echoes.scan])
     if not len(mine) or not len(cluster.kind):
         return 0.0
-    view = _ReflectorView.of(cluster, cluster.poses[echoes.scan[mine]], observations.paths.take(echoes.path[mine]))
+    view = _ReflectorView.of(cluster, cluster.poses[echoes.scan[mine]], observations.paths_at(echoes.path[mine]))
     extent, margin = cluster.extent, SETTINGS.unassigned_margin
     beside = (view.along < extent[:, :1] - margin) | (view.along > extent[:, 1:] + margin)
     possible = view.in_front & (view.off_axis < SETTINGS.outer_cone) & ~(cluster.is_wall[:, None] & beside)
@@ -80,13 +80,14 @@ class _ReflectorView(NamedTuple):
     prediction: PredictedRange
 
     @classmethod
-    def of(cls, cluster: ScanCluster, pose: Float[np.ndarray, "... 3"], paths: PathGeometry) -> "_ReflectorView":
+    def of(cls, cluster: ScanCluster, pose: Float[np.ndarray, "... 3"], paths: kernels.EchoPaths) -> "_ReflectorView":
         heading = pose[..., 2]
-        midpoint = (pose[..., :2] + rotate(paths.midpoint, heading))[None]
-        base = rotate(paths.half_baseline, heading)[None]
+        midpoint = (pose[..., :2] + rotate(np.asarray(paths.midpoint), heading))[None]
+        base = rotate(np.asarray(paths.half_baseline), heading)[None]
         parameters = cluster.parameters.reshape(-1, *[1] * (midpoint.ndim - 2), 2)
         predicted = predict_ranges(cluster.kind, parameters, midpoint, base)
-        sides = zip((predicted.departure, predicted.arrival), np.moveaxis(paths.axes, -2, 0), paths.cone.T, strict=True)
+        axes, cones = np.moveaxis(np.asarray(paths.axes), -2, 0), paths.cone.T
+        sides = zip((predicted.departure, predicted.arrival), axes, cones, strict=True)
         off = [np.square(direction - rotate(axis, heading)).sum(axis=-1) / cone for direction, axis, cone in sides]
         height = parameters[..., 0] - (midpoint * unit(parameters[..., 1])).sum(axis=-1)
         along = (midpoint * tangent_of(parameters[..., 1])).sum(axis=-1)

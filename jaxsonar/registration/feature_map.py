@@ -62,7 +62,7 @@ def _update_wall(
     theta: float,
     noise: Float[np.ndarray, "2 2"],
 ) -> None:
-    """Kalman update of a wall, in place; the measurement is the offset at the segment's centre and the direction."""
+    """Kalman update of a wall, in place; the measurement is the offset at the segment's center and the direction."""
     from_reference = segment - known.reference[wall]
     middle = from_reference.mean(axis=0)
     along = float(middle @ tangent_of(known.theta[wall]))

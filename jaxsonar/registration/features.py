@@ -59,7 +59,7 @@ class Features(NamedTuple):
 
     @property
     def middle(self) -> Float[np.ndarray, "walls 2"]:
-        """Centres of the observed parts, metres."""
+        """Centers of the observed parts, metres."""
         return self._on_wall(self.extent.mean(axis=1))
 
     @property
@@ -108,7 +108,7 @@ class Features(NamedTuple):
         return Features(*(column[walls] for column in self[:7]), *(column[points] for column in self[7:10]))
 
     def as_measurement(self, sd_floor: tuple[float, float, float]) -> "Features":
-        """The features as one independent measurement: walls refer to their centres, and noise is added.
+        """The features as one independent measurement: walls refer to their centers, and noise is added.
 
         Args:
             sd_floor: added standard deviations: walls across (m) and direction (rad), points (m).

@@ -120,7 +120,7 @@ def _wall_distance(
     position: Float[np.ndarray, "2"] | Float[np.ndarray, "poses 2"],
     heading: Float[np.ndarray, " poses"],
 ) -> Float[np.ndarray, " poses"]:
-    """Distances from the centres of the scan's walls to walls of the map along the normals of the latter, metres."""
+    """Distances from the centers of the scan's walls to walls of the map along the normals of the latter, metres."""
     middle = position + rotate(scan.middle[line], heading)
     return known.rho[wall] - (known.normal[wall] * middle).sum(-1)
 

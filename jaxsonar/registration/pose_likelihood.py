@@ -94,7 +94,7 @@ def refine_poses(
 
 
 def _match_walls(known: Features, scan: Features, poses: Float[np.ndarray, "poses 3"]) -> _Term:
-    """The most likely wall for each wall of the scan; residuals are the offset at its centre and the direction."""
+    """The most likely wall for each wall of the scan; residuals are the offset at its center and the direction."""
     normal, heading = known.normal, poses[:, 2, None]
     arm = rotate(scan.middle, heading)  # (poses, lines, 2)
     displacement = (poses[:, None, :2] + arm)[:, :, None] - known.reference  # (poses, lines, walls, 2)

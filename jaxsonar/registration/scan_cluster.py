@@ -1,4 +1,4 @@
-"""Scans that are registered to each other by ranges: their poses, and the reflectors of their echo clusters."""
+"""Scans that are registered to each other by ranges: their poses, and the reflectors of their echo groups."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,8 +25,8 @@ class ScanCluster:
 
     poses: Float[np.ndarray, "scans 3"]
     """frame_from_robot, metres and radians; NaN where a scan is not in this cluster."""
-    reflector: Int[np.ndarray, " clusters"]
-    """Row of the reflector of each cluster of echoes; -1 where it is not in this cluster of scans."""
+    reflector: Int[np.ndarray, " groups"]
+    """Row of the reflector of each group of echoes; -1 where it is not in this cluster of scans."""
     kind: Int[np.ndarray, " reflectors"]
     """Most likely kind of each reflector."""
     parameters_by_kind: Float[np.ndarray, "reflectors 3 2"]
@@ -38,9 +38,9 @@ class ScanCluster:
     """Covariance of ``parameters``, relative to the scan that was held fixed."""
     pose_covariance: Float[np.ndarray, "scans 3 3"]
     """The same for the poses."""
-    squared_residuals: Float[np.ndarray, " clusters"]
-    """Sum of squared range residuals of each cluster's echoes, in units of sigma."""
-    observed: Float[np.ndarray, "clusters 2"]
+    squared_residuals: Float[np.ndarray, " groups"]
+    """Sum of squared range residuals of each group's echoes, in units of sigma."""
+    observed: Float[np.ndarray, "groups 2"]
     """Interval of its wall that each cluster observed: positions along the tangent from the foot point of the origin,
     metres."""
     evidence: float = 0.0
@@ -50,12 +50,12 @@ class ScanCluster:
     def unadjusted(
         cls,
         poses: Float[np.ndarray, "scans 3"],
-        reflector: Int[np.ndarray, " clusters"],
+        reflector: Int[np.ndarray, " groups"],
         kind: Int[np.ndarray, " reflectors"],
         parameters_by_kind: Float[np.ndarray, "reflectors 3 2"],
     ) -> "ScanCluster":
         """A cluster before its adjustment; covariances, residuals and evidence are empty."""
-        count, scans, clusters = len(kind), len(poses), len(reflector)
+        count, scans, groups = len(kind), len(poses), len(reflector)
         return cls(
             poses,
             reflector,
@@ -64,8 +64,8 @@ class ScanCluster:
             kind_evidence=np.zeros((count, 3)),
             covariance=np.zeros((count, 2, 2)),
             pose_covariance=np.full((scans, 3, 3), np.nan),
-            squared_residuals=np.zeros(clusters),
-            observed=np.zeros((clusters, 2)),
+            squared_residuals=np.zeros(groups),
+            observed=np.zeros((groups, 2)),
         )
 
     @property
@@ -119,8 +119,8 @@ class ScanCluster:
             observed=observed,
         )
 
-    def without(self, scan_of: Int[np.ndarray, " clusters"], scan: int | np.integer) -> "ScanCluster":
-        """The cluster without one scan, not adjusted; ``scan_of`` is the scan of each cluster of echoes."""
+    def without(self, scan_of: Int[np.ndarray, " groups"], scan: int | np.integer) -> "ScanCluster":
+        """The cluster without one scan, not adjusted; ``scan_of`` is the scan of each group of echoes."""
         poses, reflector = self.poses.copy(), np.where(scan_of == scan, -1, self.reflector)
         poses[scan] = np.nan
         left = np.unique(reflector[reflector >= 0])

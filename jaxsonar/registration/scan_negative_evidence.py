@@ -52,7 +52,9 @@ def scan_negative_evidence(
     due &= ~(wall[..., None] == np.arange(len(known.theta))).any(axis=1)
     # The farther the foot point is from the observed part, the less certain it is that the wall is there.
     beyond = np.maximum(known.beyond((displacement * known.tangent).sum(-1)), 0.0)
-    probability = SETTINGS.detection_probability - np.where(known.scans > 1, 0.0, SETTINGS.single_scan_doubt)
+    probability = SETTINGS.detection_probability - np.where(
+        known.scans > 1, 0.0, SETTINGS.single_scan_detection_penalty
+    )
     probability = probability * np.exp(-beyond / SETTINGS.extension_scale)
     return nats - (np.log1p(-probability) * due).sum(-1)
 

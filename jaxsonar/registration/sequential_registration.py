@@ -183,7 +183,7 @@ class _Registration:
             lost = 0 if found else lost + 1
             if progress is not None:
                 progress(scan, count)
-            if lost >= SETTINGS.max_lost:
+            if lost >= SETTINGS.max_unregistered:
                 break
         return cluster
 
@@ -209,7 +209,7 @@ class _Registration:
             behind = np.searchsorted(inside, scans)
             beside = inside[np.clip(np.stack([behind - 1, behind]), 0, len(inside) - 1)]
             gap = np.abs(beside - scans).min(axis=0)
-            wanted = np.flatnonzero(free & ~cluster.registered & (gap <= SETTINGS.max_lost))
+            wanted = np.flatnonzero(free & ~cluster.registered & (gap <= SETTINGS.max_unregistered))
             added = [self._register(cluster, int(scan)) for scan in (wanted if turn % 2 else wanted[::-1])]
             if turn and not any(added):
                 break
@@ -239,7 +239,7 @@ class _Registration:
         a, b = np.unravel_index(int(gap.argmin()), gap.shape)
         anchor = int(theirs[b])
         priors = self.motion.priors(base.poses, mine[a : a + 1], anchor)
-        margin = self.margin + SETTINGS.margin_per_gap * min(int(gap[a, b]), SETTINGS.max_lost)
+        margin = self.margin + SETTINGS.margin_per_gap * min(int(gap[a, b]), SETTINGS.max_unregistered)
         other_from_anchor = other.poses[anchor]
         scan = map_as_scan(other.map, other_from_anchor)
         pose = unambiguous_pose(scan, base.map, priors, reach=0.0, margin=margin)

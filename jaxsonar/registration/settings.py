@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxsonar.detection.settings import DEFAULT_SIGMA
+
 
 @dataclass(frozen=True)
 class FeatureRegistrationSettings:
@@ -44,7 +46,7 @@ class FeatureRegistrationSettings:
     """Penalty for a wall between the robot and what it detected, and for a robot on a wall."""
     detection_probability: float = 0.87
     """Probability that a wall is detected if it faces the robot within reach."""
-    single_scan_doubt: float = 0.1
+    single_scan_detection_penalty: float = 0.1
     """Reduction of the detection probability for walls that only one scan observed."""
     min_wall_distance: float = 0.15
     """A robot is never nearer to a wall, metres."""
@@ -90,7 +92,7 @@ class FeatureRegistrationSettings:
     """Log-likelihood ratio by which the best pose must beat every different pose, nats."""
     margin_per_gap: float = 1.0
     """Increase of the margin for every scan between this scan and the nearest registered one, nats."""
-    max_lost: int = 5
+    max_unregistered: int = 5
     """Number of consecutive unregistered scans after which a new map is started."""
 
 
@@ -101,19 +103,19 @@ class RangeRegistrationSettings:
     All values were chosen by hand on the office without odometry (range noise 5 mm, seeds 0 to 5).
     """
 
-    default_sigma: float = 0.003
+    default_sigma: float = DEFAULT_SIGMA
     """Standard deviation of the ranges if no local model has an estimate, metres."""
     decided_probability: float = 0.8
     """Probability of the kind "plane" for a line of a local model."""
     min_kind_probability: float = 0.02
     """Lower bound of the probability of every kind."""
-    cluster_gate: float = 3.5
+    group_gate: float = 3.5
     """Echoes farther off in range (in sigma) do not belong to the reflector."""
-    cluster_significance: float = 0.003
-    """A cluster is rejected if its chi-square is less probable than this."""
-    cluster_steps: int = 6
-    """Gauss-Newton steps of the fit of one cluster."""
-    cluster_scales: tuple[float, float] = (8.0, 3.0)
+    group_significance: float = 0.003
+    """A group of echoes is rejected if its chi-square is less probable than this."""
+    group_steps: int = 6
+    """Gauss-Newton steps of the fit of one group of echoes."""
+    group_scales: tuple[float, float] = (8.0, 3.0)
     """First and last scale of the robust weights of that fit, in sigma."""
     fit_damping: float = 10.0
     """Information added to both parameters of a reflector in its fit, in units of sigma."""

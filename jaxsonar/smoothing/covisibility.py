@@ -1,19 +1,19 @@
 """Covisibility: which segments of a trajectory observe the same landmark.
 
-A robot that returns to a place without an accepted loop closure may be decimetres from where its pose says. What it
+A robot that returns to a place without an accepted loop closure may be decimetres from its estimated position. What it
 observes there need not be the nearest landmark, and a wrong association makes all poses certain of a wrong result. So a
 landmark that is observed again is a new one, unless the relative poses are known well enough.
 """
 
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxsonar.geometry.se2 import unit
+from jaxsonar.geometry.se2 import rotate, unit
+from jaxsonar.geometry.segments import cross
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.smoothing.settings import SETTINGS
 
@@ -60,23 +60,17 @@ class Traversals:
                 mask[:, number] = self._covisible(world, number, segments).any(axis=1)
         return mask
 
-    @cached_property
-    def _segment_from_world(self) -> Float[np.ndarray, "segments 2 2"]:
-        """Rotation matrices."""
-        c, s = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
-        return np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
-
     def _segments_of(self, scans: tuple[int, ...], rows: dict[int, int]) -> Int[np.ndarray, " some"]:
         return np.unique(self.segment_id[[rows[scan] for scan in scans]]) if scans else np.zeros(0, dtype=np.int64)
 
     def _covisible(
         self, world: GlobalMap, number: int, observers: Int[np.ndarray, " some"]
     ) -> Bool[np.ndarray, "segments some"]:
-        """Whether each segment knows well enough where a landmark is that the observers have seen.
+        """Whether the position of a landmark relative to each segment is certain enough, if the observers detected it.
 
-        The position along a wall need not be known.
+        The position along a wall may be uncertain.
         """
-        segment_from_world = self._segment_from_world
+        heading = -self.poses[:, 2]
         if number < len(world):
             first, last = world.segments[number]
             length_squared = max(float(((last - first) ** 2).sum()), 1e-12)
@@ -85,12 +79,11 @@ class Traversals:
             axes = unit(np.array([world.theta[number]]))
         else:
             position, axes = world.points[[number - len(world)] * len(self.poses)], np.eye(2)
-        arm = np.einsum("pij,pqj->pqi", segment_from_world, position[:, None] - self.poses[observers, :2])
+        arm = rotate(position[:, None] - self.poses[observers, :2], heading[:, None])
         variance = np.zeros((len(self.poses), len(observers)))
         for axis in axes:
-            n = np.broadcast_to((segment_from_world @ axis)[:, None], arm.shape)
-            by_heading = n[..., 1] * arm[..., 0] - n[..., 0] * arm[..., 1]
-            jacobian = np.concatenate([n, by_heading[..., None]], axis=-1)
+            direction = np.broadcast_to(rotate(axis, heading)[:, None], arm.shape)
+            jacobian = np.concatenate([direction, cross(arm, direction)[..., None]], axis=-1)
             variance += np.einsum("pqi,pqij,pqj->pq", jacobian, self.covariance[:, observers], jacobian)
         consecutive = np.abs(np.arange(len(self.poses))[:, None] - observers) <= 1
         return variance < np.where(consecutive, SETTINGS.max_consecutive_sd, SETTINGS.max_covisible_sd) ** 2

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from jaxsonar.detection.settings import DEFAULT_SIGMA
+
 
 @dataclass(frozen=True)
 class SmoothingSettings:
@@ -57,8 +59,8 @@ class SmoothingSettings:
     outlier_steps: int = 2
     """Largest number of consecutive steps that are tested together: a scan with a wrong pose changes two steps."""
     max_split_distance: int = 40
-    """Scans beyond an outlier whose points are split. Later the robot may have returned, and the odometry does not
-    decide whether a point is the same."""
+    """Largest number of scans between two detections of a point that an outlier between them splits. Later the robot
+    may have returned, and the odometry does not decide whether a point is the same."""
     max_outlier_rounds: int = 2
     """Largest number of repetitions with split points."""
     min_decrease: float = 1.005
@@ -72,7 +74,7 @@ class SmoothingSettings:
     """Metres; the same for consecutive segments. A larger one means that the robot was moved by hand."""
 
     # Wall echoes
-    default_sigma: float = 0.003
+    default_sigma: float = DEFAULT_SIGMA
     """Standard deviation of the ranges of a scan whose local model has no estimate, metres."""
 
 

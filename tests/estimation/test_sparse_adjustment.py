@@ -24,7 +24,7 @@ from support.adjustment_problem import (
 )
 
 from jaxsonar import kernels
-from jaxsonar.estimation.sparse_adjustment import adjust, marginal_covariances
+from jaxsonar.estimation.sparse_adjustment import solve_adjustment, marginal_covariances
 
 
 @pytest.fixture(autouse=True)
@@ -39,8 +39,8 @@ def odometry(request):
     return request.param
 
 
-adjust_all = partial(adjust, poses_free=True)
-adjust_held = partial(adjust, poses_free=False)
+adjust_all = partial(solve_adjustment, poses_free=True)
+adjust_held = partial(solve_adjustment, poses_free=False)
 covariances = partial(marginal_covariances, poses_free=True)
 
 

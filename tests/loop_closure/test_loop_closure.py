@@ -107,7 +107,9 @@ def test_repeating_doors_are_not_accepted_wrongly():
         second = drive((9.2 + shift, 0.8), (5.9 + shift, 0.8))
         earlier, newest, _, prior, cov = two(DOORS, drive((5.0, 0.9), (8.5, 0.9)), second, seed, 0.8)
         found = detect_closure(newest, earlier, prior, cov)
-        assert found is None or found.undetermined_direction is not None or found.log_odds < SETTINGS.acceptance_log_odds
+        assert (
+            found is None or found.undetermined_direction is not None or found.log_odds < SETTINGS.acceptance_log_odds
+        )
 
 
 def test_parallel_walls_leave_the_direction_along_them_undetermined():
@@ -325,7 +327,7 @@ def test_overlap_candidates_are_few_and_near():
     assert len(overlap_candidates(graph, made, 1)) == 0
 
 
-def test_without_removes_one_pair():
+def test_take_selects_pairs():
     pairs = Pairs(np.array([3, 1, 2]), np.array([0, 4, 5])).take(np.array([0, 2]))
     assert pairs.earlier.tolist() == [3, 2]
     assert pairs.newest.tolist() == [0, 5]

@@ -6,9 +6,9 @@ import pytest
 from jaxsonar import Ring, Room, kernels, local_models, simulate
 from jaxsonar.geometry.se2 import compose, inverse, relative, wrap_angle
 from jaxsonar.registration.agglomerative_registration import register_by_ranges
-from jaxsonar.registration.cluster_adjustment import adjust, single_scan
+from jaxsonar.registration.cluster_adjustment import adjust_cluster, single_scan
 from jaxsonar.registration.cluster_negative_evidence import cluster_negative_evidence
-from jaxsonar.registration.echo_clusters import ScanObservations
+from jaxsonar.registration.echo_groups import ScanObservations
 from jaxsonar.registration.scan_cluster import merge_clusters
 from jaxsonar.simulation.office import load_office
 
@@ -36,14 +36,12 @@ def observations(office):
     return ScanObservations.of(ring, log, models, SIGMA)
 
 
-def test_every_echo_is_clustered_or_unassigned(office, observations):
+def test_every_echo_is_grouped_or_unassigned(office, observations):
     _, _, log, _ = office
-    clustered, unassigned = len(observations.clustered.scan), len(observations.unassigned.scan)
-    assert clustered + unassigned == sum(len(log[row].range) for row in range(len(log)))
-    assert clustered > 0.9 * (clustered + unassigned)
-    np.testing.assert_array_equal(
-        observations.clusters.scan[observations.clustered.cluster], observations.clustered.scan
-    )
+    grouped, unassigned = len(observations.grouped.scan), len(observations.unassigned.scan)
+    assert grouped + unassigned == sum(len(log[row].range) for row in range(len(log)))
+    assert grouped > 0.9 * (grouped + unassigned)
+    np.testing.assert_array_equal(observations.groups.scan[observations.grouped.group], observations.grouped.scan)
 
 
 def test_a_change_of_frame_is_undone_by_its_inverse(observations, rng):
@@ -65,7 +63,7 @@ def test_common_reflectors_increase_the_evidence(office, observations):
     first, second = a.parameters_by_kind[:, None, 0], b.parameters_by_kind[:, 0]
     near = (np.abs(wrap_angle(first[..., 1] - second[:, 1])) < 0.1) & (np.abs(first[..., 0] - second[:, 0]) < 0.1)
     near &= (a.kind[:, None] == kernels.PLANE) & (b.kind == kernels.PLANE)
-    together = adjust(observations, merge_clusters(a, b, [(int(i), int(j)) for i, j in np.argwhere(near)]))
+    together = adjust_cluster(observations, merge_clusters(a, b, [(int(i), int(j)) for i, j in np.argwhere(near)]))
     assert near.sum() >= 2
     assert together.evidence > a.evidence + b.evidence
     np.testing.assert_allclose(relative(together.poses[0], together.poses[1])[:2], relative(*poses[:2])[:2], atol=0.05)

@@ -1,10 +1,11 @@
-"""Echoes of many scans, grouped into clusters: echoes of one scan that one wall, corner or edge explains."""
+"""Echo groups: the echoes of one scan that one wall, corner or edge explains, for many scans."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import chi2
@@ -20,12 +21,12 @@ from jaxsonar.sensors.range_models import KINDS, RANGE_OF_KIND
 from jaxsonar.sensors.ring import Ring
 
 
-class ClusteredEchoes(NamedTuple):
+class GroupedEchoes(NamedTuple):
     """Echoes as flat arrays, in the frames of their robots."""
 
     scan: Int[np.ndarray, " echoes"]
-    cluster: Int[np.ndarray, " echoes"]
-    """Row of ``EchoClusters``; -1 for unassigned echoes."""
+    group: Int[np.ndarray, " echoes"]
+    """Row of ``EchoGroups``; -1 for unassigned echoes."""
     range: Float[np.ndarray, " echoes"]
     """Half path lengths, corrected, metres."""
     path: Int[np.ndarray, " echoes"]
@@ -36,33 +37,20 @@ class ClusteredEchoes(NamedTuple):
     """Half the vector from transmitter to receiver, metres."""
 
 
-class EchoClusters(NamedTuple):
-    """Clusters of echoes whose kind of reflector is undecided, in the frames of their robots."""
+class EchoGroups(NamedTuple):
+    """Groups of echoes whose kind of reflector is undecided, in the frames of their robots."""
 
-    scan: Int[np.ndarray, " clusters"]
-    plane: Float[np.ndarray, "clusters 2"]
+    scan: Int[np.ndarray, " groups"]
+    plane: Float[np.ndarray, "groups 2"]
     """(rho, theta) if the reflector is a wall, metres and radians."""
-    point: Float[np.ndarray, "clusters 2"]
+    point: Float[np.ndarray, "groups 2"]
     """(x, y) if it is a corner or an edge, metres."""
-    log_prior: Float[np.ndarray, "clusters 3"]
+    log_prior: Float[np.ndarray, "groups 3"]
     """Log-probability of each kind according to the local model."""
 
 
-class PathGeometry(NamedTuple):
-    """Geometry of echo paths in the robot frame; the fields are those of ``kernels.EchoPaths``."""
-
-    midpoint: Float[np.ndarray, "paths 2"]
-    half_baseline: Float[np.ndarray, "paths 2"]
-    axes: Float[np.ndarray, "paths 2 2"]
-    cone: Float[np.ndarray, "paths 2"]
-
-    def take(self, rows: Int[np.ndarray, " rows"]) -> "PathGeometry":
-        """Some of the paths."""
-        return PathGeometry(*(column[rows] for column in self))
-
-
-class _EchoCluster(NamedTuple):
-    """One row of ``EchoClusters``, with the paths (transmitter, receiver) of its echoes."""
+class _EchoGroup(NamedTuple):
+    """One row of ``EchoGroups``, with the paths (transmitter, receiver) of its echoes."""
 
     plane: Float[np.ndarray, "2"]
     point: Float[np.ndarray, "2"]
@@ -72,23 +60,24 @@ class _EchoCluster(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScanObservations:
-    """The echoes of all scans, and their clusters."""
+    """The echoes of all scans, and their groups."""
 
     ring: Ring
     sigma: float
     """Standard deviation of the ranges, metres."""
-    clustered: ClusteredEchoes
-    """Echoes that belong to a cluster."""
-    unassigned: ClusteredEchoes
+    grouped: GroupedEchoes
+    """Echoes that belong to a group."""
+    unassigned: GroupedEchoes
     """All other echoes."""
-    clusters: EchoClusters
+    groups: EchoGroups
     ranges: Float[np.ndarray, "scans paths slots"]
     """All ranges by path, metres, sorted; infinite where there is no echo."""
-    paths: PathGeometry
+    paths: kernels.EchoPaths
+    """Of the ring, NumPy arrays."""
 
     @classmethod
     def of(cls, ring: Ring, log: Log, models: Sequence[LocalModel], sigma: float) -> "ScanObservations":
-        """Cluster the echoes of scans according to their local models.
+        """Group the echoes of scans according to their local models.
 
         Args:
             ring: the sensors.
@@ -96,13 +85,11 @@ class ScanObservations:
             models: the local model of each scan.
             sigma: standard deviation of the ranges, metres.
         """
-        exact = ring.exact_paths
-        columns = exact.midpoint, exact.half_baseline, exact.axes, exact.cone
-        paths = PathGeometry(*(np.asarray(column) for column in columns))
+        paths = jax.tree.map(np.asarray, ring.exact_paths)
         slots = SETTINGS.echoes_per_path
         ranges = np.full((len(models), len(ring.paths), slots), np.inf)
         echoes: list[tuple[np.ndarray, ...]] = []
-        clusters: list[tuple[int, _EchoCluster]] = []
+        groups: list[tuple[int, _EchoGroup]] = []
         for row, model in enumerate(models):
             path, measured = corrected_echoes(ring, log[row])
             order = np.lexsort((measured, path))
@@ -110,25 +97,29 @@ class ScanObservations:
             slot = np.arange(len(path)) - np.searchsorted(path, path)
             kept = slot < slots
             ranges[row, path[kept], slot[kept]] = measured[kept]
-            cluster = np.full(len(path), -1)
-            for one in _clusters_of(model):
+            group = np.full(len(path), -1)
+            for one in _groups_of(model):
                 own = ring.path_index[one.paths[:, 0], one.paths[:, 1]]
-                free = np.flatnonzero(np.isin(path, own) & (cluster < 0))
+                free = np.flatnonzero(np.isin(path, own) & (group < 0))
                 mine = free[_inliers(one, path[free], measured[free], paths, sigma)]
                 if len(mine):
-                    cluster[mine] = len(clusters)
-                    clusters.append((row, one))
-            echoes.append((np.full(len(path), row), cluster, measured, path))
-        scan, cluster, measured, path = _columns(echoes)
-        flat = ClusteredEchoes(scan, cluster, measured, path, paths.midpoint[path], paths.half_baseline[path])
-        some, rest = (ClusteredEchoes(*(column[rows] for column in flat)) for rows in (cluster >= 0, cluster < 0))
-        table = EchoClusters(
-            scan=np.array([row for row, _ in clusters], dtype=np.int64),
-            plane=np.array([one.plane for _, one in clusters], dtype=np.float64).reshape(-1, 2),
-            point=np.array([one.point for _, one in clusters], dtype=np.float64).reshape(-1, 2),
-            log_prior=np.array([one.log_prior for _, one in clusters], dtype=np.float64).reshape(-1, 3),
+                    group[mine] = len(groups)
+                    groups.append((row, one))
+            echoes.append((np.full(len(path), row), group, measured, path))
+        scan, group, measured, path = _columns(echoes)
+        flat = GroupedEchoes(scan, group, measured, path, paths.midpoint[path], paths.half_baseline[path])
+        some, rest = (GroupedEchoes(*(column[rows] for column in flat)) for rows in (group >= 0, group < 0))
+        table = EchoGroups(
+            scan=np.array([row for row, _ in groups], dtype=np.int64),
+            plane=np.array([one.plane for _, one in groups], dtype=np.float64).reshape(-1, 2),
+            point=np.array([one.point for _, one in groups], dtype=np.float64).reshape(-1, 2),
+            log_prior=np.array([one.log_prior for _, one in groups], dtype=np.float64).reshape(-1, 3),
         )
         return cls(ring, sigma, some, rest, table, ranges, paths)
+
+    def paths_at(self, rows: Int[np.ndarray, " rows"]) -> kernels.EchoPaths:
+        """Some of the paths."""
+        return jax.tree.map(lambda leaf: leaf[rows], self.paths)
 
     @cached_property
     def wide_paths(self) -> Int[np.ndarray, " some"]:
@@ -140,43 +131,43 @@ class ScanObservations:
 def _columns(
     echoes: Sequence[tuple[np.ndarray, ...]],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Scan, cluster, range and path of all echoes."""
+    """Scan, group, range and path of all echoes."""
     none = np.zeros(0, dtype=np.int64)
     whole = [np.concatenate(column) for column in zip((none, none, np.zeros(0), none), *echoes, strict=True)]
     return whole[0], whole[1], whole[2], whole[3]
 
 
-def _clusters_of(model: LocalModel) -> Iterator[_EchoCluster]:
+def _groups_of(model: LocalModel) -> Iterator[_EchoGroup]:
     """The reflectors of a local model, as walls and as points."""
     rest = (1 - SETTINGS.decided_probability) / 2
     least = SETTINGS.min_kind_probability
     for line in model.lines:
         log_prior = np.log([SETTINGS.decided_probability, rest, rest])
-        yield _EchoCluster(np.array([line.rho, line.theta]), line.rho * unit(line.theta), log_prior, line.paths)
+        yield _EchoGroup(np.array([line.rho, line.theta]), line.rho * unit(line.theta), log_prior, line.paths)
     for one in model.points:
         probability = np.full(3, max((1 - one.probability) / 2, least))
         probability[kernels.CORNER if one.kind == "corner" else kernels.EDGE] = one.probability
         point = np.array([one.x, one.y])
         plane = np.array([np.hypot(*point), np.arctan2(one.y, one.x)])
-        yield _EchoCluster(plane, point, np.log(probability), one.paths)
+        yield _EchoGroup(plane, point, np.log(probability), one.paths)
     for other in model.undecided:
         probability = np.array([other.probability[name] for name in ("plane", "corner", "edge")])
         plane, point = np.array([other.rho, other.theta]), np.array([other.x, other.y])
-        yield _EchoCluster(plane, point, np.log(np.maximum(probability, least)), other.paths)
+        yield _EchoGroup(plane, point, np.log(np.maximum(probability, least)), other.paths)
 
 
 def _inliers(
-    one: _EchoCluster,
+    one: _EchoGroup,
     path: Int[np.ndarray, " echoes"],
     measured: Float[np.ndarray, " echoes"],
-    paths: PathGeometry,
+    paths: kernels.EchoPaths,
     sigma: float,
 ) -> Int[np.ndarray, " inliers"]:
     """Echoes that one reflector explains, at most one per path; none if no kind of reflector explains them well."""
     nothing = np.zeros(0, dtype=np.int64)
     if not len(path):
         return nothing
-    midpoint, base = paths.midpoint[path], paths.half_baseline[path]
+    midpoint, base = np.asarray(paths.midpoint)[path], np.asarray(paths.half_baseline)[path]
     start = np.stack([one.plane, one.point, one.point])
     predicted = [RANGE_OF_KIND[kind](start[None, kind], midpoint, base).range for kind in KINDS]
     off = np.abs(np.stack(predicted) - measured).min(axis=0)
@@ -192,11 +183,11 @@ def _inliers(
         midpoint[mine],
         base[mine],
         sigma=sigma,
-        steps=SETTINGS.cluster_steps,
-        scales=SETTINGS.cluster_scales,
+        steps=SETTINGS.group_steps,
+        scales=SETTINGS.group_scales,
     )
-    cost = np.square(np.minimum(np.abs(fit.residual), SETTINGS.cluster_gate)).sum(axis=1)
+    cost = np.square(np.minimum(np.abs(fit.residual), SETTINGS.group_gate)).sum(axis=1)
     best = np.abs(fit.residual[cost.argmin()])
-    good = best < SETTINGS.cluster_gate
+    good = best < SETTINGS.group_gate
     probability = chi2.sf(np.square(best[good]).sum(), max(int(good.sum()) - 2, 1))
-    return mine[good] if good.sum() >= 2 and probability >= SETTINGS.cluster_significance else nothing
+    return mine[good] if good.sum() >= 2 and probability >= SETTINGS.group_significance else nothing
