@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar import kernels
+from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
 from jaxsonar.geometry.landmarks import pad_landmarks
 from jaxsonar.graph_slam.joint_compatibility import FeatureMeasurements
 from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
@@ -20,9 +21,9 @@ from jaxsonar.sensors.ring import Ring
 class EchoAssignmentSettings:
     """Constants of the assignment of echoes; chosen by hand unless stated otherwise."""
 
-    gate: float = 4.0
+    gate: float = GNC_SETTINGS.gate_sigmas
     """Standard deviations of a range within which an echo may come from a landmark or feature."""
-    ambiguity: float = 5.0
+    ambiguity: float = GNC_SETTINGS.ambiguity_sigmas
     """Standard deviations; an echo is ambiguous if a second landmark's range is as close as this to the first's."""
     max_prediction_sd: float = 2.0
     """Standard deviations of a range; an echo without a feature is assigned to a landmark only if the belief predicts
@@ -39,7 +40,7 @@ class EchoAssignmentSettings:
     """Track loss: least number of sensors that face known walls."""
     min_wall_scans: int = 2
     """Track loss: least number of scans that observed a wall."""
-    audible_range: float = 0.85
+    reliable_range_fraction: float = 0.85
     """Fraction of the maximum range up to which walls are reliably detected; for track loss and loop closure."""
 
 
@@ -166,7 +167,7 @@ def known_walls_missed(
     expected = np.asarray(kernels.expected_ranges(belief.pose, padded, paths))[:count]
     reliable = (landmarks.kind == kernels.PLANE) & (scan_counts >= SETTINGS.min_wall_scans)
     expected = np.where(reliable[:, None], expected, np.inf).min(axis=0)
-    facing = expected < SETTINGS.audible_range * float(ring.max_range)
+    facing = expected < SETTINGS.reliable_range_fraction * float(ring.max_range)
     detected = np.abs(measured[direct][facing] - expected[facing]) < SETTINGS.wall_echo_tolerance
     return int(facing.sum()) >= SETTINGS.min_facing_sensors and int((~detected).sum()) > int(detected.sum())
 

@@ -81,7 +81,7 @@ class Tracker:
 
     def start(self) -> TrackerState:
         """The state before the first scan."""
-        graph = SubmapGraph(reach=ECHO_SETTINGS.audible_range * float(self.ring.max_range))
+        graph = SubmapGraph(reliable_range=ECHO_SETTINGS.reliable_range_fraction * float(self.ring.max_range))
         return TrackerState(start_submap(), graph, np.zeros(3), 0)
 
     def step(

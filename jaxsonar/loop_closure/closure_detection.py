@@ -78,7 +78,7 @@ def detect_closure(
     expected: Float[np.ndarray, "3"],
     covariance: Float[np.ndarray, "3 3"],
     *,
-    reach: float = SETTINGS.reach,
+    reliable_range: float = SETTINGS.reliable_range,
     neighborhoods: tuple[SubmapNeighborhood, SubmapNeighborhood] | None = None,
 ) -> ClosureMeasurement | None:
     """Measure the relative pose of two submaps; None where it is ambiguous.
@@ -88,7 +88,7 @@ def detect_closure(
         earlier: the submap that stays.
         expected: expected earlier_from_newest, from the pose graph, metres and radians.
         covariance: its covariance.
-        reach: walls within this distance of the robot are surely detected, metres.
+        reliable_range: walls within this distance of the robot are surely detected, metres.
         neighborhoods: views of the earlier and of the newest submap; without neighbors if left out.
     """
     if min(len(newest), len(earlier)) < 2:
@@ -105,7 +105,7 @@ def detect_closure(
         return None
     # 2. Negative evidence against each.
     poses = np.array([fit.pose for _, fit in fits.values()])
-    against = _negative_evidence(views, poses, reach)
+    against = _negative_evidence(views, poses, reliable_range)
     aligned = [
         _AlignedPair(
             pairs,
@@ -118,19 +118,21 @@ def detect_closure(
     ]
     # 3. The best against all others and against perceptual aliasing.
     best = max(aligned, key=lambda one: one.log_likelihood_ratio - one.negative_evidence)
-    measured = _compare(best, aligned, views, prior, reach)
+    measured = _compare(best, aligned, views, prior, reliable_range)
     if measured is None and best.fit.undetermined_direction is None:
         # Where doors repeat, the walls of a corridor still determine the distance from them.
-        corridor = _corridor_alignment(earlier, newest, views, best, prior, reach)
-        measured = None if corridor is None else _compare(corridor, aligned, views, prior, reach)
+        corridor = _corridor_alignment(earlier, newest, views, best, prior, reliable_range)
+        measured = None if corridor is None else _compare(corridor, aligned, views, prior, reliable_range)
     return measured
 
 
 def _negative_evidence(
-    views: tuple[SubmapNeighborhood, SubmapNeighborhood], poses: Float[np.ndarray, "poses 3"], reach: float
+    views: tuple[SubmapNeighborhood, SubmapNeighborhood], poses: Float[np.ndarray, "poses 3"], reliable_range: float
 ) -> Float[np.ndarray, " poses"]:
     tolerance = SETTINGS.negative_evidence_tolerance
-    return submap_negative_evidence(views[0].own, views[1].own, poses, tolerance=tolerance, reach=reach)
+    return submap_negative_evidence(
+        views[0].own, views[1].own, poses, tolerance=tolerance, reliable_range=reliable_range
+    )
 
 
 def _fit_from(
@@ -187,7 +189,7 @@ def _compare(
     aligned: list[_AlignedPair],
     views: tuple[SubmapNeighborhood, SubmapNeighborhood],
     prior: PosePrior,
-    reach: float,
+    reliable_range: float,
 ) -> ClosureMeasurement | None:
     """The closure with its alternatives, or None if another alignment comes near it."""
     fit, basis = best.fit, _basis(best.fit.undetermined_direction)
@@ -210,7 +212,7 @@ def _compare(
     if log_sum_exp(nats) > log_weight - SETTINGS.margin:
         return None
     # 3. Places that look alike and were never observed.
-    offset, density, grid = enumerate_alternatives(fit, *views, prior, reach=reach)
+    offset, density, grid = enumerate_alternatives(fit, *views, prior, reliable_range=reliable_range)
     distance = np.linalg.norm(offset, axis=-1) if full else np.abs(offset @ basis[:2]).max(axis=-1)
     out = distance > SETTINGS.alternative_distance
     aliased = density[out] + np.log(SETTINGS.aliasing_probability)
@@ -280,7 +282,7 @@ def _corridor_alignment(
     views: tuple[SubmapNeighborhood, SubmapNeighborhood],
     best: _AlignedPair,
     prior: PosePrior,
-    reach: float,
+    reliable_range: float,
 ) -> _AlignedPair | None:
     """Alignment by the walls alone that are parallel to most of the paired walls."""
     paired = earlier.landmarks.take(best.pairs.earlier)
@@ -294,5 +296,5 @@ def _corridor_alignment(
     found = fit_compatible_pairs(earlier, newest, pairs, best.fit.pose, least=2)
     if found is None or found[1].undetermined_direction is None:
         return None
-    against = float(_negative_evidence(views, found[1].pose[None], reach)[0])
+    against = float(_negative_evidence(views, found[1].pose[None], reliable_range)[0])
     return _AlignedPair(*found, _log_likelihood_ratio(earlier, newest, *found, prior), against, True)

@@ -52,7 +52,7 @@ def log_sum_exp(nats: Float[np.ndarray, " terms"]) -> float:
 
 
 def enumerate_alternatives(
-    fit: PoseFit, earlier: SubmapNeighborhood, newest: SubmapNeighborhood, prior: PosePrior, *, reach: float
+    fit: PoseFit, earlier: SubmapNeighborhood, newest: SubmapNeighborhood, prior: PosePrior, *, reliable_range: float
 ) -> tuple[Float[np.ndarray, "cells 2"], Float[np.ndarray, " cells"], PenaltyGrid]:
     """Positions on a grid that covers the prior, with the heading of the fit.
 
@@ -61,7 +61,7 @@ def enumerate_alternatives(
         earlier: the submap that stays, with its neighbors.
         newest: the submap that is moved, with its neighbors.
         prior: prior of the pose.
-        reach: walls within this distance are surely detected, metres.
+        reliable_range: walls within this distance are surely detected, metres.
 
     Returns:
         Offsets from the fit (metres), log-probability of each cell (prior and negative evidence, nats), and the grid.
@@ -86,7 +86,7 @@ def enumerate_alternatives(
             newest,
             poses[likely],
             tolerance=SETTINGS.grid_tolerance,
-            reach=reach,
+            reliable_range=reliable_range,
             limit=SETTINGS.max_log_odds,
         )
     grid = PenaltyGrid(offset[0], pitch, nats.reshape(len(step), len(step)))

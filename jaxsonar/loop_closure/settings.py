@@ -72,7 +72,7 @@ class LoopClosureSettings:
     """Log-likelihood ratio by which one constraint must beat all that differ, nats."""
 
     # Closure detection
-    reach: float = 1.5
+    reliable_range: float = 1.5
     """Walls within this distance are surely detected, metres."""
     inflation: float = 1.5
     """Covariance inflation: standard deviations of the prior are taken this much larger than estimated."""

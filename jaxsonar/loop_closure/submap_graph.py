@@ -25,12 +25,12 @@ class SubmapGraph:
     """Poses of submaps. The frame of the first submap is the world; the last node is the frame of the next submap.
 
     Args:
-        reach: walls within this distance of the robot are surely detected, metres.
+        reliable_range: walls within this distance of the robot are surely detected, metres.
         max_compared: number of earlier submaps that are compared with each new one.
     """
 
-    def __init__(self, *, reach: float = SETTINGS.reach, max_compared: int = SETTINGS.max_compared):
-        self.reach, self.max_compared = reach, max_compared
+    def __init__(self, *, reliable_range: float = SETTINGS.reliable_range, max_compared: int = SETTINGS.max_compared):
+        self.reliable_range, self.max_compared = reliable_range, max_compared
         self.submaps: list[Submap] = []
         self.views: list[SubmapView] = []
         self.chain: list[BetweenFactor] = []
@@ -45,7 +45,7 @@ class SubmapGraph:
 
     def copy(self) -> "SubmapGraph":
         """An independent copy."""
-        twin = SubmapGraph(reach=self.reach, max_compared=self.max_compared)
+        twin = SubmapGraph(reliable_range=self.reliable_range, max_compared=self.max_compared)
         twin.submaps, twin.chain, twin.graph = list(self.submaps), list(self.chain), self.graph
         twin.views, twin._pending = list(self.views), self._pending
         twin.verifier = self.verifier.copy()
@@ -119,7 +119,12 @@ class SubmapGraph:
         views = self._neighborhood(earlier, 0, middle), self._neighborhood(newest, middle + 1, newest)
         known = self.submaps[earlier]
         measured = detect_closure(
-            self.submaps[newest], known, expected[0], covariance[0], reach=self.reach, neighborhoods=views
+            self.submaps[newest],
+            known,
+            expected[0],
+            covariance[0],
+            reliable_range=self.reliable_range,
+            neighborhoods=views,
         )
         if measured is None:
             return

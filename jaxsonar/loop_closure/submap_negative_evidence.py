@@ -18,7 +18,7 @@ def submap_negative_evidence(
     poses: Float[np.ndarray, "poses 3"],
     *,
     tolerance: float,
-    reach: float,
+    reliable_range: float,
 ) -> Float[np.ndarray, " poses"]:
     """Evidence against poses of the newest submap, nats.
 
@@ -27,11 +27,11 @@ def submap_negative_evidence(
         newest: the submap that is moved.
         poses: earlier_from_newest.
         tolerance: largest distance between two observations of one wall, metres.
-        reach: walls within this distance are surely detected, metres.
+        reliable_range: walls within this distance are surely detected, metres.
     """
     back = inverse(poses)
-    first = _one_sided(newest, earlier, poses, back, tolerance, reach)
-    return first + _one_sided(earlier, newest, back, poses, tolerance, reach)
+    first = _one_sided(newest, earlier, poses, back, tolerance, reliable_range)
+    return first + _one_sided(earlier, newest, back, poses, tolerance, reliable_range)
 
 
 def neighborhood_negative_evidence(
@@ -40,7 +40,7 @@ def neighborhood_negative_evidence(
     poses: Float[np.ndarray, "poses 3"],
     *,
     tolerance: float,
-    reach: float,
+    reliable_range: float,
     limit: float,
 ) -> Float[np.ndarray, " poses"]:
     """Largest negative evidence of any pair of submaps of two neighborhoods, nats.
@@ -52,7 +52,7 @@ def neighborhood_negative_evidence(
         newest: the submap that is moved, with its neighbors.
         poses: earlier_from_newest.
         tolerance: as for ``submap_negative_evidence``; it must include the errors between neighbors.
-        reach: walls within this distance are surely detected, metres.
+        reliable_range: walls within this distance are surely detected, metres.
         limit: evidence beyond which no further pair is evaluated, nats; the result is bounded by it.
     """
     nats = np.zeros(len(poses))
@@ -61,9 +61,9 @@ def neighborhood_negative_evidence(
             row = np.flatnonzero(nats < limit)
             pose = compose(inverse(stays), compose(poses[row], moves))
             distance = np.linalg.norm(transform_points(pose, yours.center) - mine.center, axis=-1)
-            close = distance < mine.radius + yours.radius + reach
+            close = distance < mine.radius + yours.radius + reliable_range
             row, pose = row[close], pose[close]
-            found = submap_negative_evidence(mine, yours, pose, tolerance=tolerance, reach=reach)
+            found = submap_negative_evidence(mine, yours, pose, tolerance=tolerance, reliable_range=reliable_range)
             nats[row] = np.maximum(nats[row], found)
     return np.minimum(nats, limit)
 
@@ -74,7 +74,7 @@ def _one_sided(
     poses: Float[np.ndarray, "poses 3"],
     back: Float[np.ndarray, "poses 3"],
     tolerance: float,
-    reach: float,
+    reliable_range: float,
 ) -> Float[np.ndarray, " poses"]:
     """Observations of the viewer against the walls of the other; poses are other_from_viewer, back the inverse."""
     walls = other.features
@@ -90,7 +90,7 @@ def _one_sided(
     # 2. Missed walls: they face a viewpoint, are near, not hidden, and not among the viewer's own walls.
     offset = viewpoint[:, :, None] - walls.reference
     along, distance = (offset * walls.tangent).sum(-1), -(offset * walls.normal).sum(-1)
-    due = (distance > SETTINGS.min_range) & (distance < reach) & other.is_certain
+    due = (distance > SETTINGS.min_range) & (distance < reliable_range) & other.is_certain
     due &= np.abs(along) < walls.half_length - SETTINGS.end_margin
     due &= ~_has_wall(viewer, other, poses, tolerance)[:, None]
     foot = viewpoint[:, :, None] + 0.9 * distance[..., None] * walls.normal
@@ -98,7 +98,7 @@ def _one_sided(
     # 3. Missed points.
     offset = walls.point - viewpoint[:, :, None]
     distance = np.linalg.norm(offset, axis=-1)
-    due = (distance > SETTINGS.min_range) & (distance < reach) & (other.point_factor > 0)
+    due = (distance > SETTINGS.min_range) & (distance < reliable_range) & (other.point_factor > 0)
     own = transform_points(poses[:, None], viewer.features.point)
     nearest = np.linalg.norm(own[:, :, None] - walls.point, axis=-1).min(axis=1, initial=np.inf)
     due &= ~(nearest < tolerance + 0.1)[:, None]

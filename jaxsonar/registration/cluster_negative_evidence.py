@@ -21,8 +21,8 @@ def cluster_negative_evidence(observations: ScanObservations, cluster: ScanClust
     # Paths that should detect a reflector: it is inside the cones, in range, and not an edge, whose echoes are weak.
     wide = observations.wide_paths
     view = _ReflectorView.of(cluster, poses[:, None], observations.paths_at(wide))
-    reach = SETTINGS.reach_factor * float(observations.ring.max_range)
-    due = view.in_front & (view.off_axis < SETTINGS.inner_cone) & (view.prediction.range < reach)
+    reliable_range = SETTINGS.reliable_range_fraction * float(observations.ring.max_range)
+    due = view.in_front & (view.off_axis < SETTINGS.inner_cone) & (view.prediction.range < reliable_range)
     due &= ~wall[:, None, None] | _is_observed(cluster, view.along, SETTINGS.due_margin)
     due &= (cluster.kind != kernels.EDGE)[:, None, None]
     # Paths that detected something there, or whose earlier echo masks it.

@@ -15,7 +15,7 @@ def scan_negative_evidence(
     poses: Float[np.ndarray, "poses 3"],
     wall: Int[np.ndarray, "poses lines"],
     *,
-    reach: float,
+    reliable_range: float,
     start: Float[np.ndarray, "2"] | None,
 ) -> Float[np.ndarray, " poses"]:
     """Evidence against poses of a scan, nats.
@@ -25,10 +25,10 @@ def scan_negative_evidence(
         scan: features of the scan in the robot frame.
         poses: map_from_robot.
         wall: row of the wall that each wall of the scan is matched to; -1 where it is new.
-        reach: distance within which walls are surely detected, metres; with 0 there is no negative evidence.
+        reliable_range: distance within which walls are surely detected, metres; with 0 there is no negative evidence.
         start: where the robot came from in a straight line; None if that is not known.
     """
-    if not len(known.theta) or not reach:
+    if not len(known.theta) or not reliable_range:
         return np.zeros(len(poses))
     # No wall lies between the robot and what it detected, or between the robot and its previous position.
     position = poses[:, :2]
@@ -43,7 +43,7 @@ def scan_negative_evidence(
     # Near walls that face the robot and are not hidden are detected.
     displacement = position[:, None] - known.reference
     distance = known.offset - (displacement * known.normal).sum(-1)
-    due = (distance > SETTINGS.min_detection_range) & (distance < reach)
+    due = (distance > SETTINGS.min_detection_range) & (distance < reliable_range)
     foot = position[:, None] + 0.95 * distance[..., None] * known.normal
     due &= ~_crosses(known, np.broadcast_to(position[:, None], foot.shape), foot).any(axis=-1)
     near = np.abs(distance[..., None] - scan.detections[:, 0]) < SETTINGS.detection_match[0]

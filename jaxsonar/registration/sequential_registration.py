@@ -144,7 +144,7 @@ class _Registration:
     def __init__(self, scans: list[Features], motion: MotionModel, margin: float):
         self.scans, self.motion, self.margin = scans, motion, margin
         distance = np.concatenate([np.zeros(1), *(one.detections[:, 0] for one in scans)])
-        self.reach = SETTINGS.reach_factor * float(np.quantile(distance, SETTINGS.range_quantile))
+        self.reliable_range = SETTINGS.reliable_range_fraction * float(np.quantile(distance, SETTINGS.range_quantile))
 
     def clusters(
         self, progress: Callable[[int, int], None] | None, free: Bool[np.ndarray, " scans"] | None = None
@@ -197,7 +197,7 @@ class _Registration:
         anchors = inside[max(split - 1, 0) : split + 1]
         priors = self.motion.priors(cluster.poses, anchors, scan)
         margin = self.margin + SETTINGS.margin_per_gap * (int(np.abs(anchors - scan).min()) - 1)
-        pose = unambiguous_pose(features, cluster.map, priors, reach=self.reach, margin=margin)
+        pose = unambiguous_pose(features, cluster.map, priors, reliable_range=self.reliable_range, margin=margin)
         if pose is not None:
             cluster.add(scan, features, pose)
         return pose is not None
@@ -242,12 +242,12 @@ class _Registration:
         margin = self.margin + SETTINGS.margin_per_gap * min(int(gap[a, b]), SETTINGS.max_unregistered)
         other_from_anchor = other.poses[anchor]
         scan = map_as_scan(other.map, other_from_anchor)
-        pose = unambiguous_pose(scan, base.map, priors, reach=0.0, margin=margin)
+        pose = unambiguous_pose(scan, base.map, priors, reliable_range=0.0, margin=margin)
         return None if pose is None else compose(compose(pose, inverse(other_from_anchor)), other.poses)
 
 
 def unambiguous_pose(
-    scan: Features, known: Features, priors: list[MotionPrior], *, reach: float, margin: float
+    scan: Features, known: Features, priors: list[MotionPrior], *, reliable_range: float, margin: float
 ) -> Float[np.ndarray, "3"] | None:
     """The only pose at which a scan agrees with a map, map_from_robot, or None.
 
@@ -255,12 +255,12 @@ def unambiguous_pose(
         scan: features of the scan in the robot frame.
         known: the map.
         priors: components of the prior, the widest one last.
-        reach: distance within which walls are surely detected, metres; 0: no negative evidence.
+        reliable_range: distance within which walls are surely detected, metres; 0: no negative evidence.
         margin: nats by which the best hypothesis must beat every different one.
     """
     widest = priors[-1]
     near = known.within(widest.pose[:2], 3 * widest.sd[0] + 2 * scan.radius)
-    candidates = [_refined_hypotheses(scan, near, prior, reach) for prior in priors]
+    candidates = [_refined_hypotheses(scan, near, prior, reliable_range) for prior in priors]
     poses, nats, information = (np.concatenate(part) for part in zip(*candidates, strict=True))
     if not len(poses):
         return None
@@ -278,7 +278,7 @@ def unambiguous_pose(
 
 
 def _refined_hypotheses(
-    scan: Features, known: Features, prior: MotionPrior, reach: float
+    scan: Features, known: Features, prior: MotionPrior, reliable_range: float
 ) -> tuple[Float[np.ndarray, "poses 3"], Float[np.ndarray, " poses"], Float[np.ndarray, "poses 3 3"]]:
     """The best hypotheses under a prior: poses, their evidence in nats, and their information."""
     poses = pose_hypotheses(scan, known, prior.pose)
@@ -292,5 +292,5 @@ def _refined_hypotheses(
     information = found.information + prior.information()
     volume = 1.5 * np.log(2 * np.pi) - np.linalg.slogdet(information)[1] / 2
     start = prior.pose[:2] if prior.straight else None
-    against = scan_negative_evidence(known, scan, poses, found.wall, reach=reach, start=start)
+    against = scan_negative_evidence(known, scan, poses, found.wall, reliable_range=reliable_range, start=start)
     return poses, found.log_likelihood + prior.log_density(poses) + volume - against, information

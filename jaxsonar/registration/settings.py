@@ -45,7 +45,7 @@ class FeatureRegistrationSettings:
     blocked_sight_nats: float = 3.0
     """Penalty for a wall between the robot and what it detected, and for a robot on a wall."""
     detection_probability: float = 0.87
-    """Probability that a wall is detected if it faces the robot within reach."""
+    """Probability that a wall is detected if it faces the robot within the reliable range."""
     single_scan_detection_penalty: float = 0.1
     """Reduction of the detection probability for walls that only one scan observed."""
     min_wall_distance: float = 0.15
@@ -58,7 +58,7 @@ class FeatureRegistrationSettings:
     """Distance by which a line of sight must pass through a wall, and from the ends of its observed part, metres."""
     range_quantile: float = 0.98
     """Quantile of all detected distances that serves as the sensors' range."""
-    reach_factor: float = 0.85
+    reliable_range_fraction: float = 0.85
     """Fraction of that range within which walls are surely detected."""
 
     odometry_sd: float = 0.05
@@ -227,8 +227,9 @@ class RangeRegistrationSettings:
     """Squared chord off the beam axis, relative to the cone edge: surely detected within."""
     outer_cone: float = 1.3
     """The same limit for echoes that may be detected."""
-    reach_factor: float = 0.9
-    """Fraction of the maximum range within which reflectors are due."""
+    reliable_range_fraction: float = 0.9
+    """Fraction of the maximum range within which reflectors should be detected. The cones are tested exactly here, so that
+    it is larger than for registration by features."""
     range_tolerance: float = 0.03
     """A reflector counts as detected within this and three sigma, metres."""
     masked_range: float = 0.05

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from jaxsonar.detection.settings import DEFAULT_SIGMA
+from jaxsonar.estimation.alternation import SETTINGS as ALTERNATION_SETTINGS
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class SmoothingSettings:
     may have returned, and the odometry does not decide whether a point is the same."""
     max_outlier_rounds: int = 2
     """Largest number of repetitions with split points."""
-    min_decrease: float = 1.005
+    min_decrease: float = ALTERNATION_SETTINGS.min_growth
     """Factor by which the number of explained echoes must decrease to count as fewer."""
 
     # Covisibility
