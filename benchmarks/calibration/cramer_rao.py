@@ -11,6 +11,7 @@ from jaxtyping import Float
 from benchmarks.calibration.trials import FIRST_ORDER, SIGMA, Trial
 from jaxsonar import Room
 from jaxsonar.geometry.se2 import relative, wrap_angle
+from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.simulation.simulator import Simulation
 from jaxsonar.simulation.traced_echoes import EchoKind
 
@@ -38,7 +39,7 @@ def expected_ranges(
         parameters: (rho, theta) of planes, (x, y) of points; world frame, metres and radians.
         pose: world_from_robot.
         ends: transmitter and receiver, robot frame, metres.
-        scale: 343.2 m/s divided by the speed of sound.
+        scale: ``REFERENCE_SPEED_OF_SOUND`` divided by the speed of sound.
     """
     cos, sin = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
     x, y = ends[..., 0], ends[..., 1]
@@ -86,7 +87,7 @@ def bound(
     pairs = trial.true.paths[trial.simulation.path[first]]
     rows, sensors, scans = np.arange(len(first)), trial.true.count, len(trial.poses)
     ends = np.asarray(trial.true.position)[pairs]
-    scale = np.full(len(first), 343.2 / float(trial.true.speed_of_sound))
+    scale = np.full(len(first), REFERENCE_SPEED_OF_SOUND / float(trial.true.speed_of_sound))
     count = sensors + 1 + parameters.size + 3 * scans * poses_free
     jacobian = np.zeros((len(first), count))
     for column in pairs.T:  # a path has the mean of the two offsets

@@ -16,6 +16,7 @@ from scipy.linalg import solveh_banded
 from benchmarks.calibration.cramer_rao import LANDMARK_SD, NUDGE, expected_ranges, first_order_echoes
 from benchmarks.slam.scenarios import DISTANCE, TURN, Scene
 from jaxsonar.geometry.se2 import relative, wrap_angle
+from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.simulation.traced_echoes import EchoKind
 from jaxsonar.simulation.wheel_odometry import odometry_step_sd
 
@@ -102,7 +103,7 @@ class _RangeJacobians:
         first, reflector, parameters = first_order_echoes(scene.room, simulation)
         kind, scan = simulation.kind[first], simulation.scan[first]
         ends = np.asarray(scene.ring.position)[scene.ring.paths[simulation.path[first]]]
-        scale = np.full(len(first), 343.2 / float(scene.ring.speed_of_sound))
+        scale = np.full(len(first), REFERENCE_SPEED_OF_SOUND / float(scene.ring.speed_of_sound))
 
         def derivative(reflector_step: np.ndarray, pose: np.ndarray) -> np.ndarray:
             at = [

@@ -26,14 +26,14 @@ import numpy as np
 
 from jaxsonar import simulate
 from jaxsonar.hardware.device_emulator import emulate
-from jaxsonar.hardware.messages import Group, Message
+from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND, Group, Message
 from jaxsonar.hardware.transport_servers import listen
 from jaxsonar.live.status import Status
 from jaxsonar.live.stream import stream
 from jaxsonar.simulation.device_messages import log_messages
 from jaxsonar.simulation.office import load_office
 
-SCAN = 8 * 2 * 2.0 / 343.2
+SCAN = 8 * 2 * 2.0 / REFERENCE_SPEED_OF_SOUND
 """Duration of a scan: 8 firing groups with 2 m range each, seconds."""
 SETTLED = 0.2
 """Share of the time after which memory should be constant."""

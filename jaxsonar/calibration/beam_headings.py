@@ -36,7 +36,7 @@ class HeadingSettings:
 SETTINGS = HeadingSettings()
 
 
-class _Observations(NamedTuple):
+class _WallDetections(NamedTuple):
     """Walls that a sensor could detect directly, over all scans."""
 
     sensor: Int[np.ndarray, " observations"]
@@ -63,7 +63,7 @@ def estimate_headings(
         SonarError: the echoes do not determine the headings.
     """
     # 1. Which walls were detected from which directions, and which were not.
-    observations = _observations(ring, data, found)
+    observations = _wall_detections(ring, data, found)
     size = bucket_size(len(observations.sensor), least=settings.min_observations)
     valid = np.ones(len(observations.sensor), dtype=bool)
     padded = [jnp.asarray(pad_rows(values, size)) for values in (*observations, valid)]
@@ -97,7 +97,7 @@ def estimate_headings(
     return replace(ring, heading=heading), np.sqrt(variance)
 
 
-def _observations(ring: Ring, data: BatchData, found: AdjustmentResult) -> _Observations:
+def _wall_detections(ring: Ring, data: BatchData, found: AdjustmentResult) -> _WallDetections:
     """All walls that a sensor could detect, whether it did, and from where.
 
     Points are left out: edges are weak, and the directions from which a corner can be detected are unknown.
@@ -116,4 +116,4 @@ def _observations(ring: Ring, data: BatchData, found: AdjustmentResult) -> _Obse
     ambiguous[scan, data.path[scan, echo]] = True
     kept = np.isfinite(angle) & is_wall & (~ambiguous[:, None] | detected)
     _, _, sensor = np.nonzero(kept)
-    return _Observations(sensor, angle[kept], detected[kept])
+    return _WallDetections(sensor, angle[kept], detected[kept])

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.detection.settings import check_sigma
 from jaxsonar.diagnostics.beam_width import count_by_angle, fit_cone, fit_each_cone
-from jaxsonar.diagnostics.echo_residuals import ResidualTable, explained_share, predict_and_match
+from jaxsonar.diagnostics.echo_residuals import ResidualTable, explained_fraction, predict_and_match
 from jaxsonar.diagnostics.findings import describe_findings
 from jaxsonar.diagnostics.health_report import Health as Health
 from jaxsonar.diagnostics.range_offsets import OffsetEstimate, estimate_offsets
@@ -83,7 +83,7 @@ def check(
     # Summarize residuals, explained echoes and repeated ranges.
     quantiles, spread = _residual_statistics(table, offsets, ring.count)
     gate = SETTINGS.detection.explained_gate * noise + SETTINGS.detection.explained_margin
-    explained = explained_share(as_numbered, gate, ring.count), explained_share(table, gate, ring.count)[place]
+    explained = explained_fraction(as_numbered, gate, ring.count), explained_fraction(table, gate, ring.count)[place]
     repeats, pairs = _repeated_ranges(log, ring.count)
     cross = log.tx != log.rx
     # Report by the sensor numbers of the log.

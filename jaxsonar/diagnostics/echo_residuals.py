@@ -165,14 +165,16 @@ def _is_occluded(
     # Where the ray to the point of wall w crosses the line of wall j, as a fraction of the ray and along the wall.
     toward = np.einsum("swpx,sjx->swjp", ray, n)
     height = rho[:, None, :, None] - np.einsum("px,sjx->sjp", midpoint, n)[:, None]
-    share = height / np.where(toward == 0, 1, toward)
-    along = np.einsum("px,sjx->sjp", midpoint, t)[:, None] + share * np.einsum("swpx,sjx->swjp", ray, t)
+    fraction = height / np.where(toward == 0, 1, toward)
+    along = np.einsum("px,sjx->sjp", midpoint, t)[:, None] + fraction * np.einsum("swpx,sjx->swjp", ray, t)
     start, end = np.moveaxis(scene.extent[block], -1, 0)[..., None, :, None]
-    crosses = (share > 0) & (share < 0.97) & (along > start) & (along < end) & scene.is_wall[block][:, None, :, None]
+    crosses = (
+        (fraction > 0) & (fraction < 0.97) & (along > start) & (along < end) & scene.is_wall[block][:, None, :, None]
+    )
     return crosses.any(axis=2)
 
 
-def explained_share(table: ResidualTable, gate: float, sensors: int) -> Float[np.ndarray, " sensors"]:
+def explained_fraction(table: ResidualTable, gate: float, sensors: int) -> Float[np.ndarray, " sensors"]:
     """Fraction of the echoes of each sensor, sent or received, within ``gate`` (metres) of a reflector."""
     cross = table.echo_tx != table.echo_rx
     explained = np.abs(table.echo_residual) < gate

@@ -105,7 +105,7 @@ def _cycles(place: Int[np.ndarray, " sensors"]) -> Iterator[list[int]]:
 def _stuck_sensors(health: Health, pairs: Int[np.ndarray, " sensors"]) -> Iterator[Finding]:
     """Sensors that report the same range repeatedly."""
     usual = float(np.nanmedian(health.repeats)) if np.isfinite(health.repeats).any() else 0.0
-    usual_constant = _usual_constant_share(health)
+    usual_constant = _usual_constant_fraction(health)
     for k in range(health.ring.count):
         value, constant = health.constant[k]
         if pairs[k] >= 20 and health.repeats[k] > max(_FINDINGS.min_repeats, 3 * usual, 0.5 + usual / 2):
@@ -167,7 +167,7 @@ def _ring_findings(health: Health) -> Iterator[str]:
     width, error, nominal = np.degrees([*health.beam, health.nominal])
     if abs(width - nominal) > max(_FINDINGS.min_beam_deg, 3 * error):
         yield f"cones are measured {width:.0f} ± {error:.0f} deg wide, the ring has {nominal:.0f} deg"
-    usual_constant = _usual_constant_share(health)
+    usual_constant = _usual_constant_fraction(health)
     if usual_constant > 0.1:
         value = float(np.median(health.constant[health.direct >= 20, 0]))
         yield (
@@ -182,7 +182,7 @@ def _ring_findings(health: Health) -> Iterator[str]:
         yield f"{health.left_out} of {all_echoes} echoes are of pairs of sensors that the ring does not listen to"
 
 
-def _usual_constant_share(health: Health) -> float:
+def _usual_constant_fraction(health: Health) -> float:
     """Fraction of direct echoes with a sensor's most frequent range, the median over the sensors."""
     many = health.direct >= 20
     return float(np.median(health.constant[many, 1])) if many.any() else 0.0

@@ -124,8 +124,8 @@ def join_at_corners(
         corner: where the lines of each pair cross, metres.
     """
     along = segments[:, 1] - segments[:, 0]
-    share, _ = crossings(segments, segments)
-    corner = segments[before, 0] + share[before, after, None] * along[before]
+    fraction, _ = crossings(segments, segments)
+    corner = segments[before, 0] + fraction[before, after, None] * along[before]
     sine = np.abs(cross(along[before], along[after])) / np.maximum(
         lengths(segments)[before] * lengths(segments)[after], 1e-12
     )

@@ -115,10 +115,10 @@ def evaluate(
         raise SonarError(f"evaluate: {came}; allowed are a finite distance above 0, and above 0 to pi/2 rad")
     length, reference_length = lengths(segments), lengths(reference)
     along, across, angle = _relative_position(segments, reference)
-    # Along a segment, from share 0 to 1, both coordinates are linear, so every piece is one interval of shares.
+    # Along a segment, from fraction 0 to 1, both coordinates are linear, so every piece is one interval of fractions.
     bounds = zip(
-        _shares_within(along, 0.0, reference_length),
-        _shares_within(across, -gate_distance, gate_distance),
+        _fractions_within(along, 0.0, reference_length),
+        _fractions_within(across, -gate_distance, gate_distance),
         strict=True,
     )
     (low, low_across), (high, high_across) = bounds
@@ -131,10 +131,10 @@ def evaluate(
     covered = [union_length(part[near]) for part, near in zip(on_reference.swapaxes(0, 1), on.T, strict=True)]
     # Deviations from the nearest reference.
     rows = [
-        (index, wall, share * length[index], across[index, wall] @ [1 - middle, middle], angle[index, wall])
+        (index, wall, fraction * length[index], across[index, wall] @ [1 - middle, middle], angle[index, wall])
         for index in range(len(segments))
-        for wall, share, middle in _nearest_references(pieces[index], across[index], np.flatnonzero(on[index]))
-        if share * length[index] >= SETTINGS.maps.min_overlap
+        for wall, fraction, middle in _nearest_references(pieces[index], across[index], np.flatnonzero(on[index]))
+        if fraction * length[index] >= SETTINGS.maps.min_overlap
     ]
     table = np.array(rows).reshape(-1, 5)
     return Evaluation(
@@ -186,16 +186,16 @@ def _relative_position(
     return along, across, (angle + np.pi / 2) % np.pi - np.pi / 2  # lines are undirected
 
 
-def _shares_within(
+def _fractions_within(
     ends: Float[np.ndarray, "segments references 2"], low: Any, high: Any
 ) -> tuple[Float[np.ndarray, "segments references"], Float[np.ndarray, "segments references"]]:
-    """First and last share of a segment at which a linear quantity, given at its ends, is from low to high."""
+    """First and last fraction of a segment at which a linear quantity, given at its ends, is from low to high."""
     start, change = ends[..., 0], np.diff(ends)[..., 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.sort([(low - start) / change, (high - start) / change], axis=0)
+        fractions = np.sort([(low - start) / change, (high - start) / change], axis=0)
     inside = (start >= low) & (start <= high)
-    first = np.where(change == 0, np.where(inside, -np.inf, np.inf), shares[0])
-    return first, np.where(change == 0, np.where(inside, np.inf, -np.inf), shares[1])
+    first = np.where(change == 0, np.where(inside, -np.inf, np.inf), fractions[0])
+    return first, np.where(change == 0, np.where(inside, np.inf, -np.inf), fractions[1])
 
 
 def _nearest_references(
@@ -203,7 +203,7 @@ def _nearest_references(
     across: Float[np.ndarray, "references 2"],
     walls: Int[np.ndarray, " near"],
 ) -> Iterator[tuple[int, float, float]]:
-    """The nearest reference along each part of a segment: (row, share of the segment, share at the part's middle)."""
+    """The nearest reference along each part of a segment: (row, fraction of the segment, fraction at its middle)."""
     bounds = np.unique(pieces[walls])
     part, middle = np.diff(bounds), (bounds[1:] + bounds[:-1]) / 2
     inside = (pieces[walls, :1] < middle) & (middle < pieces[walls, 1:])

@@ -119,11 +119,11 @@ def find_openings(
     settings = SETTINGS.artifacts
     viewpoint = segments.center - segments.viewing_distance[:, None] * segments.normal
     length = np.linalg.norm(gaps[:, 1] - gaps[:, 0], axis=-1)
-    share = (np.arange(settings.gap_samples) + 0.5) / settings.gap_samples
-    position = gaps[:, :1] + share[:, None] * (gaps[:, 1:] - gaps[:, :1])
+    fraction = (np.arange(settings.gap_samples) + 0.5) / settings.gap_samples
+    position = gaps[:, :1] + fraction[:, None] * (gaps[:, 1:] - gaps[:, :1])
     times = free_space.query(position.reshape(-1, 2), np.repeat(theta, settings.gap_samples))[:, 0]
-    free_share = np.isfinite(times.reshape(-1, settings.gap_samples)).mean(axis=1)
-    free = free_share * length > settings.min_opening
+    free_fraction = np.isfinite(times.reshape(-1, settings.gap_samples)).mean(axis=1)
+    free = free_fraction * length > settings.min_opening
     seen_through = np.array([_crosses(gap, viewpoint, segments.center) for gap in gaps], dtype=bool)
     return free | seen_through
 
@@ -139,8 +139,8 @@ def _crosses(
     passes &= np.abs(after) > SETTINGS.artifacts.behind
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = start + (before / (before - after))[:, None] * (end - start)
-    share = (crossing - gap[0]) @ along / max(float(along @ along), 1e-18)
-    return bool((passes & (share > 0) & (share < 1)).any())
+    fraction = (crossing - gap[0]) @ along / max(float(along @ along), 1e-18)
+    return bool((passes & (fraction > 0) & (fraction < 1)).any())
 
 
 def _vertices(
@@ -163,10 +163,10 @@ def _vertices(
     length_a, length_b = np.linalg.norm(u, axis=-1), np.linalg.norm(v, axis=-1)
     meets = np.abs(determinant) > np.sin(2 * settings.same_direction) * length_a * length_b
     determinant = np.where(meets, determinant, np.nan)
-    share_a, share_b = cross(offset, v) / determinant, cross(offset, u) / determinant
-    beyond = [np.maximum(np.maximum(-s, s - 1), 0) * n for s, n in ((share_a, length_a), (share_b, length_b))]
+    fraction_a, fraction_b = cross(offset, v) / determinant, cross(offset, u) / determinant
+    beyond = [np.maximum(np.maximum(-s, s - 1), 0) * n for s, n in ((fraction_a, length_a), (fraction_b, length_b))]
     meets &= np.maximum(*beyond) <= settings.max_extension
-    crossings = (a[:, 0] + share_a[:, None] * u)[meets]
+    crossings = (a[:, 0] + fraction_a[:, None] * u)[meets]
     return np.concatenate([ends, crossings]), np.concatenate([np.stack([own, own], axis=-1), long[pairs[meets]]])
 
 

@@ -167,8 +167,8 @@ def _free_cells(
     midpoint, start, width = (np.asarray(v)[direct] for v in (geometry.midpoint, geometry.start, geometry.width))
     distances = np.arange(_FREE.cell / 2, _FREE.certain * ring.max_range, _FREE.cell * 0.7)
     # Arrays are (scans, direct paths, rays).
-    share = 0.5 + _FREE.certain * np.linspace(-0.5, 0.5, _FREE.rays)
-    theta = pose[:, None, None, 2] + (start[:, None] + width[:, None] * share)
+    fraction = 0.5 + _FREE.certain * np.linspace(-0.5, 0.5, _FREE.rays)
+    theta = pose[:, None, None, 2] + (start[:, None] + width[:, None] * fraction)
     sensor = pose[:, None, :2] + rotate(midpoint[None], pose[:, 2, None])
     ray = unit(theta)
     free_until = np.broadcast_to(first[..., None] - _FREE.margin, theta.shape).copy()

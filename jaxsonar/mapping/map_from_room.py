@@ -6,7 +6,7 @@ from jaxsonar.floor_plans.room import Room, walls_in_robot_frame
 from jaxsonar.mapping.global_map import GlobalMap
 
 _SD = 1e-6
-"""Standard deviation of the walls of a floor plan, metres and radians: small, because a plan counts as exact. Chosen by hand."""
+"""Standard deviation of the walls of a floor plan, metres and radians; a plan counts as exact. Chosen by hand."""
 _ECHOES = 1000
 """Number of echoes that is attributed to each wall, so that none counts as uncertain. Chosen by hand."""
 

@@ -158,8 +158,8 @@ def compare_segments(
     theta_floor = settings.angle_per_offset**2 * offset_floor
 
     # The common line, as WallSegments.fuse would place it, and the distance of both centers across it.
-    share = segments.info_theta[b] / (segments.info_theta[a] + segments.info_theta[b])
-    theta = segments.theta[a] + share * angle
+    weight_b = segments.info_theta[b] / (segments.info_theta[a] + segments.info_theta[b])
+    theta = segments.theta[a] + weight_b * angle
     tangent, normal = tangent_of(theta), unit(theta)
     offset = segments.center[b] - segments.center[a]
     along, across = (offset * tangent).sum(-1), (offset * normal).sum(-1)
@@ -174,7 +174,7 @@ def compare_segments(
     between = np.maximum(first.min(-1) - second.max(-1), second.min(-1) - first.max(-1))
     between = np.maximum(between, 0)
     # Angles by which each must be rotated onto the common line, and the angle between both, as fractions of the gate.
-    turns = np.abs(np.stack([share * angle + rotation, (share - 1) * angle + rotation]))
+    turns = np.abs(np.stack([weight_b * angle + rotation, (weight_b - 1) * angle + rotation]))
     turns = (turns / np.sqrt(variance[[a, b]] + theta_floor)).max(axis=0)
     turns = np.maximum(turns, np.abs(angle) / np.sqrt(variance[a] + variance[b] + 2 * theta_floor)) / settings.gate
     spread = np.sqrt(1 / info_a + 1 / info_b + offset_floor)

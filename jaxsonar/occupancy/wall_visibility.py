@@ -30,11 +30,11 @@ class WallMap(NamedTuple):
         length = lengths(walls)
         walls, length = walls[length > 0], length[length > 0]
         # Corners: crossings on both walls, or a little beyond their ends.
-        share, other = crossings(walls, walls)
+        fraction, other = crossings(walls, walls)
         spare = SETTINGS.beyond_end / length[:, None]
-        meet = (np.abs(share - 0.5) <= 0.5 + spare) & (np.abs(other - 0.5) <= 0.5 + spare.T)
+        meet = (np.abs(fraction - 0.5) <= 0.5 + spare) & (np.abs(other - 0.5) <= 0.5 + spare.T)
         first, _ = np.nonzero(np.triu(meet))
-        corners = walls[first, 0] + share[np.triu(meet)][:, None] * (walls[first, 1] - walls[first, 0])
+        corners = walls[first, 0] + fraction[np.triu(meet)][:, None] * (walls[first, 1] - walls[first, 0])
         # Cells: samples a quarter of a cell apart miss at most a clipped corner of a cell.
         samples = (4 * length / resolution).astype(int) + 2
         cells = np.unique(np.floor(sample_segments(walls, samples)[0] / resolution).astype(int), axis=0)
@@ -135,10 +135,10 @@ def visible_range(
     angle = heading[:, None] + half_width[:, None] * np.linspace(-1, 1, sectors + 1)
     ends = position[:, None] + max_range * unit(angle)
     starts = np.broadcast_to(position[:, None], ends.shape)
-    share, other = crossings(np.stack([starts, ends], axis=-2).reshape(-1, 2, 2), walls.segments)
+    fraction, other = crossings(np.stack([starts, ends], axis=-2).reshape(-1, 2, 2), walls.segments)
     before, after = (extension / lengths(walls.segments)[:, None]).T
-    hit = (share >= 0) & (other >= -before - 1e-9) & (other <= 1 + after + 1e-9)
-    distance = np.where(hit, share, np.inf).min(axis=1).reshape(angle.shape) * max_range
+    hit = (fraction >= 0) & (other >= -before - 1e-9) & (other <= 1 + after + 1e-9)
+    distance = np.where(hit, fraction, np.inf).min(axis=1).reshape(angle.shape) * max_range
     return np.minimum(distance[:, 1:], distance[:, :-1])
 
 

@@ -37,7 +37,7 @@ MAX_ELLIPSES = 24
 _MIN_ELLIPSE = 0.008
 """Minimum half axis relative to the size of the trajectory; smaller ellipses are enlarged. Chosen by hand."""
 _ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-"""Factors by which ellipses may be enlarged: round numbers, because the legend names the factor."""
+"""Factors by which ellipses may be enlarged: round numbers, because the legend shows the factor."""
 _ODOMETRY_COLOR, _TRUTH_COLOR, _CLOSURE_COLOR, _WITHDRAWN_COLOR = WALL_COLOR, ROBOT_COLOR, PALETTE[2], CROSS_COLOR
 _POINT_SIZES = {"corner": 3.5, "edge": 3.0}
 """Marker sizes, points."""
