@@ -63,7 +63,7 @@ class HypothesisTracker:
     """The map, the scans, and the odometry between them."""
 
     ring: Ring
-    map: KnownMap
+    known_map: KnownMap
     log: Log
     models: Sequence[LocalModel]
     odometry: Float[np.ndarray, "scans 3"]
@@ -92,7 +92,7 @@ class HypothesisTracker:
 
     def _matching_poses(self, start: Float[np.ndarray, "3"] | None) -> list[Float[np.ndarray, "3"]]:
         """Poses of the first scan at which features of the first scans match the map, the most likely first."""
-        known, rows = self.map.features, self.rows[: SETTINGS.first_scans]
+        known, rows = self.known_map.features, self.rows[: SETTINGS.first_scans]
         first = self.odometry[rows[0]]
         richest = sorted(rows, key=lambda row: -(len(self.models[row].lines) + len(self.models[row].points)))
         scans = {
@@ -179,7 +179,7 @@ class HypothesisTracker:
         pose, covariance = hypothesis.pose, hypothesis.covariance
         if number:
             pose, covariance = self._predict(pose, covariance, number)
-        belief = self.map.belief_at(pose, covariance, self.ring.max_range)
+        belief = self.known_map.belief_at(pose, covariance, self.ring.max_range)
         scan = self.log[row]
         prior = SubmapState(belief, np.full(len(belief.landmarks.kind), 2, np.int64))
         found = update(self.ring, prior, scan, self.models[row], row=row, sigma=sigma, add_landmarks=False)

@@ -31,4 +31,6 @@ Decisions:
   beats all others. An ambiguous scan waits until the map around it has grown.
 - An alignment that leaves a direction undetermined competes with the others at its best position along that direction.
 - A common corner of two common walls is no additional evidence.
+- ``cluster_adjustment`` does not use the sparse solver of ``estimation``. Clusters are small, the evidence needs the
+  full covariance, and kinds of reflectors change between steps.
 """

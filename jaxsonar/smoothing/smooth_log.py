@@ -35,7 +35,7 @@ class Smoothed:
     pose_cov: Float[np.ndarray, "scans 3 3"]
     """Covariance of (x, y, theta) with respect to the fixed pose, metres and radians; NaN as above. An undetermined
     direction has a standard deviation of many metres."""
-    heard: Int[np.ndarray, " scans"]
+    explained_counts: Int[np.ndarray, " scans"]
     """Number of echoes of each scan that landmarks explain; 0 where the odometry alone determines the pose."""
     world: GlobalMap
     """The adjusted landmarks, with their standard deviations."""
@@ -153,7 +153,7 @@ def _result(smoother: Smoother, fit: SmoothingFit) -> Smoothed:
     return Smoothed(
         poses=fit.poses,
         pose_cov=pose_cov,
-        heard=fit.echo_counts,
+        explained_counts=fit.echo_counts,
         world=adjusted_map(fit.alternation.maps[0], found, cov.landmarks),
         used=float(found.used.sum() / max(fit.data.echo_count, 1)),
         sigma=found.sigma,

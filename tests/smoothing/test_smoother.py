@@ -63,7 +63,7 @@ def test_poses_and_walls_are_better_than_odometry_and_consistent(recording, foun
     assert nees.mean() < 8
     assert found.sigma == pytest.approx(SIGMA, rel=0.1)
     assert found.used > 0.7
-    assert (found.heard > 10).all()
+    assert (found.explained_counts > 10).all()
     np.testing.assert_allclose(off[0], 0, atol=1e-3)
     assert np.sqrt(cov[0, 0, 0]) < 1e-3
     np.testing.assert_array_equal(cov, np.swapaxes(cov, 1, 2))
