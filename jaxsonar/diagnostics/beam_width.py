@@ -66,8 +66,8 @@ def fit_cone(
         return -float(detected @ np.log(p) + (expected - detected) @ np.log(1 - p))
 
     # Several starting points: the likelihood has local maxima.
-    bounds = [(np.radians(2), np.pi / 2), (np.radians(0.6), np.radians(15)), (0.05, 1.0), (0.0, 0.4)]
-    starts = [np.array([np.radians(half), np.radians(3), 0.85, 0.03]) for half in (8, 15, 22, 30, 40, 55, 70)]
+    bounds = list(zip(_CONES.lower_limits, _CONES.upper_limits, strict=True))
+    starts = [np.array([np.radians(half), *_CONES.start_shape]) for half in _CONES.start_half_widths_deg]
     fits = (minimize(negative_log_likelihood, start, method="L-BFGS-B", bounds=bounds) for start in starts)
     best = min(fits, key=lambda fit: fit.fun).x
     # Standard deviation from the Fisher information, reduced by the observed scatter.
@@ -82,8 +82,7 @@ def fit_cone(
     scatter = ((detected - expected * p) ** 2 / (p * (1 - p) * np.maximum(expected, 1)))[expected > 0]
     overdispersion = max(1.0, float(scatter.sum()) / max(1, len(scatter) - 4))
     information = (jacobian * (expected / (p * (1 - p)))) @ jacobian.T / overdispersion
-    prior = np.diag([3.6, 130.0, 4.0, 25.0])  # standard deviations of 30 deg, 5 deg, 0.5 and 0.2
-    error = float(np.sqrt(np.linalg.inv(information + prior)[0, 0]))
+    error = float(np.sqrt(np.linalg.inv(information + np.diag(_CONES.prior_information))[0, 0]))
     outside, inside = np.abs(BIN_CENTERS) > best[0], np.abs(BIN_CENTERS) < best[0]
     least = _CONES.min_per_side
     if expected[outside].sum() < least or expected[inside].sum() < least or error > _CONES.max_error:

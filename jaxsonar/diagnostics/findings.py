@@ -53,7 +53,9 @@ def _silent_sensors(health: Health) -> Iterator[Finding]:
         few_cross = expected[1:].min() < _FINDINGS.min_expected
         if low[0] and (np.isnan(usual[1]) or low[1:].all() or few_cross):
             amount = "nothing" if detected.sum() == 0 else "hardly anything"
-            elsewhere = f", and reports {echoes[k]} echoes elsewhere" if echoes[k] > 0.3 * others else ""
+            elsewhere = (
+                f", and reports {echoes[k]} echoes elsewhere" if echoes[k] > _FINDINGS.min_elsewhere * others else ""
+            )
             yield Finding(
                 f"sensor {k} hears {amount}: {detected[0]} of {expected[0]} expected direct echoes, the others "
                 f"{100 * usual[0]:.0f} %{elsewhere}",
@@ -108,14 +110,15 @@ def _stuck_sensors(health: Health, pairs: Int[np.ndarray, " sensors"]) -> Iterat
     usual_constant = _usual_constant_fraction(health)
     for k in range(health.ring.count):
         value, constant = health.constant[k]
-        if pairs[k] >= 20 and health.repeats[k] > max(_FINDINGS.min_repeats, 3 * usual, 0.5 + usual / 2):
+        least = max(_FINDINGS.min_repeats, 3 * usual, 0.5 + usual / 2)
+        if pairs[k] >= _FINDINGS.min_samples and health.repeats[k] > least:
             yield Finding(
                 f"sensor {k} repeats the range of the scan before in {100 * health.repeats[k]:.0f} % of the scans, the "
                 f"others in {100 * usual:.0f} %",
                 {k: "stale"},
                 exclusive=True,
             )
-        elif health.direct[k] >= 20 and constant > max(_FINDINGS.min_constant, 4 * usual_constant):
+        elif health.direct[k] >= _FINDINGS.min_samples and constant > max(_FINDINGS.min_constant, 4 * usual_constant):
             yield Finding(
                 f"sensor {k} reports exactly {value:.3f} m in {100 * constant:.0f} % of its direct echoes: is this its "
                 f"code for no echo?",
@@ -169,7 +172,7 @@ def _ring_findings(health: Health) -> Iterator[str]:
         yield f"cones are measured {width:.0f} ± {error:.0f} deg wide, the ring has {nominal:.0f} deg"
     usual_constant = _usual_constant_fraction(health)
     if usual_constant > 0.1:
-        value = float(np.median(health.constant[health.direct >= 20, 0]))
+        value = float(np.median(health.constant[health.direct >= _FINDINGS.min_samples, 0]))
         yield (
             f"every sensor reports one range again and again, {value:.3f} m in {100 * usual_constant:.0f} % of its "
             f"echoes"
@@ -184,7 +187,7 @@ def _ring_findings(health: Health) -> Iterator[str]:
 
 def _usual_constant_fraction(health: Health) -> float:
     """Fraction of direct echoes with a sensor's most frequent range, the median over the sensors."""
-    many = health.direct >= 20
+    many = health.direct >= _FINDINGS.min_samples
     return float(np.median(health.constant[many, 1])) if many.any() else 0.0
 
 

@@ -128,6 +128,16 @@ class ConeSettings:
     """Expected echoes that the cone of a single sensor needs."""
     min_detected_each: int = 15
     """Detected echoes that it needs."""
+    lower_limits: tuple[float, float, float, float] = (float(np.radians(2)), float(np.radians(0.6)), 0.05, 0.0)
+    """Lower limits of the fitted curve: half width and roll-off, radians; probability inside and outside the cone."""
+    upper_limits: tuple[float, float, float, float] = (np.pi / 2, float(np.radians(15)), 1.0, 0.4)
+    """Upper limits of the same."""
+    start_half_widths_deg: tuple[float, ...] = (8, 15, 22, 30, 40, 55, 70)
+    """Half widths at which the fit starts, degrees: the likelihood has local maxima."""
+    start_shape: tuple[float, float, float] = (float(np.radians(3)), 0.85, 0.03)
+    """Roll-off (radians) and probabilities inside and outside the cone at which the fit starts."""
+    prior_information: tuple[float, float, float, float] = (3.6, 130.0, 4.0, 25.0)
+    """Inverse variances of the curve's prior: standard deviations of 30 deg, 5 deg, 0.5 and 0.2."""
 
 
 @dataclass(frozen=True)
@@ -144,10 +154,14 @@ class FindingSettings:
     """Expected echoes that a detection rate needs."""
     dead_rate: float = 0.15
     """A sensor with less than this fraction of the usual detection rate is dead, deaf or mute."""
+    min_elsewhere: float = 0.3
+    """Echoes relative to the median sensor from which on a sensor without expected echoes is not dead."""
     weak_rate: float = 0.6
     """A sensor with less than this fraction of the usual detection rate is weak."""
     min_repeats: float = 0.3
     """Fraction of repeated ranges above which a sensor is stale; at least three times the usual fraction, too."""
+    min_samples: int = 20
+    """Ranges, or pairs of consecutive ranges, that a fraction of them needs."""
     min_constant: float = 0.25
     """Fraction of identical ranges above which a sensor saturates; at least four times the usual fraction, too."""
     min_turn_deg: float = 10.0

@@ -95,7 +95,7 @@ def estimate_systematic_error(segments: WallSegments, *, gap: float) -> float:
         order = np.argsort(excess_variance, kind="stable")
         median = np.searchsorted(np.cumsum(walls.count[order]), walls.count.sum() / 2)
         larger = min(2 * float(np.sqrt(excess_variance[order[median]])), SETTINGS.fusion.max_systematic_error)
-        if larger < 1.1 * error:
+        if larger < SETTINGS.fusion.min_error_growth * error:
             return error
         error = larger
 
@@ -222,7 +222,7 @@ def _candidate_pairs(
     theta_floor = settings.angle_per_offset**2 * (systematic_error**2 + (segments.count / segments.info_offset).max())
     largest_angle = settings.gate * np.sqrt(2 / segments.info_theta.min() + 2 * theta_floor)
     angular_distance = settings.angle_scale * min(largest_angle, np.pi / 2)
-    radius = float(np.hypot(1.6 * gap + settings.max_offset, angular_distance))
+    radius = float(np.hypot(settings.search_gaps * gap + settings.max_offset, angular_distance))
     tree, queries = KDTree(points), np.flatnonzero(changed[segment])
     if nearest is None and len(queries) == len(points):
         one, other = tree.query_pairs(radius, output_type="ndarray").reshape(-1, 2).T

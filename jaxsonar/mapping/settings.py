@@ -83,6 +83,8 @@ class FusionSettings:
     """Smallest systematic error of an offset, metres: walls are not perfectly straight, and odometry is not perfect."""
     max_systematic_error: float = 0.02
     """Largest systematic error that is attributed to the poses, metres."""
+    min_error_growth: float = 1.1
+    """The estimate of the systematic error is repeated while it grows by at least this factor."""
     angle_per_offset: float = 2.2
     """Systematic error of a direction per systematic error of an offset, radians per metre."""
     max_thickness: float = 0.04
@@ -96,6 +98,8 @@ class FusionSettings:
     """Iterations of the robust refit."""
     angle_scale: float = 2.0
     """Weight of directions against positions in the search for neighbors, metres per radian."""
+    search_gaps: float = 1.6
+    """Radius of the search for neighbors, in longest gaps; samples of a segment are at most one gap apart."""
     nearest: int = 12
     """Number of neighbors that the first search for candidate pairs considers; a full search follows."""
 
