@@ -228,8 +228,8 @@ class RangeRegistrationSettings:
     outer_cone: float = 1.3
     """The same limit for echoes that may be detected."""
     reliable_range_fraction: float = 0.9
-    """Fraction of the maximum range within which reflectors should be detected. The cones are tested exactly here, so that
-    it is larger than for registration by features."""
+    """Fraction of the maximum range within which reflectors should be detected. Cones are tested exactly here, so it is
+    larger than for registration by features."""
     range_tolerance: float = 0.03
     """A reflector counts as detected within this and three sigma, metres."""
     masked_range: float = 0.05

@@ -13,20 +13,20 @@ from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
 from jaxsonar.mapping.global_map import GlobalMap
 
 
-def adjusted_map(world: GlobalMap, found: AdjustmentResult, cov: Float[np.ndarray, "landmarks 2 2"]) -> GlobalMap:
+def adjusted_map(world: GlobalMap, adjustment: AdjustmentResult, cov: Float[np.ndarray, "landmarks 2 2"]) -> GlobalMap:
     """The map with its landmarks where the adjustment put them; landmarks with too few echoes are removed.
 
     Args:
         world: the map from which the landmarks were made, the only one of the adjustment.
-        found: the result of the adjustment.
+        adjustment: its result.
         cov: marginal covariance of the parameters of each landmark, metres and radians.
     """
     wall_count, count = len(world), len(world) + len(world.points)
-    first = np.asarray(found.problem.factors.reflection.first)[found.used]
+    first = np.asarray(adjustment.problem.factors.reflection.first)[adjustment.used]
     echoes = np.bincount(first, minlength=count)[:count]
     kept = np.flatnonzero(echoes >= GNC_SETTINGS.min_landmark_echoes)
     wall, point = kept[kept < wall_count], kept[kept >= wall_count]
-    walls, points = (found.state.landmark_map.landmarks.take(rows) for rows in (wall, point))
+    walls, points = (adjustment.state.landmark_map.landmarks.take(rows) for rows in (wall, point))
     # From (distance of the anchor, theta) to (rho, theta).
     distance, theta = np.asarray(walls.parameters).T
     rho = distance + (unit(theta) * walls.anchor).sum(-1)
