@@ -1,6 +1,6 @@
 """SLAM: poses and map from a log (``slam.slam``) or scan by scan (``tracker.Tracker``, ``incremental_mapper.Mapper``).
 
-The way of a scan: ``frontend`` (EKF-SLAM in the submap around the robot) with ``joint_compatibility`` (association of
+The steps of a scan: ``frontend`` (EKF-SLAM in the submap around the robot) with ``feature_association`` (association of
 features) and ``scan_echoes`` (assignment of echoes, update); every few metres a finished submap goes to
 ``loop_closure.submap_graph``. For a log, ``initial_poses`` tracks or registers all scans, and ``smoothing`` adjusts
 them. ``submap_evidence`` gathers the map evidence of a run whose poses are estimated.

@@ -17,7 +17,7 @@ from jaxsonar.detection.settings import DEFAULT_SIGMA
 from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
 from jaxsonar.geometry.landmarks import concatenate_landmarks, transform_landmarks
 from jaxsonar.geometry.se2 import diagonal_covariance, propagate, relative, tangent_of, transform_points
-from jaxsonar.graph_slam.joint_compatibility import FeatureMeasurements, associate_features, feature_measurements
+from jaxsonar.graph_slam.feature_association import FeatureMeasurements, associate_features, feature_measurements
 from jaxsonar.graph_slam.scan_echoes import ScanEchoes, known_walls_missed, without_padding
 from jaxsonar.loop_closure.submap import Submap
 from jaxsonar.scans.scan_log import Scan

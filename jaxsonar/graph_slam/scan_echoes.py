@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxsonar import kernels
 from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
 from jaxsonar.geometry.landmarks import pad_landmarks
-from jaxsonar.graph_slam.joint_compatibility import FeatureMeasurements
+from jaxsonar.graph_slam.feature_association import FeatureMeasurements
 from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
 from jaxsonar.scans.flat_echoes import corrected_echoes
 from jaxsonar.scans.scan_log import Scan
