@@ -7,9 +7,7 @@ them. ``submap_evidence`` gathers the map evidence of a run whose poses are esti
 
 Design decisions:
 
-- Submaps instead of one filter. In a frame that starts at the robot the errors are small, so that linearization is
-  valid, and the cost of a step stays constant. A submap starts with the last scan of the submap before: nothing else is
-  known about its frame.
+- Submaps instead of one filter (reasons in ``loop_closure``).
 - Echoes, not lines, correct the pose. Lines only associate echoes with walls. An echo without a line counts only if
   the belief predicts its range to two standard deviations; otherwise a wrong landmark would fit by chance.
 - A new wall must have 0.4 of the echoes of a long wall. A wall with few echoes may be mistaken for its edge, and a
