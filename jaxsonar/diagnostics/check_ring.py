@@ -114,7 +114,7 @@ def check(
         asked=expected_in_all,
         answered=detected_in_all,
         beam_each=2 * half_width[place] * scale[place],
-        center=direction[place] * scale[place],
+        centre=direction[place] * scale[place],
         remarks=("",) * ring.count,
         findings=(),
     )

@@ -152,7 +152,7 @@ def _weak_or_turned_sensors(health: Health) -> Iterator[Finding]:
                 f"{100 * usual[0]:.0f} %",
                 {k: "weak"},
             )
-        turn, error = np.degrees(health.center[k])
+        turn, error = np.degrees(health.centre[k])
         # Not against a map: its walls end where they were detected.
         if abs(turn) > max(_FINDINGS.min_turn_deg, 4 * error) and health.source == "scans":
             side = "left" if turn > 0 else "right"

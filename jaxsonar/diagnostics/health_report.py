@@ -72,7 +72,7 @@ class Health:
     """Number of them that were detected."""
     beam_each: Float[np.ndarray, "sensors 2"]
     """Full width of each sensor's cone and its standard deviation, radians."""
-    center: Float[np.ndarray, "sensors 2"]
+    centre: Float[np.ndarray, "sensors 2"]
     """Direction of the middle of its cone relative to its heading, counter-clockwise, and its standard deviation,
     radians."""
     remarks: tuple[str, ...]

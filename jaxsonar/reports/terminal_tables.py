@@ -148,7 +148,7 @@ def health_table(health: Health) -> Table:
             fixed(1e3 * float(health.spread[k, 1]), 1),
             fixed(100 * float(health.repeats[k]), 0),
             with_error(*np.degrees(health.beam_each[k]).tolist(), digits=0),
-            with_error(*np.degrees(health.center[k]).tolist(), digits=0),
+            with_error(*np.degrees(health.centre[k]).tolist(), digits=0),
             health.remarks[k],
             style="bold red" if health.remarks[k] else None,
         )

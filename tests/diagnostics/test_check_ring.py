@@ -211,6 +211,7 @@ def test_json_table_and_figure(healthy, tmp_path):
     plain = written(healthy)
     assert plain["ring"] == RING.name
     assert len(plain["offset"]) == 24
+    assert {"heard", "centre", "fits", "answered"} <= set(plain)  # keys of the file format
     np.testing.assert_allclose(plain["nominal_beam"], np.pi / 3)
     with open(tmp_path / "table.txt", "w", encoding="utf-8") as file:
         Console(file=file, width=160).print(health_table(healthy))
