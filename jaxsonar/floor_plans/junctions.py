@@ -8,9 +8,11 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.geometry.segments import crossings, point_to_segments
 
 TOUCH = 1e-3
-"""Ends of walls that are closer than this are one vertex; an end this close to another wall touches it. Metres; chosen by hand."""
+"""Ends of walls that are closer than this are one vertex; an end this close to another wall touches it. Metres; chosen
+by hand."""
 ANGLE_TOLERANCE = np.radians(1.0)
-"""Largest deviation of a right-angled wedge from 90 deg, and smallest excess over 180 deg of an edge. Radians; chosen by hand."""
+"""Largest deviation of a right-angled wedge from 90 deg, and smallest excess over 180 deg of an edge. Radians; chosen
+by hand."""
 SAME_DIRECTION = 1e-4
 """Walls that leave a vertex in directions closer than this overlap. Radians; chosen by hand."""
 

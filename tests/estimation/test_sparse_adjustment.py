@@ -24,7 +24,7 @@ from support.adjustment_problem import (
 )
 
 from jaxsonar import kernels
-from jaxsonar.estimation.sparse_adjustment import solve_adjustment, marginal_covariances
+from jaxsonar.estimation.sparse_adjustment import marginal_covariances, solve_adjustment
 
 
 @pytest.fixture(autouse=True)

@@ -9,8 +9,8 @@ import pytest
 from jaxsonar import Ring, Room, kernels, local_model, simulate
 from jaxsonar.geometry.landmarks import wall_segments
 from jaxsonar.geometry.se2 import unit
-from jaxsonar.graph_slam.frontend import SubmapState, finish_submap, start_submap, update
 from jaxsonar.graph_slam.feature_association import FeatureMeasurements, associate_features
+from jaxsonar.graph_slam.frontend import SubmapState, finish_submap, start_submap, update
 
 RING = Ring.circular()
 PLANE, CORNER = kernels.PLANE, kernels.CORNER
