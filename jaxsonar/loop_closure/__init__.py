@@ -1,6 +1,6 @@
 """Loop closure: the pose graph of submaps, and the closures that it accepts.
 
-Entry points: ``submap.Submap``, ``submap_graph.SubmapGraph``, ``verification.ClosureDecision``. The way of a finished
+Entry points: ``submap.Submap``, ``submap_graph.SubmapGraph``, ``verification.ClosureDecision``. Steps for a finished
 submap: ``sequential_constraint`` (walls shared with the previous submap), ``submap_graph.overlap_candidates`` (which
 earlier submaps may overlap), ``closure_detection`` (relative pose from ``pose_candidates`` and ``submap_matching``,
 against ``submap_negative_evidence`` and ``perceptual_aliasing``), ``verification`` (accepted or refused, with
