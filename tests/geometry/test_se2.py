@@ -152,4 +152,14 @@ def test_covariance_of_a_relative_pose_has_both_errors_and_their_correlation(rng
 def test_an_exact_change_of_frame_rotates_the_covariance(rng):
     frame, pose, cov = rng.uniform(-2, 2, 3), rng.uniform(-2, 2, 3), random_covariance(rng, 3, 1e-4)
     expected = compose_with_covariance(frame, np.zeros((3, 3)), pose, cov)[1]
-    np.testing.assert_allclose(rotate_covariance(frame[2], cov), expected, atol=1e-15)
+    np.testing.assert_allclose(rotate_covariance(frame[2], cov), expected, atol=1e-14)
+
+
+def test_batches_of_poses_transform_like_single_poses(rng):
+    poses, others, points = rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), rng.normal(size=(7, 2))
+    np.testing.assert_allclose(
+        transform_points(poses[:, None], points), [transform_points(pose, points) for pose in poses], atol=1e-14
+    )
+    single = [compose(pose, other) for pose, other in zip(poses, others, strict=True)]
+    np.testing.assert_allclose(compose(poses, others), single, atol=1e-14)
+    np.testing.assert_allclose(compose(poses, others[0]), [compose(pose, others[0]) for pose in poses], atol=1e-14)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsonar.geometry.se2 import transform_points
-from jaxsonar.geometry.segments import cross, crossings, lengths, point_to_segments
+from jaxsonar.geometry.segments import cross, crossings, lengths, perpendicular_intersections, point_to_segments
 
 coordinates = st.floats(-5, 5, allow_nan=False)
 poses = st.tuples(coordinates, coordinates, coordinates).map(np.array)
@@ -48,3 +48,14 @@ def test_distance_to_the_nearest_end_or_to_the_line():
     segment = np.array([[[0.0, 0.0], [2.0, 0.0]]])
     points = np.array([[1.0, 0.5], [-3.0, 4.0], [3.0, 0.0], [1.5, 0.0]])
     np.testing.assert_allclose(point_to_segments(points, segment)[:, 0], [0.5, 5.0, 1.0, 0.0])
+
+
+def test_perpendicular_intersections_are_those_of_about_perpendicular_walls():
+    """Two walls meet at (2, 1) with gaps of 0.1 and 0.2; the third one is parallel to the first."""
+    segments = np.array([[[2.0, -1.0], [2.0, 0.9]], [[-1.0, 1.0], [1.8, 1.0]], [[-1.0, -1.0], [-1.0, 0.5]]])
+    found = perpendicular_intersections(np.array([0.0, np.pi / 2, np.pi]), segments, max_skew=0.1)
+    assert found.first.tolist() == [0, 1]
+    assert found.second.tolist() == [1, 2]
+    np.testing.assert_allclose(found.point, [[2.0, 1.0], [-1.0, 1.0]], atol=1e-12)
+    np.testing.assert_allclose(found.gap, [[0.1, 0.2], [0.0, 0.5]], atol=1e-12)
+    assert len(perpendicular_intersections(np.array([0.0, 0.5]), segments[:2], max_skew=0.1).first) == 0
