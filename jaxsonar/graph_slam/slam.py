@@ -112,14 +112,13 @@ def slam(
     if window is None and float(np.asarray(ring.echo_paths.width).sum() / (2 * np.pi)) < SETTINGS.sparse_echoes:
         window = SETTINGS.sparse_window
     has_odometry = np.asarray(np.isfinite(log.pose).all(axis=1))
-    # 1. Check the arguments.
     _check(log, has_odometry, sigma=sigma, window=window, smooth=smooth, speed=speed, scale=scale)
-    # 2. Detect the local model of every scan, unless maps of windows or the tracker do so.
+    # 1. Detect: the local model of every scan, unless maps of windows or the tracker do so.
     scan_by_scan = live and has_odometry.any()
     models = None if window is not None or scan_by_scan else detect(ring, log, sigma=sigma, progress=report)
-    # 3. Estimate initial poses: odometry as it is, tracked with loop closure, or registered without odometry.
+    # 2. Track the poses and close loops. Without odometry, register the scans; with windows, keep the odometry.
     initial = initial_poses(ring, log, models, window=window, sigma=sigma, odometry_noise=noise, progress=report)
-    # 4. Smooth all poses and landmarks on the raw ranges.
+    # 3. Smooth: all poses and landmarks on the raw ranges.
     smoothed = None
     if smooth if smooth is not None else _is_smoothed_by_default(initial, has_odometry, speed):
         smoothed = smooth_poses(
@@ -137,7 +136,7 @@ def slam(
             progress=lambda task: report(task, 0, 0),
         )
         _check_explained(smoothed)
-    # 5. Take the map of the smoothed landmarks, or build one from the initial poses.
+    # 4. Map: that of the smoothed landmarks, or one from the initial poses.
     if smoothed is not None:
         poses, covariance, world = smoothed.poses, smoothed.pose_cov, smoothed.world
     else:
