@@ -58,6 +58,18 @@ def rng():
     return np.random.default_rng(20240917)
 
 
+@pytest.fixture
+def small_csv(tmp_path):
+    """A CSV file with the small scan log of ``support.logs``."""
+    from support.logs import SMALL
+
+    from jaxsonar.scans.log_file import save_log
+
+    file = tmp_path / "small.csv"
+    save_log(SMALL, file)
+    return file
+
+
 @pytest.fixture(scope="session")
 def faw_ring():
     """The paper's ring: 24 sensors, 60 deg cones, neighbors up to the third."""

@@ -5,8 +5,6 @@ import math
 import os
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from jaxsonar import Log, load_log, load_ring
 from jaxsonar.batch_jobs.inputs import find_inputs
 from jaxsonar.batch_jobs.shards import split_input
 from jaxsonar.cli import app as cli
-from jaxsonar.fileio.compilation_cache import CACHE_VARIABLE, use_compilation_cache
 from jaxsonar.scans.rosbag_log import read_bag_scans
 from jaxsonar.simulation.device_messages import log_messages
 
@@ -219,22 +216,3 @@ def test_an_unfinished_recording_is_read_up_to_its_last_complete_scan(tmp_path):
     (tmp_path / "log.csv.recording").write_text(f"{len(GOOD):20d}\n")
     assert len(parts_of(tmp_path / "log.csv", tmp_path)) == 20
     assert [one.source for one in find_inputs([tmp_path])] == ["log.csv"]
-
-
-def test_the_compilation_cache_can_be_turned_off(tmp_path, monkeypatch):
-    import jax
-
-    kept: Any = jax.config
-    before = kept.jax_compilation_cache_dir
-    try:
-        jax.config.update("jax_compilation_cache_dir", None)
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-        monkeypatch.setenv(CACHE_VARIABLE, "off")
-        use_compilation_cache()
-        assert not list(tmp_path.iterdir())
-        monkeypatch.delenv(CACHE_VARIABLE)
-        use_compilation_cache()
-        assert kept.jax_compilation_cache_dir == str(tmp_path / "jaxsonar" / "compiled")
-        assert Path(kept.jax_compilation_cache_dir).stat().st_mode & 0o777 == 0o700
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)

@@ -2,8 +2,6 @@
 
 import csv
 import math
-import os
-import stat
 import subprocess
 import sys
 import tempfile
@@ -16,19 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.logs import HEADER, SMALL, SMALL_CSV, any_scans, log_of, read, refused
 
-from jaxsonar.fileio.atomic_files import atomic_write
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans import csv_log as logs_csv
 from jaxsonar.scans.convert import convert
 from jaxsonar.scans.log_file import load_log, save_log
 from jaxsonar.scans.scan_log import Log
-
-
-@pytest.fixture
-def small_csv(tmp_path):
-    file = tmp_path / "small.csv"
-    save_log(SMALL, file)
-    return file
 
 
 def test_every_column_is_read_into_its_own_field(small_csv):
@@ -348,63 +338,6 @@ def test_messages_have_one_line_for_any_filename(tmp_path):
     with pytest.raises(SonarError) as caught:
         load_log(tmp_path / "two\nlines.csv")
     assert str(caught.value).isprintable()
-
-
-@pytest.mark.parametrize("failure", [RuntimeError("stop"), KeyboardInterrupt(), OSError(28, "No space left on device")])
-def test_a_failed_write_keeps_the_old_file(failure, monkeypatch, small_csv):
-    def some_lines(log):
-        yield HEADER
-        raise failure
-
-    monkeypatch.setattr(logs_csv, "csv_lines", some_lines)
-    with pytest.raises(SonarError if isinstance(failure, OSError) else type(failure)) as caught:
-        save_log(SMALL[:1], small_csv)
-    assert small_csv.read_text() == SMALL_CSV
-    assert list(small_csv.parent.iterdir()) == [small_csv]
-    if isinstance(failure, OSError):
-        assert str(caught.value).startswith(f"{small_csv}: cannot write: No space left on device; allowed is")
-
-
-def test_unwritable_files_raise_an_error(tmp_path):
-    (tmp_path / "folder.csv").mkdir()
-    for path in (
-        tmp_path / "folder.csv",
-        tmp_path / "no" / "log.csv",
-        tmp_path / "\0.csv",
-        tmp_path / f"{'a' * 300}.csv",
-    ):
-        with pytest.raises(SonarError) as caught:
-            save_log(SMALL, path)
-        assert "cannot write: " in str(caught.value)
-        assert str(caught.value).isprintable()
-    assert [file.name for file in tmp_path.iterdir()] == ["folder.csv"]
-
-
-def test_permissions_come_from_the_umask_or_the_old_file(tmp_path):
-    file = tmp_path / "log.csv"
-    before = os.umask(0o027)
-    try:
-        save_log(SMALL, file)
-        assert stat.S_IMODE(file.stat().st_mode) == 0o640
-        file.chmod(0o604)
-        save_log(SMALL, file)
-        assert stat.S_IMODE(file.stat().st_mode) == 0o604
-    finally:
-        os.umask(before)
-
-
-def test_symbolic_links_are_kept(small_csv):
-    link = small_csv.with_name("link.csv")
-    link.symlink_to(small_csv.name)
-    save_log(SMALL[:1], link)
-    assert link.is_symlink()
-    assert load_log(small_csv) == SMALL[:1]
-
-
-def test_device_files_are_written_not_replaced():
-    with atomic_write("/dev/null") as file:
-        file.write("nothing")
-    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
 
 
 def test_reading_and_writing_logs_does_not_import_jax(tmp_path):
