@@ -77,6 +77,7 @@ def as_rows(name, columns):
 # Results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["ml", "hough"])
 def test_the_numbers_are_those_of_local_models(method):
     log = office_scans(17)

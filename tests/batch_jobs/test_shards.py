@@ -19,6 +19,7 @@ pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 @pytest.mark.parametrize("scans", [1, 7, 50])
 def test_chunks_concatenate_to_the_log(tmp_path, suffix, scans):
@@ -31,6 +32,7 @@ def test_chunks_concatenate_to_the_log(tmp_path, suffix, scans):
     assert Log.from_scans([scan for one in read for scan in one]) == log == load_log(path)
 
 
+@pytest.mark.slow
 def test_csv_and_parquet_give_the_same_rows(tmp_path):
     log = office_scans(10)
     save_log(log, tmp_path / "log.csv")
@@ -58,6 +60,7 @@ def test_a_log_without_scans_has_no_shards(tmp_path):
     assert [split_input(one, staging=tmp_path, sensors=24) for one in find_inputs([tmp_path])] == [[], []]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_planning_takes_bounded_memory(tmp_path, suffix, monkeypatch):
     """Four times the scans, the same memory."""

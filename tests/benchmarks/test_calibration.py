@@ -101,6 +101,7 @@ def score_of(case, error, covariance):
     return calibration.compared(ring, lines, case, KNOWN, mean_free=False)
 
 
+@pytest.mark.slow
 def test_errors_at_the_bound_have_ratio_1_and_nees_1(office, rng):
     crb = bound(office, mean_free=False)
     errors = rng.multivariate_normal(np.zeros(25), crb, size=60, method="svd")

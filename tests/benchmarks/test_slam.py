@@ -65,6 +65,7 @@ def test_trajectories_keep_clear_of_walls(scene):
     assert len(floor) == 1 or scene.name == "office"
 
 
+@pytest.mark.slow
 def test_steps_and_rotations_are_bounded(scene):
     if scene.name == "office":
         return

@@ -137,6 +137,7 @@ def test_points_lie_on_the_arcs(given):
     assert 0.01 * len(points) < image.sum() <= len(points)
 
 
+@pytest.mark.slow
 def test_batches_have_the_stated_numbers_of_echoes():
     some = batch(60)
     assert some.mixed.shape == some.dense.shape == (60, 168, 2)

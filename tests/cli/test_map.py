@@ -271,6 +271,7 @@ def test_one_scan_of_the_laser_is_a_polygonal_model(here, capsys):
     assert Path("a.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_recording_through_all_three_commands(tmp_path, monkeypatch, capsys):
     folder = recorded("corridor8")
     monkeypatch.chdir(tmp_path)

@@ -84,6 +84,7 @@ def test_lines_agree_with_the_slow_oracle(ring, seed):
         np.testing.assert_allclose(lines.segments[0, k], ends, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_walls_are_detected_at_their_positions(faw_ring):
     echoes = [(k, r) for wall in THREE_WALLS for k, r in oracles.echoes_of_wall(faw_ring, *wall)]
     came = found(extract_lines(faw_ring, dense(faw_ring, echoes)))
@@ -113,6 +114,7 @@ def test_rotation_by_sensor_steps_permutes_paths_and_shifts_theta(seed, steps):
         assert twin[2] == pytest.approx(line[2], abs=2)
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(st.integers(0, 10_000))
 def test_a_mirrored_room_gives_mirrored_lines(seed):

@@ -63,6 +63,7 @@ def test_exactly_both_walls_of_a_corridor_are_detected(seed, stale):
         assert k == 0 or times.min() == 1, f"window {k}: a wall is missing"  # the first window is only half full
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_lines_are_consistent_with_their_echoes(seed):
     """Every echo is in one line at most; lines have enough echoes and length; segments lie on their lines."""

@@ -98,6 +98,7 @@ def test_segments_are_equivariant_under_a_motion_of_line_and_sensors(x, y, turn,
     np.testing.assert_allclose(there, transform_points(motion, np.asarray(here, float)), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_rotation_of_the_frame_by_whole_cells_shifts_the_cells(rng):
     arcs = arc_tables(RING, SETTINGS).arcs
     echoes = mixed_echoes(rng, poses=rng.uniform(-0.3, 0.3, (2, 3)))

@@ -3,12 +3,14 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from support.health_logs import RING, log_of
 
 from jaxsonar.diagnostics.check_ring import check
 from jaxsonar.diagnostics.range_offsets import remove_gauge_freedom
 
 
+@pytest.mark.slow
 def test_an_offset_is_attributed_to_its_sensor_only():
     offset = np.zeros(24)
     offset[3] = 0.01

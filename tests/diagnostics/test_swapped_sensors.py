@@ -21,6 +21,7 @@ def test_swapped_sensors_are_named(log, pair):
     assert sum(map(bool, found.remarks)) == 2
 
 
+@pytest.mark.slow
 def test_a_swap_is_distinguished_from_its_mirror_image():
     """In the office the poses are similar: with the original walls, (4, 8) fits better than the true (5, 7)."""
     office = load_office()

@@ -88,6 +88,7 @@ def test_dense_solvers_find_the_same(rng, odometry, odometry_scale):
     np.testing.assert_allclose(found.cost, kernels.cost(problem, found.unknowns), rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odometry_scale", [False, True])
 def test_the_covariances_are_those_of_the_dense_equations(rng, odometry, odometry_scale):
     problem, start, _ = problem_with_truth(rng, odometry=odometry, odometry_scale=odometry_scale)

@@ -175,6 +175,7 @@ def test_both_faces_of_a_thin_wall():
     np.testing.assert_allclose(np.sort(walls[:, :, 1].mean(axis=1)), [0, 0.12], atol=0.002)
 
 
+@pytest.mark.slow
 def test_walls_that_few_scans_saw_are_left_out():
     hall = loop(HALL)
     laser = drive(hall, path())
@@ -195,6 +196,7 @@ def test_a_run_without_returns():
         reference_map(lost)
 
 
+@pytest.mark.slow
 def test_the_recorded_corridor():
     """Two parallel walls with doors and recesses; normals 91.4 and 270.0 deg, 1.220 and 1.083 m from the start."""
     walls = reference_map(read_corridor8_laser(recorded("corridor8")))

@@ -36,6 +36,7 @@ def test_aligned_errors_do_not_depend_on_the_frame(rng):
     assert np.isnan(unaligned.nees)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_the_best_alignment_equals_a_numerical_search(seed):
     rng = np.random.default_rng(seed)

@@ -118,6 +118,7 @@ def test_a_dash_is_standard_output(tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @given(tables, st.dictionaries(st.text(), tables, max_size=2))
 def test_toml_round_trip(tmp_path_factory, table, nested):
     file = tmp_path_factory.mktemp("toml") / "table.toml"

@@ -24,6 +24,7 @@ def as_feature(properties, form, coordinates):
     return feature(form, coordinates, **properties)
 
 
+@pytest.mark.slow
 @given(st.lists(features, max_size=4))
 def test_features_round_trip(tmp_path_factory, written):
     file = tmp_path_factory.mktemp("features") / "features.geojson"

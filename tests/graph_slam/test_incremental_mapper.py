@@ -99,6 +99,7 @@ def test_two_continuations_of_one_state_are_independent(office):
     assert_same_map(mapper.map(middle), build_map(RING, log[:8]))
 
 
+@pytest.mark.slow
 def test_a_step_returns_the_local_model_and_its_walls(office):
     """The walls are in the world frame."""
     mapper, state = Mapper(ring=RING), Mapper(ring=RING).start()

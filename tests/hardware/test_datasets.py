@@ -272,6 +272,7 @@ def test_a_missing_recording_is_named(reader, tmp_path):
     assert "this is no text" in refused(reader, tmp_path / "picture")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["corridor8", "scitos24"])
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_convert_keeps_every_echo_of_a_recording(name, suffix, tmp_path):

@@ -59,6 +59,7 @@ class Clocked(Sink):
         pass
 
 
+@pytest.mark.slow
 def test_messages_are_sent_in_real_time(office, log):
     """At 20 times the speed: never early, and late only because of a busy machine."""
     sent = list(log_messages(log[:4], office.ring))
@@ -89,6 +90,7 @@ def test_invalid_speeds_are_rejected(speed):
         emulate([], sink, speed=speed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["tcp", "pty"])
 def test_the_next_client_continues_where_the_last_one_left(scheme, office, log):
     """No message is skipped between two clients, and the device waits without a client."""
@@ -111,6 +113,7 @@ def test_the_next_client_continues_where_the_last_one_left(scheme, office, log):
     assert device.served.clients == 2 or (scheme == "pty" and device.served.clients == 1)
 
 
+@pytest.mark.slow
 def test_an_unplugged_link_loses_only_what_was_in_flight(office, log):
     """The source reconnects after a reset; messages in flight are lost, the others are complete."""
     sent = list(log_messages(log, office.ring))

@@ -48,6 +48,7 @@ def kinds(events):
 SOME = [bytes([1 + k % 255]) * (1 + 37 * k % 900) + b"\0" for k in range(400)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["tcp", "udp", "pty", "serial"])
 def test_bytes_arrive_as_they_were_sent(scheme, pty_url):
     if scheme == "serial":

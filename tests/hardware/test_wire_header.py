@@ -128,6 +128,7 @@ def decode_command(frame):
     return f"d {len(frame)} {frame.hex()}"
 
 
+@pytest.mark.slow
 def test_c_and_python_encode_the_same_bytes(device, rng):
     counts = [*range(60), 500, 4096]
     groups = [some_group(rng, count) for count in counts]

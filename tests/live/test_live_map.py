@@ -62,6 +62,7 @@ def wall_errors(models, poses):
     return np.array(errors), covs
 
 
+@pytest.mark.slow
 def test_lines_of_a_moving_robot_are_as_accurate_as_at_rest():
     """With the poses of the groups the walls are accurate to the bound; without them errors are much larger."""
     raws, poses = moving_scans(0.001)

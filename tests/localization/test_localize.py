@@ -100,6 +100,7 @@ def test_a_rectangle_is_ambiguous():
     assert_correct(localize(RING, world_of(walls), given, start=[0.9, 0.6, 0.1], sigma=SIGMA), poses)
 
 
+@pytest.mark.slow
 def test_corners_of_a_floor_plan_explain_echoes(world):
     """A floor plan has no points: corners are added where its walls meet at right angles."""
     truth = office().poses[8:9]

@@ -30,6 +30,7 @@ def test_closures_in_a_room_are_correct_and_consistent():
     assert 0.5 < sum(surprise) / rank < 1.8
 
 
+@pytest.mark.slow
 def test_after_little_drift_a_closure_needs_no_confirmation():
     sure = 0
     for seed in range(5):
@@ -49,6 +50,7 @@ def test_a_similar_room_is_not_accepted(sigma):
         assert found is None or found.log_odds < SETTINGS.acceptance_log_odds - 2
 
 
+@pytest.mark.slow
 def test_a_similar_room_is_not_accepted_where_drift_moves_it_onto_the_known_one():
     first = drive((3, 2.2), (3, 3), (1.9, 3.2), (2.2, 4.2), (4, 4))
     for seed in range(4):
@@ -57,6 +59,7 @@ def test_a_similar_room_is_not_accepted_where_drift_moves_it_onto_the_known_one(
         assert found is None or found.log_odds < SETTINGS.acceptance_log_odds - 2
 
 
+@pytest.mark.slow
 def test_a_rectangle_is_not_rotated_by_half_a_turn():
     outline, half = rectangle(4.0, 3.2), np.array([4.0, 3.2, np.pi])
     there = compose(half, SECOND)  # the same trajectory, rotated by half a turn about the center of the room
@@ -73,6 +76,7 @@ def test_a_rectangle_is_not_rotated_by_half_a_turn():
         assert found is None or np.abs(off_by(found, true)[0]).max() < 0.1
 
 
+@pytest.mark.slow
 def test_repeating_doors_are_not_accepted_wrongly():
     for seed in range(4):
         shift = 2.0 * (seed % 3 - 1)

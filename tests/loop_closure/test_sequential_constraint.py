@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from support.submap_pairs import FIRST, NICHE
 from support.submaps import drive, rectangle, submap, submaps
 
@@ -12,6 +13,7 @@ from jaxsonar.loop_closure.sequential_constraint import sequential_factor
 from jaxsonar.loop_closure.submap_matching import nearest_pairs
 
 
+@pytest.mark.slow
 def test_sequential_factors_are_more_accurate_and_consistent():
     total, joint, before, better, count = 0.0, 0.0, 0.0, 0, 20
     for seed in range(count):

@@ -1,12 +1,14 @@
 """Withdrawal of a wrong closure restores the pose graph."""
 
 import numpy as np
+import pytest
 from support.submap_pairs import run_graph
 from support.submaps import drive, ring_corridor
 
 from jaxsonar.loop_closure.closure_candidate import ACCEPTED, ClosureCandidate
 
 
+@pytest.mark.slow
 def test_a_wrong_closure_is_withdrawn_and_leaves_no_trace():
     corners = [(-0.9, -0.9), (7.9, -0.9), (7.9, 5.9), (-0.9, 5.9)]
     doors = [(0, 1.7, 0.5, 0.2), (0, 3.9, 0.4, 0.2), (1, 3.0, 0.5, 0.2)]

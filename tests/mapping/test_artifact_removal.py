@@ -254,6 +254,7 @@ def seen_through(times, part, last_seen):
     return sum(t > last_seen for t in beside) >= 3
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.integers(1, 6))
 def test_removal_equals_a_loop_over_parts(seed, count):

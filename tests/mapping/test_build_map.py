@@ -190,6 +190,7 @@ def test_invariants_of_a_map(office_maps):
         assert (world.sigma_theta > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("merging", MERGING_METHODS)
 def test_a_single_scan_gives_a_map(office_log, merging, method):
@@ -263,6 +264,7 @@ def test_unknown_methods_are_refused(office_log):
         build_map(RING, stranger)
 
 
+@pytest.mark.slow
 def test_echoes_of_pairs_that_the_ring_does_not_listen_to_are_reported(office_log):
     first = office_log[0]
     more = dataclasses.replace(
@@ -344,6 +346,7 @@ def test_nothing_bridges_the_doors_recess(office, office_maps, seed):
     assert covered(office_maps[seed], mouth, within=0.05) < 0.15
 
 
+@pytest.mark.slow
 def test_the_papers_merging_finds_the_walls_of_the_office(office, office_logs):
     """With wide tolerances: this merging keeps the lines of corners and does not bridge gaps."""
     for sim, log in office_logs[:3]:

@@ -69,6 +69,7 @@ def test_split_and_order_of_the_scans_do_not_matter(seed, count, parts):
     assert_same(whole, apart)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.integers(1, 300), st.sampled_from([(0, 0), (-37, 1), (10**6, -(10**6))]))
 def test_query_gives_the_latest_times_in_descending_order(seed, count, around):
@@ -251,6 +252,7 @@ def test_no_scans_give_no_cells(faw_ring):
     assert len(who) == 0
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(st.floats(0.45, 1.9), st.floats(-3.1, 3.1), st.floats(-3.1, 3.1), st.floats(-50, 50))
 def test_a_wall_with_echoes_is_not_free(rho, theta, heading, x):
@@ -329,6 +331,7 @@ def test_walls_of_the_office_are_never_free():
     assert np.isneginf(times_found[:, -1]).all()  # three scans in agreement would remove a wall
 
 
+@pytest.mark.slow
 def test_only_scans_with_a_pose_and_echoes_within_range_count(faw_ring):
     """An echo beyond the maximum range counts as none; a scan without a pose adds no free space."""
     far = Log.from_echoes(

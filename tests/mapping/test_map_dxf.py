@@ -22,6 +22,7 @@ def ezdxf():
     return pytest.importorskip("ezdxf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [0, 1, 40])
 def test_a_drawing_is_read_back(ezdxf, rng, tmp_path, count):
     world = a_map(rng.uniform(-30, 30, (count, 2, 2)))
@@ -37,6 +38,7 @@ def test_a_drawing_is_read_back(ezdxf, rng, tmp_path, count):
     np.testing.assert_array_equal(ends[..., 2], 0)
 
 
+@pytest.mark.slow
 def test_the_initial_view_contains_all_walls(ezdxf, tmp_path):
     """A corridor of 25 m along y; the view has a given height, and programs make it at least as wide."""
     world = a_map([[[3, 0], [3, 25]], [[5, 0], [5, 25]]])
@@ -46,6 +48,7 @@ def test_the_initial_view_contains_all_walls(ezdxf, tmp_path):
     assert view.dxf.height >= 25
 
 
+@pytest.mark.slow
 def test_the_same_map_gives_the_same_bytes(ezdxf, rng, tmp_path, monkeypatch):
     """Also if a year passes between the two writes."""
     import datetime
@@ -64,6 +67,7 @@ def test_the_same_map_gives_the_same_bytes(ezdxf, rng, tmp_path, monkeypatch):
     assert (tmp_path / "a.dxf").read_bytes() == (tmp_path / "b.dxf").read_bytes()
 
 
+@pytest.mark.slow
 def test_other_drawings_keep_their_dates(ezdxf, tmp_path):
     save_dxf(a_map([]), tmp_path / "map.dxf")
     assert not ezdxf.options.write_fixed_meta_data_for_testing
@@ -76,6 +80,7 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written_is_named(ezdxf, tmp_path):
     with pytest.raises(SonarError, match=r"no/map\.dxf.*cannot write"):
         save_dxf(a_map([]), tmp_path / "no" / "map.dxf")

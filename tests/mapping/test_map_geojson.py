@@ -50,6 +50,7 @@ def same(one, two):
     )
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 9), points=st.integers(0, 9))
 def test_saving_and_loading_gives_the_same_map(seed, count, points, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.geojson"

@@ -377,6 +377,7 @@ def test_scan_by_scan_in_any_order_equals_all_at_once(office_map, rng):
     assert (again.point_kinds, again.point_scans) == (whole.point_kinds, whole.point_scans)
 
 
+@pytest.mark.slow
 def test_walls_do_not_extend_across_a_doorway():
     """A wall with a doorway, through which another wall was observed."""
     walls = [[[-2, 1.2], [-0.4, 1.2]], [[0.5, 1.2], [2, 1.2]], [[-1, 1.9], [1, 1.9]], [[-2, -1], [2, -1]]]

@@ -163,6 +163,7 @@ def test_every_segment_lies_on_its_wall(seed):
 # --- laws ---
 
 
+@pytest.mark.slow
 @SOME
 @given(SEEDS)
 def test_order_does_not_matter(seed):

@@ -99,6 +99,7 @@ def test_ellipses_contain_the_stated_fraction(rng):
     np.testing.assert_allclose(np.mean(((own / halves[0]) ** 2).sum(axis=1) <= 1), ELLIPSE_PROBABILITY, atol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.0, np.pi / 2])
 def test_everything_is_inside_the_figure(turn):
     """Including the legend of a narrow plan."""
@@ -119,6 +120,7 @@ def test_everything_is_inside_the_figure(turn):
     assert legend.y1 <= axes.y0, "outside of the data"
 
 
+@pytest.mark.slow
 def test_the_suffix_selects_the_format(tmp_path):
     figure = slam_figure(world(), out_and_back())
     for suffix in ("svg", "png"):

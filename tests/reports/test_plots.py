@@ -167,6 +167,7 @@ def test_every_figure_function_is_tested():
     assert drawing == {f"{name.split()[0]}_figure" for name in DRAW if name != "last sensor fires"}
 
 
+@pytest.mark.slow
 def test_drawing_does_not_change_the_global_style():
     """A program that draws its own figures keeps its own style."""
     import matplotlib
@@ -371,6 +372,7 @@ def test_a_failed_write_keeps_the_old_figure(tmp_path):
 # Arcs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ring", [Ring.circular(), BUMPER, Ring.circular(count=8, beam=2.0, neighbors=2)])
 def test_arc_points_lie_at_the_path_length(ring, rng):
     """The path transmitter - point - receiver has twice the range, for every point of the arc."""

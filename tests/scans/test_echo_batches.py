@@ -29,6 +29,7 @@ def some_ranges(count, *, slots=2):
     return ranges.astype(np.float32)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(0, 10_000), st.integers(0, 400), st.sampled_from([FAST_SCANS, SLOW_SCANS]), st.booleans())
 def test_batches_contain_every_echo_of_every_scan_once(seed, scans, policy, cut):

@@ -104,6 +104,7 @@ def test_a_raw_recording_contains_all_bytes_and_both_clocks(tmp_path):
         assert sorted(times) == [message.time_us * 1000 for message in sent]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0, 4])
 def test_a_raw_recording_is_replayed_with_its_timing(speed, tmp_path):
     path = tmp_path / "raw.mcap"
@@ -302,6 +303,7 @@ def test_a_stopped_reader_has_written_everything(tmp_path):
     assert queue.get(0.0)[0].scan == len(log) - 16
 
 
+@pytest.mark.slow
 def test_a_waiting_reader_drops_nothing_and_stops_after_the_requested_scans():
     queue: DropOldestQueue[RawScan] = DropOldestQueue(4)
     reader = ReaderThread(Given(encode(m) for m in messages(300)), queue, block_when_full=True, scans=200)

@@ -186,6 +186,7 @@ def kept_of(readings, poses=None, ring=FOUR):
     return list(zip(flat.scan[fresh].tolist(), flat.path[fresh].tolist(), flat.reported[fresh].tolist(), strict=True))
 
 
+@pytest.mark.slow
 @given(st.integers(1, 12), st.integers(1, 12))
 def test_every_second_repeated_reading_is_fresh_and_a_gap_restarts_the_count(times, again):
     here, other = (0, 0, 1.0), (1, 1, 1.0)

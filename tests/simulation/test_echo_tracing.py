@@ -173,6 +173,7 @@ def test_traced_echoes_agree_with_a_slow_oracle(seed):
     assert_as_oracle(room, places(rng, room, 4), places(rng, room, 4))
 
 
+@pytest.mark.slow
 def test_junctions_within_walls_agree_with_the_oracle(rng):
     hall = loop([[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]])
     stub = [[0.5, -1.5], [0.5, -0.7]]  # T with the hall

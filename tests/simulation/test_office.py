@@ -117,6 +117,7 @@ def test_the_room_is_closed_and_not_aligned_with_the_ring(office):
         assert min(turn, 15 - turn) > 1
 
 
+@pytest.mark.slow
 def test_the_chair_is_detected_at_later_poses_only(office, noisy):
     """For every seed: no line at the first pose, and a line at one or more later poses."""
     chair = chair_of(office)
@@ -129,6 +130,7 @@ def test_the_chair_is_detected_at_later_poses_only(office, noisy):
         assert any(seen[1:])
 
 
+@pytest.mark.slow
 def test_three_walls_at_the_first_pose_with_deviations_as_in_the_paper(office, noisy):
     """For 8 of 10 seeds exactly the three walls have lines, within the paper's deviations."""
     good = 0
@@ -146,6 +148,7 @@ def test_three_walls_at_the_first_pose_with_deviations_as_in_the_paper(office, n
     assert good >= 8
 
 
+@pytest.mark.slow
 def test_most_clearly_visible_walls_are_detected(office, noisy):
     for heard, models in noisy:
         result = line_accuracy(office.ring, models, heard, office.room, office.poses, sigma=SIGMA)
@@ -156,6 +159,7 @@ def test_most_clearly_visible_walls_are_detected(office, noisy):
         assert np.sqrt(np.mean(result.theta_error**2)) < PAPER_THETA
 
 
+@pytest.mark.slow
 def test_segments_of_true_walls_lie_on_them(office, noisy):
     """The middle of each segment of the back wall is near that wall in the world frame."""
     wall = office.room.walls[office.room.wall_names.index("back wall")]

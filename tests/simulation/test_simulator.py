@@ -82,6 +82,7 @@ def test_echoes_are_invariant_under_a_common_motion_of_world_and_robot(seed, ang
     assert np.allclose(causes(here), causes(there), atol=1e-6)
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(seed=seeds)
 def test_a_mirrored_world_gives_mirrored_echoes(seed):
@@ -164,6 +165,7 @@ def test_echoes_below_the_threshold_are_not_detected(rng):
     assert 0 < len(loud.range) < len(everything.range)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("blanking", "max_echoes"), [(0.0, 2), (0.03, 1), (0.03, 3), (0.3, 9)])
 def test_blanking_and_the_number_of_echoes(rng, blanking, max_echoes):
     room = random_room(rng, box=1.0, segment=1.0, pole=1.0)
