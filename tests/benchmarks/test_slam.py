@@ -89,6 +89,7 @@ def test_loops_return_to_their_start():
         assert 35 < scene.distance_traveled < 125
 
 
+@pytest.mark.slow
 def test_walls_are_in_range_and_a_seed_determines_the_scene():
     scene, again = scene_of("loop 3"), loop(3)
     np.testing.assert_array_equal(scene.poses, again.poses)

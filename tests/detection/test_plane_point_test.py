@@ -90,6 +90,7 @@ def test_poles_are_not_reported_as_walls(poles, seed):
     assert all(model.empty for _, model in windows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("middle", [3.0, 4.3])
 def test_a_door_splits_a_wall(middle, seed):

@@ -326,6 +326,7 @@ def test_clearance_is_checked():
         random_pose(np.random.default_rng(0), Room(loop(SQUARE)), clearance=-1.0)
 
 
+@pytest.mark.slow
 def test_rooms_and_tracing_do_not_import_jax():
     code = "import sys, jaxsonar.floor_plans.room, jaxsonar.simulation.echo_tracing; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

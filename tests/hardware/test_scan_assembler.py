@@ -154,6 +154,7 @@ def test_numbers_and_clock_continue_after_a_restart(run, poses):
         assert 29.5 < stamps[run] - stamps[run - 1] < 30.5, "the gap is in the record"
 
 
+@pytest.mark.slow
 def test_scan_numbers_continue_after_a_restart_of_the_scan_counter():
     sent = device(300)
     for message in sent[200 * 16 :]:

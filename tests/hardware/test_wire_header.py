@@ -137,12 +137,14 @@ def test_c_and_python_encode_the_same_bytes(device, rng):
     assert frames == [protocol.encode(message) for message in [*groups, *poses]]
 
 
+@pytest.mark.slow
 def test_c_decodes_frames_of_python(device, rng):
     records = [bytes(rng.integers(0, top, size, dtype=np.uint8)) for top in (2, 255) for size in range(16, 600, 7)]
     records += [bytes([1]) * size for size in range(245, 260)] + [bytes([1]) * size + b"\0" for size in range(245, 260)]
     assert device([decode_command(protocol.encode_frame(record)[:-1]) for record in records]) == records
 
 
+@pytest.mark.slow
 def test_c_rejects_damaged_frames(device, rng):
     whole = protocol.encode(some_group(rng, 30))[:-1]
     bad = []
@@ -153,6 +155,7 @@ def test_c_rejects_damaged_frames(device, rng):
     assert device([decode_command(frame) for frame in [*bad, b"\xff", b"\1", b"\2\0"]]) == [b""] * 403
 
 
+@pytest.mark.slow
 def test_a_small_buffer_gives_no_frame(device, rng):
     """Every size up to the needed one; the program exits with 7 if it writes beyond the buffer."""
     group, pose = some_group(rng, 3), Pose(1, 2, 3.0, 4.0, 5.0)
@@ -171,6 +174,7 @@ def test_the_documented_frame_size_suffices(rng):
         assert len(protocol.encode(some_group(rng, count))) <= worst <= payload + payload // 254 + 2
 
 
+@pytest.mark.slow
 def test_too_many_echoes_give_no_frame(device, rng):
     command = group_command(some_group(rng, 4097))
     assert device([command])[0] == b""

@@ -43,6 +43,7 @@ def test_the_residuals_of_the_true_unknowns_are_the_noise(rng):
     assert np.std(residual) == pytest.approx(SIGMA, rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_residuals_are_reported_minus_predicted_ranges(rng):
     """Echo by echo, through the kernels of one path."""
     problem, _, true = problem_with_truth(rng)
@@ -87,6 +88,7 @@ def test_forward_reverse_and_numerical_derivatives_agree(rng):
     np.testing.assert_allclose(reverse, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odometry_scale", [False, True])
 def test_linearize_yields_the_blocks_of_the_dense_jacobian(rng, odometry_scale):
     problem, _, true = problem_with_truth(rng, odometry_scale=odometry_scale)

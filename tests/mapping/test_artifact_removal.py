@@ -93,6 +93,7 @@ def test_lines_of_a_corner_are_removed_and_its_walls_stay(seed):
     assert echoes_of(cleaned(walls)) == [100, 101]
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(st.integers(0, 10_000))
 def test_lines_of_a_pole_are_removed(seed):

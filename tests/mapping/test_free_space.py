@@ -318,6 +318,7 @@ def test_true_walls_are_never_free(faw_ring, seed):
     assert checked > 20
 
 
+@pytest.mark.slow
 def test_walls_of_the_office_are_never_free():
     """The evidence of the whole log has no free space where some scan sees a true wall."""
     office = load_office()

@@ -236,6 +236,7 @@ def test_gaps_up_to_the_limit_are_closed(gap, theta):
     assert two(1.01 * gap) == 2
 
 
+@pytest.mark.slow
 @SOME
 @given(SEEDS, st.sampled_from([(0.10, 2), (0.02, 1)]))
 def test_parallel_walls(seed, apart):

@@ -162,6 +162,7 @@ def test_fusion_is_the_least_squares_line(seed, count):
     assert abs(information[0, 1]) < 1e-3 * math.sqrt(information[0, 0] * information[1, 1])
 
 
+@pytest.mark.slow
 @SOME
 @given(SEEDS, st.integers(2, 15))
 def test_fusion_of_fusions_equals_fusion_of_all(seed, count):
@@ -179,6 +180,7 @@ def test_order_does_not_matter(seed, count):
     near(segments.take(order).fuse(group[order]), segments.fuse(group), 1e-9)
 
 
+@pytest.mark.slow
 @SOME
 @given(SEEDS, st.integers(2, 9), st.tuples(*[st.floats(-1e4, 1e4)] * 2, st.floats(-4, 4)))
 def test_fusion_is_equivariant_under_rigid_motions(seed, count, pose):
@@ -206,6 +208,7 @@ def test_a_group_with_one_member_is_unchanged(seed, count):
     assert same(segments.fuse(np.arange(count + 3)), segments)
 
 
+@pytest.mark.slow
 @SOME
 @given(SEEDS, st.integers(2, 9))
 def test_the_side_of_observation_does_not_change_the_line(seed, count):

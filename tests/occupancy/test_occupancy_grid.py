@@ -95,6 +95,7 @@ def shuffled(log, order):
     return Log.from_echoes(scan, **columns, **numbers)
 
 
+@pytest.mark.slow
 def test_parts_add_up_to_the_whole_in_any_order(office, heard, office_grid, rng):
     walls = office.room.walls
     first, second = (occupancy(office.ring, part, walls=walls) for part in (heard[:6], heard[6:]))
@@ -113,6 +114,7 @@ def test_scan_by_scan_equals_all_at_once(office, heard, office_grid):
     assert grid.scans == len(heard)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 def test_the_grid_is_equivariant_under_quarter_turns(office, heard, known):
     walls = office.room.walls if known else NO_WALLS

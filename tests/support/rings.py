@@ -5,7 +5,7 @@ import numpy as np
 from jaxsonar import Ring
 
 
-def bumper_ring(beam_deg=70.0, *, calibrated=True, **more):
+def bumper_ring(beam_deg: float | list[float] = 70.0, *, calibrated=True, **more):
     """Four sensors at the front of a robot, all of which hear each other.
 
     With ``calibrated`` they have range offsets and a speed of sound other than the reference.
