@@ -68,11 +68,6 @@ class Features(NamedTuple):
         return np.stack([self._on_wall(self.extent[:, 0]), self._on_wall(self.extent[:, 1])], axis=1)
 
     @property
-    def wall_sd(self) -> Float[np.ndarray, "walls 2"]:
-        """Standard deviations of (offset at the reference, theta), metres and radians."""
-        return np.sqrt(self.covariance[:, [0, 1], [0, 1]])
-
-    @property
     def radius(self) -> float:
         """Distance of the farthest feature from the origin, metres."""
         ends = np.concatenate([self.segment.reshape(-1, 2), self.point])
