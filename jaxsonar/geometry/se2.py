@@ -184,3 +184,29 @@ def relative_covariance(
     mixed = by_a @ cross @ by_b.swapaxes(-1, -2)
     cov = by_a @ cov_a @ by_a.swapaxes(-1, -2) + by_b @ cov_b @ by_b.swapaxes(-1, -2)
     return cov + mixed + mixed.swapaxes(-1, -2)
+
+
+def interpolate(
+    start: Float[np.ndarray, "*batch 3"], end: Float[np.ndarray, "*batch 3"], fraction: Float[np.ndarray, "*batch"]
+) -> Float[np.ndarray, "*batch 3"]:
+    """Poses between two poses by motion with constant velocity and turn rate (a geodesic of SE(2)).
+
+    Args:
+        start: poses x, y (m), theta (rad) at fraction 0.
+        end: poses at fraction 1; the turn is the shorter one.
+        fraction: any real number; below 0 and above 1 the motion is extrapolated.
+    """
+    x, y, turn = np.moveaxis(relative(start, end), -1, 0)
+    # The twist that leads from start to end in unit time: (x, y) = V(turn) velocity.
+    sine, versine = _arc_factors(turn)
+    scale = sine**2 + versine**2
+    velocity_x, velocity_y = (sine * x + versine * y) / scale, (sine * y - versine * x) / scale
+    sine, versine = _arc_factors(fraction * turn)
+    step_x, step_y = sine * velocity_x - versine * velocity_y, versine * velocity_x + sine * velocity_y
+    return compose(start, np.stack([fraction * step_x, fraction * step_y, fraction * turn], axis=-1))
+
+
+def _arc_factors(turn: Float[np.ndarray, "*batch"]) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+    """sin(turn) / turn and (1 - cos(turn)) / turn, continuous at 0."""
+    # (1 - cos a) / a = sinc(a / 2)^2 a / 2, which does not cancel.
+    return np.sinc(turn / np.pi), np.sinc(turn / (2 * np.pi)) ** 2 * turn / 2

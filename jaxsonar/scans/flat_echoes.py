@@ -1,9 +1,11 @@
 """Echoes of scans as flat columns, addressed by the echo paths of a ring."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.scans.firing_poses import path_poses
+from jaxsonar.scans.measured_paths import is_repeated, measured_paths
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -20,6 +22,8 @@ class FlatEchoes:
         *,
         pose: Float[np.ndarray, "echoes 3"] | None = None,
         scans_per_window: Float[np.ndarray, " scans"] | None = None,
+        measured: Bool[np.ndarray, "scans paths"] | None = None,
+        path_pose: Float[np.ndarray, "scans paths 3"] | None = None,
     ):
         """Store columns that are sorted by scan.
 
@@ -31,7 +35,10 @@ class FlatEchoes:
             pose: model_from_robot when each echo was received: x, y (m), theta (rad). All echoes share one pose if
                 omitted.
             scans_per_window: effective number of scans that were gathered into each of these scans; 1 if omitted.
+            measured: paths that each scan measured, whether or not they heard anything; all of them if omitted.
+            path_pose: scan_from_robot when each path was measured; all at the pose of the scan if omitted.
         """
+        self.measured, self.path_pose = measured, path_pose
         self.scan_count, self.scan, self.path, self.reported = scan_count, scan, path, reported
         self.pose, self.scans_per_window = pose, scans_per_window
         self.start = np.searchsorted(scan, np.arange(scan_count + 1))
@@ -65,6 +72,9 @@ class FlatEchoes:
     def from_log(cls, ring: Ring, log: Log) -> tuple["FlatEchoes", int]:
         """Echoes of a log on the ring's paths, and the number of echoes on other (tx, rx) pairs, which are omitted.
 
+        Repeated old readings (``is_repeated``) are omitted, too. ``measured`` is None if every scan measured all paths,
+        ``path_pose`` is None if every reading belongs to the pose of its scan.
+
         Raises:
             SonarError: the log contains a sensor index that the ring does not have.
         """
@@ -76,8 +86,18 @@ class FlatEchoes:
                 f"{ring.count - 1}, the sensors of {ring.name!r}"
             )
         path = ring.path_index[log.tx, log.rx]
-        is_path = path >= 0
-        return cls(len(log), log.echo_scan[is_path], path[is_path], log.range[is_path]), int((~is_path).sum())
+        heard = np.isfinite(log.range)
+        used = (path >= 0) & heard & ~is_repeated(log)
+        measured = measured_paths(ring, log)
+        flat = cls(
+            len(log),
+            log.echo_scan[used],
+            path[used],
+            log.range[used],
+            measured=None if measured.all() else measured,
+            path_pose=path_poses(ring, log),
+        )
+        return flat, int((heard & (path < 0)).sum())
 
 
 def corrected_echoes(ring: Ring, scan: Scan) -> tuple[Int[np.ndarray, " echoes"], Float[np.ndarray, " echoes"]]:

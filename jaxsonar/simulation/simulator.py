@@ -47,9 +47,13 @@ class Simulation:
     """Seconds, one for every pose."""
 
     def as_log(self, ring: Ring, poses: Float[np.ndarray, "scans 3"]) -> Log:
-        """A scan log of these echoes, with the given poses (x, y, theta; metres, radians) as odometry."""
+        """A scan log of these echoes, with the given poses (x, y, theta; metres, radians) as odometry.
+
+        Every scan measured all paths of the ring.
+        """
         tx, rx = ring.paths[self.path].T
-        return Log.from_echoes(self.scan, tx, rx, self.range, amplitude=self.amplitude, stamp=self.stamps, pose=poses)
+        echoes = {"amplitude": self.amplitude, "stamp": self.stamps, "pose": poses}
+        return Log.from_echoes(self.scan, tx, rx, self.range, **echoes, asked=ring.paths)
 
     def dense(self, paths: int, echoes: int) -> Float[np.ndarray, "scans paths echoes"]:
         """Ranges as an argument of ``extract_lines``: (scans, paths, echoes), nearest first, NaN = no echo.

@@ -1,0 +1,141 @@
+"""Poses of the robot at the time of each reading, and the grouping of single firings into scans."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsonar.geometry.se2 import compose, interpolate, relative
+from jaxsonar.scans.measured_paths import measurement_times
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.ring import Ring
+
+
+@dataclass(frozen=True)
+class FiringSettings:
+    """Constants of the poses of firings. Chosen by hand."""
+
+    max_extrapolation: float = 1.0
+    """Largest extrapolation of the motion beyond the first and the last known pose, in intervals between poses."""
+    max_scan_duration: float = 2.0
+    """Longest time between the first and the last firing of a scan that is grouped from single firings, seconds."""
+
+
+SETTINGS = FiringSettings()
+
+
+def reading_motion(log: Log) -> Float[np.ndarray, "readings 3"] | None:
+    """scan_from_robot of each reading: x, y (m), theta (rad) of the robot when the reading was measured.
+
+    The motion between the stamp of the scan and the time of measurement, stamp + t - age, is interpolated in the
+    odometry of the log (``Log.odometry``) or, without it, in the poses of its scans. Readings of scans without stamp or
+    pose, and all readings if fewer than two poses are known, belong to the pose of their scan.
+
+    Returns:
+        The poses; None if every reading belongs to the pose of its scan.
+    """
+    time, pose = _known_poses(log)
+    if not (log.t.any() or log.age.any()) or len(time) < 2:
+        return None
+    scan = log.echo_scan
+    moves = np.isfinite(log.stamp) & np.isfinite(log.pose).all(axis=1)
+    rows = np.flatnonzero(moves[scan] & ((log.t != 0) | (log.age != 0)))
+    motion = np.zeros((len(scan), 3))
+    at_stamp = _pose_at(time, pose, log.stamp[scan[rows]])
+    motion[rows] = relative(at_stamp, _pose_at(time, pose, measurement_times(log)[rows]))
+    return motion if motion.any() else None
+
+
+def reading_poses(log: Log) -> Float[np.ndarray, "readings 3"]:
+    """world_from_robot when each reading was measured: x, y (m), theta (rad); NaN for scans without a pose."""
+    pose, motion = log.pose[log.echo_scan], reading_motion(log)
+    return pose if motion is None else compose(pose, motion)
+
+
+def path_poses(ring: Ring, log: Log) -> Float[np.ndarray, "scans paths 3"] | None:
+    """scan_from_robot of each path of each scan, as ``reading_motion``; zero for paths without a reading.
+
+    Returns:
+        The poses; None if every reading belongs to the pose of its scan.
+    """
+    motion = reading_motion(log)
+    if motion is None:
+        return None
+    known = (log.tx < ring.count) & (log.rx < ring.count)
+    path = np.full(len(log.tx), -1)
+    path[known] = ring.path_index[log.tx[known], log.rx[known]]
+    known = path >= 0
+    poses = np.zeros((len(log), len(ring.paths), 3))
+    poses[log.echo_scan[known], path[known]] = motion[known]
+    return poses
+
+
+def group_firings(log: Log) -> Log:
+    """Merge firings that are scans of their own into scans in which every transmitter fires once.
+
+    A log whose scans hold several transmitters is returned unchanged. A new scan begins with the second firing of a
+    transmitter, where stamps or poses are missing, and after ``FiringSettings.max_scan_duration``. A scan has the
+    number, stamp and pose of its first firing; ``t`` tells when the others fired, and ``odometry`` keeps all poses.
+    """
+    if len(log) < 2 or len(log.asked):
+        return log
+    counts = np.diff(log.start)
+    scan = log.echo_scan
+    one_transmitter = np.minimum.reduceat(log.tx, log.start[:-1][counts > 0]) if len(log.tx) else log.tx
+    if not (one_transmitter[np.cumsum(counts > 0)[scan] - 1] == log.tx).all() or len(np.unique(one_transmitter)) < 2:
+        return log
+    transmitter = np.full(len(log), -1)
+    transmitter[counts > 0] = one_transmitter
+    group = _groups_of_firings(log, transmitter)
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    t = log.t + np.where(np.isnan(log.stamp), 0, log.stamp - log.stamp[first[group]])[scan]
+    known = np.isfinite(log.stamp) & np.isfinite(log.pose).all(axis=1)
+    odometry = np.column_stack([log.stamp, log.pose])[known]
+    return replace(
+        log,
+        scan=log.scan[first],
+        stamp=log.stamp[first],
+        pose=log.pose[first],
+        start=np.append(log.start[first], len(log.tx)),
+        t=t,
+        odometry=odometry if log.odometry is None else log.odometry,
+    )
+
+
+def _groups_of_firings(log: Log, transmitter: Int[np.ndarray, " scans"]) -> Int[np.ndarray, " scans"]:
+    """Number of the merged scan of each firing; firings without a reading (-1) join the scan before them."""
+    has_pose = np.isfinite(log.pose).all(axis=1)
+    known = np.isfinite(log.stamp)
+    group = np.zeros(len(log), np.int64)
+    fired: set[int] = set()
+    first = current = 0
+    for row, tx in enumerate(transmitter.tolist()):
+        late = log.stamp[row] - log.stamp[first]
+        joins = tx not in fired and known[row] and known[first] and has_pose[row] == has_pose[first]
+        if row and not (joins and 0 <= late <= SETTINGS.max_scan_duration):
+            current, first, fired = current + 1, row, set()
+        if tx >= 0:
+            fired.add(tx)
+        group[row] = current
+    return group
+
+
+def _known_poses(log: Log) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 3"]]:
+    """Times, ascending, and poses between which motion is interpolated."""
+    if log.odometry is not None:
+        time, pose = log.odometry[:, 0], log.odometry[:, 1:]
+    else:
+        time, pose = log.stamp, log.pose
+    known = np.isfinite(time) & np.isfinite(pose).all(axis=1)
+    time, first = np.unique(time[known], return_index=True)
+    return time, pose[known][first]
+
+
+def _pose_at(
+    time: Float[np.ndarray, " samples"], pose: Float[np.ndarray, "samples 3"], at: Float[np.ndarray, " times"]
+) -> Float[np.ndarray, "times 3"]:
+    """Poses at some times, interpolated; slightly beyond the first and the last one extrapolated."""
+    before = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(time) - 2)
+    fraction = (at - time[before]) / (time[before + 1] - time[before])
+    fraction = np.clip(fraction, -SETTINGS.max_extrapolation, 1 + SETTINGS.max_extrapolation)
+    return interpolate(pose[before], pose[before + 1], fraction)

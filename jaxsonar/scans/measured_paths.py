@@ -1,0 +1,146 @@
+"""What a scan measured: the paths that fired and were listened to, whether or not they heard anything.
+
+Only a path that was measured can be silent. A path without a measurement is no evidence at all.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.ring import Ring
+
+
+@dataclass(frozen=True)
+class ReadingAgeSettings:
+    """Constants for readings that were not renewed. Chosen by hand."""
+
+    same_measurement: float = 2e-3
+    """Readings of one path with equal ranges whose times of measurement differ by less are one measurement, seconds. It
+    exceeds the rounding of printed stamps and ages, and is shorter than the time between two firings of a sensor."""
+
+
+SETTINGS = ReadingAgeSettings()
+
+
+def measured_paths(ring: Ring, log: Log) -> Bool[np.ndarray, "scans paths"]:
+    """Which paths of a ring each scan of a log measured.
+
+    These are the paths with a reading in the scan, and those that every scan measured (``Log.asked``). A path that only
+    has a repeated old reading (``is_repeated``) was not measured. The result may be a read-only broadcast array.
+
+    Args:
+        ring: the sensors; sensors and pairs that it does not have are ignored.
+        log: the scans.
+    """
+    always = np.zeros(len(ring.paths), bool)
+    always[_path_rows(ring, *log.asked.T)] = True
+    repeated = is_repeated(log)
+    if always.all() and not repeated.any():
+        return np.broadcast_to(always, (len(log), len(always)))
+    path = _path_rows(ring, log.tx, log.rx, keep=True)
+    known = path >= 0
+    if always[path[known]].all() and not repeated.any():
+        return np.broadcast_to(always, (len(log), len(always)))
+    measured = np.tile(always, (len(log), 1))
+    scan = log.echo_scan
+    old = known & repeated
+    measured[scan[old], path[old]] = False
+    new = known & ~repeated
+    measured[scan[new], path[new]] = True
+    return measured
+
+
+def is_repeated(log: Log) -> Bool[np.ndarray, " readings"]:
+    """Readings that were not renewed and whose original the log also holds, in an earlier scan.
+
+    An unrenewed reading is evidence for the pose at which it was measured, once. If the log does not hold the original,
+    the first repetition stands for it.
+    """
+    repeated = np.zeros(len(log.tx), bool)
+    if not log.age.any():
+        return repeated
+    measured_at = measurement_times(log)
+    # One group for each path and range (silent readings have a group of their own), sorted by time of measurement.
+    reported = np.where(np.isnan(log.range), -1.0, log.range)
+    order = np.lexsort((log.echo_scan, measured_at, reported, log.rx, log.tx))
+    same = np.ones(max(len(order) - 1, 0), bool)
+    for column in (log.tx, log.rx, reported):
+        same &= column[order[1:]] == column[order[:-1]]
+    later_scan = np.diff(log.echo_scan[order]) != 0
+    same &= later_scan & (np.diff(measured_at[order]) < SETTINGS.same_measurement)
+    repeated[order[1:]] = same & (log.age[order[1:]] > 0)
+    return repeated
+
+
+def measurement_times(log: Log) -> Float[np.ndarray, " readings"]:
+    """When each reading was measured: stamp + t - age, seconds. A scan without a stamp has its number as stamp."""
+    stamp = np.where(np.isnan(log.stamp), log.scan, log.stamp)
+    return stamp[log.echo_scan] + log.t - log.age
+
+
+def unique_readings(log: Log) -> Log:
+    """The log without readings that were not renewed and whose original it also holds; it is unchanged without ages.
+
+    The paths of removed readings count as not measured. Therefore the result is explicit: it holds a row without a
+    range for every other path that a scan measured and that heard nothing.
+    """
+    repeated = is_repeated(log)
+    if not repeated.any():
+        return log
+    scan, tx, rx = log.echo_scan, log.tx, log.rx
+    columns = {name: getattr(log, name)[~repeated] for name in ("tx", "rx", "range", "amplitude", "t", "age")}
+    rows = scan[~repeated]
+    if len(log.asked):
+        # Of the pairs that every scan measured, those without any reading were silent.
+        code = _pair_codes(scan, tx, rx)
+        asked_scan = np.repeat(np.arange(len(log)), len(log.asked))
+        asked_tx, asked_rx = np.tile(log.asked, (len(log), 1)).T
+        silent = ~np.isin(_pair_codes(asked_scan, asked_tx, asked_rx), code)
+        nothing = np.full(int(silent.sum()), np.nan)
+        added = {"tx": asked_tx[silent], "rx": asked_rx[silent], "range": nothing, "amplitude": nothing}
+        added |= {"t": np.zeros(len(nothing)), "age": np.zeros(len(nothing))}
+        columns = {name: np.concatenate([column, added[name]]) for name, column in columns.items()}
+        rows = np.concatenate([rows, asked_scan[silent]])
+        order = np.argsort(rows, kind="stable")
+        rows, columns = rows[order], {name: column[order] for name, column in columns.items()}
+    start = np.searchsorted(rows, np.arange(len(log) + 1))
+    return replace(log, start=start, **columns, asked=np.zeros((0, 2), np.int64))
+
+
+def full_wall_paths(
+    ring: Ring, counts: Float[np.ndarray, "rows paths"], *, directions: int = 360
+) -> Float[np.ndarray, " rows"]:
+    """Number of measurements that receive a wide wall: the mean over all directions in which any of them receives it.
+
+    For one measurement of every path it equals ``kernels.full_wall_paths``.
+
+    Args:
+        ring: the sensors.
+        counts: number of measurements of each path, in the scan or window of each row.
+        directions: number of directions of the mean.
+    """
+    geometry = ring.exact_paths
+    angle = (np.arange(directions) + 0.5) * (2 * np.pi / directions)
+    received = np.mod(angle[:, None] - geometry.start, 2 * np.pi) < geometry.width
+    covered = ((counts > 0).astype(np.float64) @ received.T > 0).mean(axis=1)
+    return counts @ geometry.width / (2 * np.pi * np.maximum(covered, 1 / directions))
+
+
+def _path_rows(
+    ring: Ring, tx: Int[np.ndarray, " pairs"], rx: Int[np.ndarray, " pairs"], *, keep: bool = False
+) -> Int[np.ndarray, " rows"]:
+    """Rows of ``Ring.paths``; pairs that are no paths of the ring are omitted, or -1 with ``keep``."""
+    known = (tx < ring.count) & (rx < ring.count)
+    path = np.full(len(tx), -1)
+    path[known] = ring.path_index[tx[known], rx[known]]
+    return path if keep else path[path >= 0]
+
+
+def _pair_codes(
+    scan: Int[np.ndarray, " rows"], tx: Int[np.ndarray, " rows"], rx: Int[np.ndarray, " rows"]
+) -> Int[np.ndarray, " rows"]:
+    """One number for each scan and pair of sensors."""
+    sensors = int(max(tx.max(initial=0), rx.max(initial=0))) + 1
+    return (scan * sensors + tx) * sensors + rx
