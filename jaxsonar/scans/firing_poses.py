@@ -104,8 +104,7 @@ def group_firings(log: Log) -> Log:
 
 def _groups_of_firings(log: Log, transmitter: Int[np.ndarray, " scans"]) -> Int[np.ndarray, " scans"]:
     """Number of the merged scan of each firing; firings without a reading (-1) join the scan before them."""
-    has_pose = np.isfinite(log.pose).all(axis=1)
-    known = np.isfinite(log.stamp)
+    has_pose, known = np.isfinite(log.pose).all(axis=1).tolist(), np.isfinite(log.stamp).tolist()
     group = np.zeros(len(log), np.int64)
     fired: set[int] = set()
     first = current = 0
