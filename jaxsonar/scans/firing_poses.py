@@ -104,7 +104,8 @@ def group_firings(log: Log) -> Log:
 
 def _groups_of_firings(log: Log, transmitter: Int[np.ndarray, " scans"]) -> Int[np.ndarray, " scans"]:
     """Number of the merged scan of each firing; firings without a reading (-1) join the scan before them."""
-    has_pose, known = np.isfinite(log.pose).all(axis=1).tolist(), np.isfinite(log.stamp).tolist()
+    has_pose: list[bool] = np.isfinite(log.pose).all(axis=1).tolist()
+    known: list[bool] = np.isfinite(log.stamp).tolist()
     group = np.zeros(len(log), np.int64)
     fired: set[int] = set()
     first = current = 0

@@ -31,6 +31,7 @@ LAYERS = (
     ("geometry", "fileio"),
     ("sensors", "floor_plans"),
     ("scans",),
+    ("recordings",),
     ("simulation", "detection"),
     ("occupancy", "mapping", "registration", "batch_jobs"),
     ("diagnostics", "estimation"),

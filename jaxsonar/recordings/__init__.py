@@ -1,0 +1,1 @@
+"""Recordings: readers of any robot's files."""
