@@ -104,15 +104,14 @@ def group_firings(log: Log) -> Log:
 
 def _groups_of_firings(log: Log, transmitter: Int[np.ndarray, " scans"]) -> Int[np.ndarray, " scans"]:
     """Number of the merged scan of each firing; firings without a reading (-1) join the scan before them."""
-    has_pose: list[bool] = np.isfinite(log.pose).all(axis=1).tolist()
-    known: list[bool] = np.isfinite(log.stamp).tolist()
+    has_pose = np.all(np.isfinite(log.pose), axis=1)
     group = np.zeros(len(log), np.int64)
     fired: set[int] = set()
     first = current = 0
     for row, tx in enumerate(transmitter.tolist()):
-        late = log.stamp[row] - log.stamp[first]
-        joins = tx not in fired and known[row] and known[first] and has_pose[row] == has_pose[first]
-        if row and not (joins and 0 <= late <= SETTINGS.max_scan_duration):
+        late = log.stamp[row] - log.stamp[first]  # NaN without stamps
+        joins = tx not in fired and has_pose[row] == has_pose[first] and 0 <= late <= SETTINGS.max_scan_duration
+        if row and not joins:
             current, first, fired = current + 1, row, set()
         if tx >= 0:
             fired.add(tx)

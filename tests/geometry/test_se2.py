@@ -9,6 +9,7 @@ from jaxsonar.geometry.se2 import (
     compose,
     compose_jacobians,
     compose_with_covariance,
+    interpolate,
     inverse,
     perpendicular,
     propagate,
@@ -163,3 +164,26 @@ def test_batches_of_poses_transform_like_single_poses(rng):
     single = [compose(pose, other) for pose, other in zip(poses, others, strict=True)]
     np.testing.assert_allclose(compose(poses, others), single, atol=1e-14)
     np.testing.assert_allclose(compose(poses, others[0]), [compose(pose, others[0]) for pose in poses], atol=1e-14)
+
+
+def interpolated(start, end, fraction):
+    (pose,) = interpolate(start[None], np.asarray(end)[None], np.array([fraction]))
+    return pose
+
+
+@given(start=poses, step=poses, fraction=st.floats(-1, 2))
+def test_interpolation_composes_along_the_geodesic(start, step, fraction):
+    step = step * np.array([1, 1, 0.4])  # turns of less than half a circle
+    end = compose(start, step)
+    assert_same_pose(interpolated(start, end, 0.0), start)
+    assert_same_pose(interpolated(start, end, 1.0), end)
+    # The second half of the way equals the first half.
+    half = interpolated(start, end, fraction / 2)
+    assert_same_pose(relative(start, half), relative(half, interpolated(start, end, fraction)))
+
+
+def test_interpolation_of_a_straight_drive_and_of_a_circle():
+    assert_same_pose(interpolated(IDENTITY, np.array([2.0, -1.0, 0.0]), 0.25), np.array([0.5, -0.25, 0.0]))
+    quarter = np.array([1.0, 1.0, np.pi / 2])  # of a circle with radius 1
+    expected = np.array([np.sin(np.pi / 6), 1 - np.cos(np.pi / 6), np.pi / 6])
+    assert_same_pose(interpolated(IDENTITY, quarter, 1 / 3), expected)
