@@ -1,17 +1,20 @@
-"""Reading and writing of scan logs; the suffix of the file determines the format."""
+"""Reading and writing of scan logs as CSV and Parquet."""
 
 import os
 
 from jaxsonar.hardware.recorder_base import recording_marker
 from jaxsonar.scans.scan_log import Log, log_format
 
+PARQUET_MAGIC = b"PAR1"
+"""First bytes of a Parquet file."""
 
-def load_log(filename: str | os.PathLike[str]) -> Log:
-    """Load a scan log from a ``.csv`` or ``.parquet`` file.
+
+def load_scan_log(filename: str | os.PathLike[str]) -> Log:
+    """Load a scan log in CSV or Parquet. Its content decides which, not its suffix.
 
     Args:
-        filename: the file; its suffix, in either case, determines the format. If a ``.recording`` file beside it shows
-            that the recording process was killed, all complete scans are loaded, with a warning if any is incomplete.
+        filename: the file. If a ``.recording`` file beside it shows that the recording process was killed, all complete
+            scans are loaded, with a warning if any is incomplete.
 
     Raises:
         SonarError: the file cannot be read or is invalid; the message names file, row, column and allowed values.
@@ -20,13 +23,16 @@ def load_log(filename: str | os.PathLike[str]) -> Log:
         from jaxsonar.scans.recording_journal import recover_recording
 
         return recover_recording(filename)
-    if log_format(filename) == "csv":
-        from jaxsonar.scans.csv_log import read_csv
+    if _is_parquet(filename):
+        from jaxsonar.scans.parquet_log import read_parquet
 
-        return read_csv(filename)
-    from jaxsonar.scans.parquet_log import read_parquet
+        return read_parquet(filename)
+    from jaxsonar.scans.csv_log import read_csv
 
-    return read_parquet(filename)
+    return read_csv(filename)
+
+
+load_log = load_scan_log  # until all callers use recordings.load_log
 
 
 def save_log(log: Log, filename: str | os.PathLike[str]) -> None:
@@ -48,3 +54,11 @@ def save_log(log: Log, filename: str | os.PathLike[str]) -> None:
         from jaxsonar.scans.parquet_log import write_parquet
 
         write_parquet(log, filename)
+
+
+def _is_parquet(filename: str | os.PathLike[str]) -> bool:
+    try:
+        with open(filename, "rb") as file:
+            return file.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
+    except (OSError, ValueError):
+        return log_format(filename) == "parquet"  # the reader reports the error

@@ -1,0 +1,163 @@
+"""What a file holds, recognized from its first bytes. The suffix of its name does not decide."""
+
+import os
+import re
+from pathlib import Path
+
+from jaxsonar.fileio.atomic_files import reason, shown
+from jaxsonar.hardware.errors import SonarError
+from jaxsonar.hardware.mcap_recorder import PROFILE
+from jaxsonar.scans.csv_log import COLUMNS
+
+HEAD = 1 << 16
+"""Bytes of a file that are examined."""
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+
+DESCRIPTIONS = {
+    "csv": "a scan log as CSV",
+    "parquet": "a Parquet file",
+    "record": "a raw recording (MCAP)",
+    "bag": "a ROS bag",
+    "beesoft": "a Beesoft log",
+    "player": "a Player log",
+    "table": "a table of numbers",
+    "corridor8": "a recording like corridor8",
+    "scitos24": "a recording like scitos24",
+}
+"""What ``file_content`` returns, in words."""
+
+SUFFIXES = {
+    ".csv": ("csv", "table", "scitos24"),
+    ".parquet": ("parquet",),
+    ".mcap": ("record", "bag"),
+    ".bag": ("bag",),
+    ".db3": ("bag",),
+}
+"""Contents that fit each suffix; any content fits another suffix."""
+
+_BINARY = {
+    b"\x89PNG": "a picture (PNG)",
+    b"\xff\xd8\xff": "a picture (JPEG)",
+    b"%PDF": "a PDF file",
+    b"PK\x03\x04": "a ZIP archive or a spreadsheet (XLSX)",
+    b"\xd0\xcf\x11\xe0": "a spreadsheet or document (Microsoft Office)",
+    b"\x1f\x8b": "a file compressed by gzip",
+    b"\x28\xb5\x2f\xfd": "a file compressed by Zstandard",
+    b"BZh": "a file compressed by bzip2",
+    b"\xfd7zXZ": "a file compressed by xz",
+    b"\x89HDF": "an HDF5 file",
+    b"\x93NUMPY": "a NumPy array",
+    b"RIFF": "a sound or video file (RIFF)",
+    b"MATLAB 5.0": "a MATLAB file",
+}
+"""First bytes of files that are no recordings."""
+
+
+def file_content(filename: str | os.PathLike[str]) -> str:
+    """What a file or folder holds: a key of ``DESCRIPTIONS``.
+
+    Raises:
+        SonarError: the file cannot be read, or it is no recording; the message names what it is.
+    """
+    try:
+        is_folder = os.path.isdir(filename)
+        entries = sorted(os.listdir(filename)) if is_folder else []
+        head = b"" if is_folder else _head(filename)
+    except (OSError, ValueError) as failure:  # ValueError: a NUL in the filename
+        raise SonarError(f"{shown(filename)}: {reason(failure)}; needed is a readable file with a recording") from None
+    if is_folder:
+        return _folder_content(filename, entries)
+    if head.startswith(b"PAR1"):
+        return "parquet"
+    if head.startswith(b"#ROSBAG V") or head.startswith(b"SQLite format 3\0"):
+        return "bag"
+    if head.startswith(MCAP_MAGIC):
+        # magic, opcode 1, length of the record (8 bytes), length of the profile (4 bytes), profile
+        profile = PROFILE.encode()
+        return "record" if head[21 : 21 + len(profile)] == profile else "bag"
+    for magic, what in _BINARY.items():
+        if head.startswith(magic):
+            raise _rejected(filename, what)
+    return _text_content(filename, head)
+
+
+def check_suffix(filename: str | os.PathLike[str], content: str) -> str | None:
+    """A note if the suffix of a file promises something else than the file holds; None if both agree."""
+    suffix = Path(filename).suffix.lower()
+    if suffix not in SUFFIXES or content in SUFFIXES[suffix]:
+        return None
+    return f"{shown(filename)}: this is {DESCRIPTIONS[content]}, not what {suffix} promises; it is read as what it is"
+
+
+def _head(filename: str | os.PathLike[str]) -> bytes:
+    with open(filename, "rb") as file:
+        return file.read(HEAD)
+
+
+def _folder_content(folder: str | os.PathLike[str], entries: list[str]) -> str:
+    """Content of a folder with these entries."""
+    if "metadata.yaml" in entries:
+        return "bag"
+    if "measurement.txt" in entries and "poses.txt" in entries:
+        return "corridor8"
+    if "sensor_readings_24.data" in entries:
+        return "scitos24"
+    bags = [name for name in entries if name.lower().endswith((".db3", ".mcap"))]
+    if bags:
+        came = f"a folder with {shown(bags[0], 40)} but without metadata.yaml came"
+        raise SonarError(f"{shown(folder)}: {came}; name the file itself, or add its metadata.yaml")
+    raise SonarError(f"{shown(folder)}: a folder came; allowed is a file, or the folder of a ROS 2 bag (metadata.yaml)")
+
+
+def _text_content(filename: str | os.PathLike[str], head: bytes) -> str:
+    """Content of a file that has no magic number."""
+    if not head:
+        raise _rejected(filename, "an empty file")
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise SonarError(f"{shown(filename)}: text in UTF-16 came; allowed is UTF-8: save the file as CSV in UTF-8")
+    text = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace")
+    if "\0" in text or text.count("\ufffd") > 0.01 * len(text) + 1:
+        raise _rejected(filename, "a binary file")
+    lines = [line.strip() for line in text.splitlines()]
+    first = next((line for line in lines if line), "")
+    if _is_log_header(first):
+        return "csv"
+    if re.search(r"^#(ROBOT|SONAR\s+\d+\s*:)", text, re.MULTILINE):
+        return "beesoft"
+    if re.search(r"^## *Player version", text, re.MULTILINE) or _is_player_line(lines):
+        return "player"
+    if re.match(r"S1,S2,.*,S24,OUTPUT$", first):
+        return "scitos24"
+    if first.startswith(("{", "[{")):
+        raise _rejected(filename, "a JSON file")
+    if first.startswith("<"):
+        raise _rejected(filename, "an XML or HTML file")
+    if re.match(r"\[\[?\w+\]\]?$|\w+ *= *\S", first):
+        raise _rejected(filename, "a TOML file (a ring or settings)")
+    if _is_number_table(lines):
+        return "table"
+    raise _rejected(filename, f"a text that begins with '{shown(first, 40)}'")
+
+
+def _is_log_header(line: str) -> bool:
+    """Whether a line resembles the header of a scan log; what is wrong with it, the CSV reader says."""
+    names = [name.strip(" \"'") for name in re.split(r"[,;\t]", line)]
+    return names[0] == "scan" or len(set(names) & set(COLUMNS)) >= 5
+
+
+def _is_player_line(lines: list[str]) -> bool:
+    """Whether any line is one of a Player log: time, host, robot, interface, index."""
+    pattern = r"\d+\.\d+ \d+ \d+ (sonar|position2d|position) \d+ "
+    return any(re.match(pattern, line) for line in lines[:200])
+
+
+def _is_number_table(lines: list[str]) -> bool:
+    """Whether most lines after the first are rows of numbers."""
+    rows = [line for line in lines[1:200] if line and not line.startswith("#")][:-1] or lines[:1]
+    numbers = [sum(bool(re.fullmatch(r"[-+\d.,eE]+", field)) for field in re.split(r"[,;\s]+", row)) for row in rows]
+    return bool(rows) and sum(count >= 2 for count in numbers) > 0.5 * len(rows)
+
+
+def _rejected(filename: str | os.PathLike[str], what: str) -> SonarError:
+    allowed = "a scan log (CSV, Parquet), a raw recording (MCAP), a ROS bag, or what --from names"
+    return SonarError(f"{shown(filename)}: this is {what}; allowed is {allowed}")
