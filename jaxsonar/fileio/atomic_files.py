@@ -149,12 +149,13 @@ def check_outputs(
 
     Args:
         outputs: option name ("--figure") and filename of each output; None: not requested.
-        inputs: input files; None and names of files that do not exist (a shipped ring) are ignored.
+        inputs: input files, and folders for the files in them; None and names of files that do not exist (a shipped
+            ring) are ignored.
 
     Raises:
         SonarError: an output that cannot be written, that is also an input, or that is used twice.
     """
-    existing_inputs = [filename for filename in inputs if filename is not None and os.path.exists(filename)]
+    existing_inputs = [one for filename in inputs if filename is not None for one in _existing_files(filename)]
     taken: dict[str, str] = {}
     for option, filename in outputs.items():
         if filename is None:
@@ -176,6 +177,15 @@ def check_outputs(
             _probe(Path(real))
         except OSError as failure:
             raise SonarError(f"{label}: cannot write: {reason(failure)}; allowed is a file you may write") from None
+
+
+def _existing_files(filename: str | os.PathLike[str]) -> list[str | os.PathLike[str]]:
+    """A file, or a folder and the files in it; nothing if it does not exist."""
+    if "\0" in os.fspath(filename) or not os.path.exists(filename):
+        return []
+    with suppress(OSError):
+        return [filename, *(entry for entry in os.scandir(filename) if os.path.exists(entry))]
+    return [filename]
 
 
 def _probe(target: Path) -> None:

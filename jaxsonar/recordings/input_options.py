@@ -3,6 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+FORMATS = ("csv", "parquet", "record", "bag")
+"""Formats that can be named as ``InputOptions.format``."""
+
 
 @dataclass(frozen=True)
 class InputOptions:

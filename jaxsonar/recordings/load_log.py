@@ -7,13 +7,10 @@ from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.recorder_base import recording_marker
 from jaxsonar.recordings.file_content import DESCRIPTIONS, check_suffix, file_content
-from jaxsonar.recordings.input_options import InputOptions
+from jaxsonar.recordings.input_options import FORMATS, InputOptions
 from jaxsonar.scans.log_file import load_scan_log
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
-
-FORMATS = ("csv", "parquet", "record", "bag")
-"""Formats that can be named as ``InputOptions.format``."""
 
 
 def load_log(

@@ -1,0 +1,173 @@
+"""The inputs of commands: ring and log, the options that say how a log is read, notes and warnings.
+
+Nothing heavy is imported with this module, so that ``--help`` is fast.
+"""
+
+import argparse
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxsonar.recordings.input_options import InputOptions
+    from jaxsonar.scans.scan_log import Log
+    from jaxsonar.sensors.ring import Ring
+
+from jaxsonar.cli.arguments import filename, finite
+from jaxsonar.cli.console import errors_in, print_status
+from jaxsonar.hardware.errors import SonarError
+from jaxsonar.reports.text import plural
+
+LOG_HELP = "scan log (CSV, Parquet), raw record (MCAP, extra live), ROS bag (extra ros), or what --from names"
+
+
+def add_log_arguments(
+    parser: argparse.ArgumentParser,
+    *,
+    name: str = "log",
+    metavar: str = "LOG",
+    nargs: str | None = None,
+    help: str = LOG_HELP,
+) -> None:
+    """Add a log as positional argument, and the options that say how it is read."""
+    parser.add_argument(name, nargs=nargs, type=filename, metavar=metavar, help=help)
+    add_reading_options(parser, metavar)
+
+
+def add_reading_options(parser: argparse.ArgumentParser, metavar: str = "LOG") -> None:
+    """Add the options that say how a log is read: ``--from``, ``--sensor``, ``--odometry-topic`` and others."""
+    from jaxsonar.recordings.input_options import FORMATS
+
+    reading = parser.add_argument_group(f"how {metavar} is read")
+    reading.add_argument(
+        "--from", dest="from_", choices=FORMATS, metavar="FORMAT", help=f"{', '.join(FORMATS)} (default: by content)"
+    )
+    reading.add_argument(
+        "--sensor",
+        action="append",
+        default=[],
+        type=sensor_name,
+        metavar="NAME=INDEX",
+        help="bag: the sensor of the ring that a frame or topic belongs to; once for each sensor",
+    )
+    reading.add_argument("--odometry-topic", metavar="TOPIC", help="bag: topic of the odometry (default: the only one)")
+    reading.add_argument(
+        "--no-echo",
+        action="append",
+        default=[],
+        type=finite(0),
+        metavar="METRES",
+        help="a range that means no echo; can be repeated",
+    )
+    reading.add_argument("--strict", action="store_true", help="a warning about the input is an error (exit code 2)")
+
+
+def sensor_name(text: str) -> tuple[str, int]:
+    """An argparse type: the name of a sensor and its index, as NAME=INDEX."""
+    name, _, index = text.rpartition("=")
+    if not name or not index.isascii() or not index.isdigit() or len(index) > 9:
+        raise argparse.ArgumentTypeError(f"{text!r} came; allowed is NAME=INDEX, such as sonar_front=0")
+    return name, int(index)
+
+
+def input_options(options: argparse.Namespace) -> "InputOptions":
+    """How a log is read, from the options of a command.
+
+    Raises:
+        SonarError: two indices for one name.
+    """
+    from jaxsonar.recordings.input_options import InputOptions
+
+    sensors: dict[str, int] = {}
+    for name, index in options.sensor:
+        if sensors.setdefault(name, index) != index:
+            raise SonarError(f"--sensor {name}={index}: {name}={sensors[name]} came, too; allowed is one index a name")
+    return InputOptions(
+        format=options.from_, sensors=sensors, odometry=options.odometry_topic, no_echo=tuple(options.no_echo)
+    )
+
+
+class InputMessages:
+    """Prints notes and warnings about inputs on standard error, and counts the warnings."""
+
+    def __init__(self, *, strict: bool):
+        self.strict = strict
+        """Whether a warning ends the command."""
+        self.warnings = 0
+        """Number of warnings so far."""
+
+    def note(self, text: str) -> None:
+        """Print a note; one that begins with ``warning:`` is a warning."""
+        if text.startswith("warning: "):
+            self.warn(text.removeprefix("warning: "))
+        else:
+            print_status(text)
+
+    def warn(self, text: str) -> None:
+        """Print a warning: what, likely cause, what to do."""
+        self.warnings += 1
+        print_status(f"warning: {text}")
+
+    def check(self) -> None:
+        """Check that there was no warning, if there must be none.
+
+        Raises:
+            SonarError: there was one, and the command is strict.
+        """
+        if self.strict and self.warnings:
+            raise SonarError(f"--strict: {plural(self.warnings, 'warning')} came; allowed is input without warnings")
+
+
+def load_inputs(options: argparse.Namespace) -> tuple["Ring", "Log"]:
+    """Load the ring and the log of a command; print notes and warnings.
+
+    Readings that are no echoes but marks become silent, and firings that are scans of their own are merged into scans.
+
+    Raises:
+        SonarError: an input cannot be read, or there was a warning and ``--strict`` was given.
+    """
+    ring, (log,) = load_all_inputs(options, [options.log])
+    return ring, log
+
+
+def load_all_inputs(options: argparse.Namespace, filenames: Sequence[str]) -> tuple["Ring", list["Log"]]:
+    """Load the ring of a command and several logs, as ``load_inputs``."""
+    from jaxsonar.sensors.ring_toml import load_ring
+
+    messages = InputMessages(strict=options.strict)
+    ring = load_ring(options.ring)
+    logs = [prepared_log(ring, read_log(name, options, messages, ring=ring), messages, name) for name in filenames]
+    messages.check()
+    return ring, logs
+
+
+def read_log(name: str, options: argparse.Namespace, messages: InputMessages, *, ring: "Ring | None" = None) -> "Log":
+    """Read a log as its options say; nothing is changed in it.
+
+    Raises:
+        SonarError: it cannot be read.
+    """
+    from jaxsonar.recordings.load_log import load_log
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        log = load_log(name, ring=ring, options=input_options(options), on_note=messages.note)
+    for one in caught:
+        messages.warn(str(one.message))
+    return log
+
+
+def prepared_log(ring: "Ring", log: "Log", messages: InputMessages, name: str) -> "Log":
+    """A log as computations need it: marks for no echo as silent readings, single firings merged into scans."""
+    from jaxsonar.scans.firing_poses import group_firings
+    from jaxsonar.scans.unheard_paths import unheard_warning
+
+    warn = partial(messages.warn)
+    with errors_in(name):
+        if (text := unheard_warning(ring, log)) is not None:
+            warn(text)
+        grouped = group_firings(log)
+    if grouped is not log:
+        messages.note(f"{plural(len(log), 'scan')} of single firings merged into {plural(len(grouped), 'scan')}")
+    return grouped

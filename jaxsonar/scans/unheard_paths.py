@@ -1,0 +1,62 @@
+"""Kinds of echo paths that a ring lists and that a log never heard."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.ring import Ring
+
+
+@dataclass(frozen=True)
+class UnheardPathSettings:
+    """When a kind of paths counts as never heard. Chosen by hand."""
+
+    min_expected: float = 20.0
+    """Least number of echoes of a kind that the echoes of the other kinds let expect."""
+
+
+SETTINGS = UnheardPathSettings()
+
+
+def neighbor_offsets(ring: Ring) -> Int[np.ndarray, " paths"]:
+    """Distance between transmitter and receiver of each path, in sensors, on either side; 0: a direct echo."""
+    tx, rx = ring.paths.T
+    offset = (rx - tx) % ring.count
+    return np.minimum(offset, ring.count - offset)
+
+
+def unheard_offsets(ring: Ring, log: Log) -> list[int]:
+    """Neighbor offsets (0: direct echoes) of which the log holds no echo, although the ring lists such paths.
+
+    A kind of paths counts only if the echoes of the other kinds let expect at least ``SETTINGS.min_expected`` of it,
+    where the number of echoes is proportional to the width of the directions in which paths detect a wall.
+    """
+    known = (log.tx < ring.count) & (log.rx < ring.count) & np.isfinite(log.range)
+    path = ring.path_index[log.tx[known], log.rx[known]]
+    offset, width = neighbor_offsets(ring), ring.exact_paths.width
+    heard = np.bincount(offset[path[path >= 0]], minlength=int(offset.max()) + 1)
+    width = np.bincount(offset, weights=width, minlength=len(heard))
+    is_heard = heard > 0
+    if not is_heard.any() or width[is_heard].sum() == 0:
+        return []
+    expected = heard.sum() * width / width[is_heard].sum()
+    return np.flatnonzero(~is_heard & (expected >= SETTINGS.min_expected)).tolist()
+
+
+def unheard_warning(ring: Ring, log: Log) -> str | None:
+    """A warning about kinds of paths that were never heard: what, likely cause, what to do; None if there is none."""
+    offsets = unheard_offsets(ring, log)
+    if not offsets:
+        return None
+    kinds = ["direct echo" if k == 0 else f"echo from neighbor {k}" for k in offsets]
+    listed = " or ".join(kinds) if len(kinds) < 3 else f"{', '.join(kinds[:-1])} or {kinds[-1]}"
+    paths = int(np.isin(neighbor_offsets(ring), offsets).sum())
+    what = f"no {listed} among {log.echo_count} echoes, but {ring.name!r} lists {paths} such paths"
+    if 0 in offsets:
+        return f"{what}; the device probably leaves direct echoes out; record them, or check tx and rx of the log"
+    return (
+        f"{what}; the device probably reports fewer kinds of echoes; set neighbors = {min(offsets) - 1} in the ring: the "
+        "paths count as not measured"
+    )
