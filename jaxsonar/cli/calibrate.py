@@ -4,15 +4,14 @@ import argparse
 
 from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, finite
 from jaxsonar.cli.console import ascii_name, errors_in, print_status, step_status, write_figure
+from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_all_inputs
 
 SUMMARY = "Calibrate a ring from ordinary scans of an unknown room."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar calibrate``."""
-    parser.add_argument(
-        "logs", nargs="+", type=filename, metavar="LOG", help="scan logs of this ring, .csv or .parquet"
-    )
+    add_log_arguments(parser, name="logs", nargs="+", help=f"logs of this ring: {LOG_HELP}")
     parser.add_argument("--ring", type=filename, required=True, help=f"the nominal ring: {RING_HELP}")
     parser.add_argument(
         "-o", "--output", type=filename, metavar="RING2", required=True, help="the calibrated ring, TOML; - = stdout"
@@ -55,11 +54,9 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.calibration.calibrate import calibrate as calibrate_ring
     from jaxsonar.calibration.calibration_toml import save_calibration
     from jaxsonar.fileio.atomic_files import check_outputs
-    from jaxsonar.scans.log_file import load_log
-    from jaxsonar.sensors.ring_toml import load_ring
 
     check_outputs({"-o": options.output, "--figure": options.figure}, [*options.logs, options.ring])
-    ring, logs = load_ring(options.ring), [load_log(log) for log in options.logs]
+    ring, logs = load_all_inputs(options, options.logs)
     choices = {key: getattr(options, key) for key in ("free", "poses", "odometry", "temperature", "sigma", "window")}
     with errors_in(", ".join(ascii_name(log) for log in options.logs)), step_status() as step:
         calibration = calibrate_ring(ring, logs, **choices, on_step=step)

@@ -13,6 +13,7 @@ from jaxsonar.cli.console import (
     write_figure,
     write_json,
 )
+from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Check the health of a ring, sensor by sensor, from a log."
@@ -20,7 +21,7 @@ SUMMARY = "Check the health of a ring, sensor by sensor, from a log."
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar check``."""
-    parser.add_argument("log", type=filename, metavar="LOG", help="scan log, .csv or .parquet; poses are not needed")
+    add_log_arguments(parser, help=f"poses are not needed: {LOG_HELP}")
     parser.add_argument("--ring", type=filename, required=True, help=RING_HELP)
     parser.add_argument(
         "--sigma", type=finite(1e-4, 1), metavar="METRES", help="standard deviation of the ranges (default: estimated)"
@@ -36,11 +37,9 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.diagnostics.check_ring import check as check_ring
     from jaxsonar.fileio.atomic_files import check_outputs
     from jaxsonar.reports.terminal_tables import health_table
-    from jaxsonar.scans.log_file import load_log
-    from jaxsonar.sensors.ring_toml import load_ring
 
     check_outputs({"--json": options.json, "--figure": options.figure}, [options.log, options.ring])
-    ring, log = load_ring(options.ring), load_log(options.log)
+    ring, log = load_inputs(options)
     with errors_in(options.log), progress_bar("scans", None) as show:
         health = check_ring(
             ring,

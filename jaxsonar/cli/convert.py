@@ -1,23 +1,74 @@
-"""``jaxsonar convert``: convert scan logs between formats, and recordings to scan logs."""
+"""``jaxsonar convert``: recordings of any kind to scan logs."""
 
 import argparse
+from importlib import import_module
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    from jaxsonar.sensors.ring import Ring
+
+from jaxsonar.cli.arguments import RING_HELP, filename, filename_ending_in
 from jaxsonar.cli.console import print_status
+from jaxsonar.cli.inputs import InputMessages, add_log_arguments, input_options, read_log
+from jaxsonar.reports.text import plural
 
-SUMMARY = "Convert scan logs between CSV and Parquet, and recordings of devices to scan logs."
+SUMMARY = "Convert recordings, ROS bags and tables to scan logs, and scan logs between CSV and Parquet."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar convert``."""
-    parser.add_argument("source", metavar="IN", help="log or recording")
-    parser.add_argument("destination", metavar="OUT", help="scan log, .csv or .parquet")
-    formats = ("corridor8", "scitos24", "sew-amr", "csv", "parquet")
-    parser.add_argument("--from", dest="from_", choices=formats, help="format of IN (default: by its suffix)")
+    add_log_arguments(parser, name="source", metavar="IN")
+    parser.add_argument(
+        "destination", type=filename_ending_in(".csv", ".parquet"), metavar="OUT", help="scan log, .csv or .parquet"
+    )
+    parser.add_argument(
+        "--ring", type=filename, help=f"the sensors, where IN names sensors or numbers must be checked: {RING_HELP}"
+    )
+    parser.add_argument(
+        "--ring-out",
+        type=filename_ending_in(".toml"),
+        metavar="RING2",
+        help="bag: write the ring that /tf_static and field_of_view describe, TOML",
+    )
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run ``jaxsonar convert``."""
-    from jaxsonar.scans.convert import convert as convert_log
+def run(options: argparse.Namespace) -> int:
+    """Run ``jaxsonar convert``. Returns 1 if there is no scan."""
+    from jaxsonar.fileio.atomic_files import check_outputs, shown
+    from jaxsonar.scans.log_file import save_log
+    from jaxsonar.sensors.ring_toml import load_ring, save_ring
 
-    log = convert_log(options.source, options.destination, from_=options.from_)
-    print_status(f"{len(log)} scans, {len(log.range)} echoes")
+    check_outputs({"OUT": options.destination, "--ring-out": options.ring_out}, [options.source, options.ring])
+    messages = InputMessages(strict=options.strict)
+    ring = None if options.ring is None else load_ring(options.ring)
+    if options.ring_out is not None:
+        ring = _ring_of_bag(options, messages)
+    log = read_log(options.source, options, messages, ring=ring)
+    messages.check()
+    if not len(log):
+        print_status(f"nothing converted: {shown(options.source)}: no scan: the log is empty")
+        return 1
+    save_log(log, options.destination)
+    if ring is not None and options.ring_out is not None:
+        save_ring(ring, options.ring_out)
+    silent, old = len(log.tx) - log.echo_count, int((log.age > 0).sum())
+    more = [plural(silent, "silent reading")] * (silent > 0) + [f"{plural(old, 'reading')} not renewed"] * (old > 0)
+    print_status(", ".join([plural(len(log), "scan"), f"{log.echo_count} echoes", *more]))
+    return 0
+
+
+def _ring_of_bag(options: argparse.Namespace, messages: InputMessages) -> "Ring":
+    """The ring that a bag describes.
+
+    Raises:
+        SonarError: a ring was given as well, or the bag does not describe one.
+    """
+    from jaxsonar.hardware.errors import SonarError
+    from jaxsonar.recordings.file_content import file_content
+
+    if options.ring is not None:
+        raise SonarError(f"--ring {options.ring}: --ring-out came, too; allowed is one of them")
+    if file_content(options.source) != "bag":
+        raise SonarError(f"--ring-out {options.ring_out}: IN is no ROS bag; allowed is --ring-out with a ROS bag")
+    ring_from_bag = import_module("jaxsonar.recordings.rosbag_log").ring_from_bag
+    return ring_from_bag(options.source, options=input_options(options), on_note=messages.note)

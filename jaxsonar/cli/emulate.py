@@ -12,16 +12,17 @@ if TYPE_CHECKING:
     from jaxsonar.hardware.messages import Message
     from jaxsonar.sensors.ring import Ring
 
-from jaxsonar.cli.arguments import RING_HELP, finite, number
+from jaxsonar.cli.arguments import RING_HELP, filename, finite, number
 from jaxsonar.cli.console import print_status, stopped_by_signals
+from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, read_log
 
 SUMMARY = "Emulate a device: play a log, or simulate a drive through a room."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar emulate``."""
-    parser.add_argument("log", metavar="LOG", help="scan log or record (.csv, .parquet, .mcap), or room (.geojson)")
-    parser.add_argument("--ring", required=True, help=RING_HELP)
+    add_log_arguments(parser, help=f"{LOG_HELP}, or room (.geojson)")
+    parser.add_argument("--ring", type=filename, required=True, help=RING_HELP)
     parser.add_argument(
         "--listen",
         required=True,
@@ -91,9 +92,7 @@ def _messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
     if Path(options.log).suffix.lower() not in (".geojson", ".json"):
         if options.path or options.sigma:
             raise SonarError("--path or --sigma came with a log; allowed are they with a room (.geojson)")
-        from jaxsonar.live.replay import messages_of
-
-        return messages_of(options.log, ring)
+        return _log_messages(options, ring)
     if not options.path:
         raise SonarError("a room came without --path; needed is a trajectory, --path CSV")
     from jaxsonar.floor_plans.room_geojson import load_room
@@ -102,3 +101,19 @@ def _messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
 
     poses, stamps = load_poses(options.path)
     return room_messages(ring, load_room(options.log), poses, stamps, sigma=options.sigma, seed=options.seed)
+
+
+def _log_messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
+    """The messages of a device that would give a log; those of a raw record as they were received."""
+    from jaxsonar.cli.console import errors_in
+    from jaxsonar.live.replay import messages_of
+    from jaxsonar.recordings.file_content import file_content
+    from jaxsonar.simulation.device_messages import log_messages
+
+    if options.from_ in (None, "record") and file_content(options.log) == "record":
+        return messages_of(options.log, ring)
+    messages = InputMessages(strict=options.strict)
+    log = read_log(options.log, options, messages, ring=ring)
+    messages.check()
+    with errors_in(options.log):
+        return log_messages(log, ring)

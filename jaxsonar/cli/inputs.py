@@ -6,7 +6,6 @@ Nothing heavy is imported with this module, so that ``--help`` is fast.
 import argparse
 import warnings
 from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -127,8 +126,8 @@ def load_inputs(options: argparse.Namespace) -> tuple["Ring", "Log"]:
     Raises:
         SonarError: an input cannot be read, or there was a warning and ``--strict`` was given.
     """
-    ring, (log,) = load_all_inputs(options, [options.log])
-    return ring, log
+    ring, logs = load_all_inputs(options, [options.log])
+    return ring, logs[0]
 
 
 def load_all_inputs(options: argparse.Namespace, filenames: Sequence[str]) -> tuple["Ring", list["Log"]]:
@@ -142,6 +141,18 @@ def load_all_inputs(options: argparse.Namespace, filenames: Sequence[str]) -> tu
     return ring, logs
 
 
+def nothing_used(ring: "Ring", log: "Log", name: str) -> bool:
+    """Whether no echo of a log can be used; prints the reason."""
+    from jaxsonar.fileio.atomic_files import shown
+    from jaxsonar.scans.unused_echoes import EchoCounts
+
+    with errors_in(name):
+        reason = EchoCounts.of(ring, log).why_none_is_used(ring)
+    if reason:
+        print_status(f"nothing found: {shown(name)}: {reason}")
+    return bool(reason)
+
+
 def read_log(name: str, options: argparse.Namespace, messages: InputMessages, *, ring: "Ring | None" = None) -> "Log":
     """Read a log as its options say; nothing is changed in it.
 
@@ -149,12 +160,16 @@ def read_log(name: str, options: argparse.Namespace, messages: InputMessages, *,
         SonarError: it cannot be read.
     """
     from jaxsonar.recordings.load_log import load_log
+    from jaxsonar.scans.recording_journal import TruncatedRecording
 
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+        warnings.simplefilter("always", TruncatedRecording)
         log = load_log(name, ring=ring, options=input_options(options), on_note=messages.note)
     for one in caught:
-        messages.warn(str(one.message))
+        if issubclass(one.category, TruncatedRecording):
+            messages.warn(f"{one.message}; the recording was interrupted; its complete scans are used")
+        else:
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     return log
 
 
@@ -163,10 +178,9 @@ def prepared_log(ring: "Ring", log: "Log", messages: InputMessages, name: str) -
     from jaxsonar.scans.firing_poses import group_firings
     from jaxsonar.scans.unheard_paths import unheard_warning
 
-    warn = partial(messages.warn)
     with errors_in(name):
         if (text := unheard_warning(ring, log)) is not None:
-            warn(text)
+            messages.warn(text)
         grouped = group_firings(log)
     if grouped is not log:
         messages.note(f"{plural(len(log), 'scan')} of single firings merged into {plural(len(grouped), 'scan')}")

@@ -19,13 +19,14 @@ from jaxsonar.cli.console import (
     with_progress,
     write_figure,
 )
+from jaxsonar.cli.inputs import add_log_arguments, load_inputs, nothing_used
 
 SUMMARY = "Detect lines around the robot, in every scan of a log."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar lines``."""
-    parser.add_argument("log", metavar="LOG", help="scan log, .csv or .parquet")
+    add_log_arguments(parser)
     add_detection_arguments(parser)
     parser.add_argument(
         "-o", "--output", metavar="LINES", required=True, help="JSON Lines, one object per scan; - = stdout"
@@ -36,27 +37,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scan", type=number(int, -(2**62), 2**62), metavar="N", help="scan to draw (default: first)")
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run ``jaxsonar lines``."""
+def run(options: argparse.Namespace) -> int:
+    """Run ``jaxsonar lines``. Returns 1 if no echo could be used."""
     from jaxsonar.detection.extract import local_models
     from jaxsonar.detection.local_model import save_models
     from jaxsonar.detection.settings import hough_settings
     from jaxsonar.detection.settings_toml import load_settings, save_settings
     from jaxsonar.fileio.atomic_files import check_outputs, shown
     from jaxsonar.hardware.errors import SonarError
-    from jaxsonar.scans.log_file import load_log
-    from jaxsonar.sensors.ring_toml import load_ring
 
     check_outputs({"-o": options.output, "--figure": options.figure}, [options.log, options.ring, options.settings])
     if options.scan is not None and not options.figure:
         raise SonarError(f"--scan {options.scan} came alone; allowed is --scan with --figure, to which it belongs")
     check_sigma_is_used(options.sigma, options.method, None)
-    ring, log = load_ring(options.ring), load_log(options.log)
+    ring, log = load_inputs(options)
     settings = hough_settings(ring, load_settings(options.settings) if options.settings else None)
     if options.scan is not None and options.scan not in log.scan:
         numbers = f"numbers from {log.scan.min()} to {log.scan.max()}" if len(log) else "none"
         raise SonarError(f"--scan {options.scan}: no such scan in {shown(options.log)}; it holds {len(log)}, {numbers}")
-
+    if nothing_used(ring, log, options.log):
+        return 1
     with errors_in(options.log):
         models = local_models(
             ring,
@@ -79,6 +79,7 @@ def run(options: argparse.Namespace) -> None:
         scan = log[int((log.scan == model.scan).argmax())]
         write_figure(lines_figure(ring, scan, model), options.figure)
     print_status(summary.text())
+    return 0
 
 
 class RunSummary:

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
 
 from jaxsonar.cli.arguments import add_slam_arguments, figure_filename, filename, odometry_noise
 from jaxsonar.cli.console import ascii_name, errors_in, print_status, stage_status, write_figure
+from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Localize the robot in a known map."
@@ -15,7 +16,7 @@ SUMMARY = "Localize the robot in a known map."
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar localize``."""
-    parser.add_argument("log", type=filename, metavar="LOG", help="scan log of a short drive, .csv or .parquet")
+    add_log_arguments(parser, help=f"a short drive: {LOG_HELP}")
     parser.add_argument(
         "--map", type=filename, required=True, metavar="MAP", help="the known map, or a floor plan: GeoJSON"
     )
@@ -37,13 +38,12 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.estimation.trajectory import save_trajectory
     from jaxsonar.fileio.atomic_files import check_outputs
     from jaxsonar.localization.localize import localize as run_localize
-    from jaxsonar.scans.log_file import load_log
-    from jaxsonar.sensors.ring_toml import load_ring
 
     check_outputs(
         {"--trajectory": options.trajectory, "--figure": options.figure}, [options.log, options.ring, options.map]
     )
-    ring, log, world = load_ring(options.ring), load_log(options.log), _load_known_map(options.map)
+    world = _load_known_map(options.map)
+    ring, log = load_inputs(options)
     with errors_in(options.log), stage_status() as progress:
         result = run_localize(
             ring,

@@ -27,6 +27,7 @@ from jaxsonar.cli.console import (
     with_progress,
     write_figure,
 )
+from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Build a map of walls, from a log of scans with poses."
@@ -34,7 +35,7 @@ SUMMARY = "Build a map of walls, from a log of scans with poses."
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar map``."""
-    parser.add_argument("log", type=filename, metavar="LOG", help="scan log with poses, .csv or .parquet")
+    add_log_arguments(parser, help=f"with poses: {LOG_HELP}")
     add_detection_arguments(parser)
     parser.add_argument(
         "--window",
@@ -64,8 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run ``jaxsonar map``."""
+def run(options: argparse.Namespace) -> int:
+    """Run ``jaxsonar map``. Returns 1 if no echo could be used."""
     import numpy as np
 
     from jaxsonar.detection.extract import local_models
@@ -76,9 +77,7 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.mapping.build_map import assemble_map, check_poses, required_scans
     from jaxsonar.mapping.map_evidence import gather_evidence
     from jaxsonar.mapping.map_geojson import save_map
-    from jaxsonar.scans.log_file import load_log
     from jaxsonar.scans.sliding_windows import check_window
-    from jaxsonar.sensors.ring_toml import load_ring
 
     settings_file = settings_filename(options.output)
     if settings_file and options.settings and Path(options.settings).resolve() == settings_file.resolve():
@@ -102,9 +101,11 @@ def run(options: argparse.Namespace) -> None:
         load_ezdxf(options.dxf)
     check_window(options.window)
     check_sigma_is_used(options.sigma, options.method, options.window)
-    ring, log = load_ring(options.ring), load_log(options.log)
+    ring, log = load_inputs(options)
     given = None if options.settings is None else load_settings(options.settings)
     settings = hough_settings(ring, given, window=options.window)
+    if nothing_used(ring, log, options.log):
+        return 1
     left_out: list[int] = []
     with errors_in(options.log):
         check_poses(log)
@@ -163,6 +164,7 @@ def run(options: argparse.Namespace) -> None:
         f"{plural(len(log), 'scan')}, {plural(len(models), 'local model')}, "
         f"{plural(len(evidence.segments), 'segment')}, {plural(len(world), 'wall')}, {world.length.sum():.1f} m{remark}"
     )
+    return 0
 
 
 def _laser_points(recording: str) -> "np.ndarray":

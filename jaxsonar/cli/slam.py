@@ -12,6 +12,7 @@ from jaxsonar.cli.console import (
     write_figure,
     write_json,
 )
+from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Trajectory and map, from echoes and odometry, or from echoes alone."
@@ -19,9 +20,7 @@ SUMMARY = "Trajectory and map, from echoes and odometry, or from echoes alone."
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar slam``."""
-    parser.add_argument(
-        "log", type=filename, metavar="LOG", help="scan log, .csv or .parquet; its poses are odometry, or empty"
-    )
+    add_log_arguments(parser, help=f"poses are odometry, or missing: {LOG_HELP}")
     add_slam_arguments(parser)
     parser.add_argument(
         "-o", "--output", type=filename, metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout"
@@ -69,14 +68,12 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.hardware.errors import SonarError
     from jaxsonar.mapping.map_geojson import save_map
     from jaxsonar.scans.flat_echoes import FlatEchoes
-    from jaxsonar.scans.log_file import load_log
-    from jaxsonar.sensors.ring_toml import load_ring
 
     check_outputs(
         {"-o": options.output, "--trajectory": options.trajectory, "--figure": options.figure, "--json": options.json},
         [options.log, options.ring, options.truth],
     )
-    ring, log = load_ring(options.ring), load_log(options.log)
+    ring, log = load_inputs(options)
     truth = None if options.truth is None else load_trajectory(options.truth)
     if truth is not None:
         check_truth(truth, log, truth_name=str(options.truth), log_name=options.log)

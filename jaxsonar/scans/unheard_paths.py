@@ -56,7 +56,8 @@ def unheard_warning(ring: Ring, log: Log) -> str | None:
     what = f"no {listed} among {log.echo_count} echoes, but {ring.name!r} lists {paths} such paths"
     if 0 in offsets:
         return f"{what}; the device probably leaves direct echoes out; record them, or check tx and rx of the log"
-    return (
-        f"{what}; the device probably reports fewer kinds of echoes; set neighbors = {min(offsets) - 1} in the ring: the "
-        "paths count as not measured"
-    )
+    if offsets == list(range(offsets[0], ring.neighbors + 1)):
+        remedy = f"set neighbors = {offsets[0] - 1} in the ring"
+    else:
+        remedy = "check which neighbors the device listens to"
+    return f"{what}; the device probably does not report them, and they count as not measured; {remedy}"
