@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar import kernels
+from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 
@@ -45,6 +46,9 @@ class Ring(eqx.Module):
     """Largest half path length of an echo, metres."""
     name: str = eqx.field(static=True)
     """Name in messages and figures."""
+    names: tuple[str, ...] = eqx.field(static=True)
+    """How recordings of other robots call each sensor: a topic if it begins with "/", otherwise the frame of its
+    messages; "" for a sensor without a name. The tuple is empty if no sensor has a name."""
 
     def __init__(
         self,
@@ -57,6 +61,7 @@ class Ring(eqx.Module):
         range_offset: Float[AnyArray, " sensors"] | Sequence[float] | float = 0.0,
         speed_of_sound: Float[AnyArray, ""] | float = REFERENCE_SPEED_OF_SOUND,
         name: str = "ring",
+        names: Sequence[str] = (),
     ):
         """Build an array of any arrangement: a ring, a car bumper, two rings one above the other.
 
@@ -71,6 +76,7 @@ class Ring(eqx.Module):
             range_offset: subtracted from the reported range, metres, one for all sensors or one each.
             speed_of_sound: metres per second.
             name: name in messages and figures.
+            names: topic or frame of each sensor in recordings of other robots, one each, or none at all.
 
         Raises:
             SonarError: a value out of range; the message names it and the allowed range.
@@ -84,6 +90,7 @@ class Ring(eqx.Module):
         self.neighbors = _whole(neighbors, "neighbors")
         self.max_range = float(max_range)
         self.name = name
+        self.names = tuple(str(one) for one in names) if any(names) else ()
         self._check()
         for array in (self.position, self.heading, self.beam, self.range_offset, self.speed_of_sound):
             array.setflags(write=False)
@@ -112,6 +119,12 @@ class Ring(eqx.Module):
         if not 0 < self.speed_of_sound <= 10_000:
             raise SonarError(f"ring: speed_of_sound {self.speed_of_sound:g} m/s; allowed is more than 0, at most 10000")
 
+        if self.names and len(self.names) != count:
+            raise SonarError(f"ring: {len(self.names)} names came; allowed is one for each of {count} sensors, or none")
+        given = [one for one in self.names if one]
+        if twice := next((one for one in given if given.count(one) > 1), None):
+            raise SonarError(f"ring: the name {shown(twice)} came twice; allowed is one sensor for each name")
+
     @classmethod
     def circular(
         cls,
@@ -124,6 +137,7 @@ class Ring(eqx.Module):
         first_heading: float = 0.0,
         speed_of_sound: float = REFERENCE_SPEED_OF_SOUND,
         name: str = "ring",
+        names: Sequence[str] = (),
     ) -> "Ring":
         """Build a ring of evenly spaced sensors that face outward, counter-clockwise; by default the paper's ring.
 
@@ -136,6 +150,7 @@ class Ring(eqx.Module):
             first_heading: direction of the axis of sensor 0, radians.
             speed_of_sound: metres per second.
             name: name in messages and figures.
+            names: as in the constructor.
 
         Raises:
             SonarError: a value out of range; the message names it and the allowed range.
@@ -154,6 +169,7 @@ class Ring(eqx.Module):
             max_range=max_range,
             speed_of_sound=speed_of_sound,
             name=name,
+            names=names,
         )
 
     @property

@@ -22,6 +22,7 @@ _Length = Annotated[float, Meta(description="a finite number (m)")]
 _Heading = Annotated[float, Meta(description="a finite number (degrees counter-clockwise from x)")]
 _Beam = Annotated[float, Meta(gt=0, le=180, description="a number above 0 and up to 180 (degrees)")]
 _Neighbors = Annotated[int, Meta(ge=0, description="a whole number, 0 or more and less than there are sensors")]
+_Name = Annotated[str, Meta(pattern="[^/]", description="a text, the frame or the topic of a sensor in bags")]
 _MaxRange = Annotated[float, Meta(gt=0, description="a finite number above 0 (m)")]
 
 
@@ -45,6 +46,13 @@ class _SensorTable(msgspec.Struct, forbid_unknown_fields=True):
     heading_deg: _Heading
     beam_deg: _Beam
     range_offset: _Length = 0.0
+    frame: _Name = ""
+    topic: _Name = ""
+
+
+class _NameTable(msgspec.Struct, forbid_unknown_fields=True):
+    frame: _Name = ""
+    topic: _Name = ""
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -57,7 +65,12 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     calibration: Annotated[dict[str, Any] | None, Meta(description="one table [calibration]")] = None
 
 
+class _CircleFile(_File, forbid_unknown_fields=True):
+    sensor: Annotated[list[_NameTable] | None, Meta(description="tables [[sensor]], one a sensor")] = None
+
+
 _TABLES = {"": _File, "ring": _RingTable, "array": _ArrayTable, "sensor": _SensorTable}
+_CIRCLE_TABLES = _TABLES | {"sensor": _NameTable}
 
 
 def shipped_rings() -> tuple[str, ...]:
@@ -72,6 +85,9 @@ def load_ring(filename: str | os.PathLike[str]) -> Ring:
     ring is a table ``[ring]`` with count, radius, first_heading_deg, beam_deg, neighbors and max_range. An array is a
     table ``[array]`` with neighbors and max_range, and one table ``[[sensor]]`` per sensor with x, y, heading_deg,
     beam_deg and optionally range_offset. Lengths are in metres. A table ``[calibration]`` is ignored.
+
+    In both cases a ``[[sensor]]`` may contain ``frame`` or ``topic``, the name of the sensor in ROS bags
+    (``Ring.names``). Beside ``[ring]`` these are the only keys, and there is one ``[[sensor]]`` per sensor.
 
     Args:
         filename: the file; if there is no such file, a name from ``shipped_rings()``, as in ``load_ring("faw")``.
@@ -89,8 +105,9 @@ def load_ring(filename: str | os.PathLike[str]) -> Ring:
     if (given.ring is None) == (given.array is None):
         came = "neither [ring] nor [array]" if given.ring is None else "both [ring] and [array]"
         raise SonarError(f"{shown(file)}: {came} came; allowed is [ring], or [array] with one [[sensor]] each")
-    if given.ring is not None and given.sensor is not None:
-        raise SonarError(f"{shown(file)}: [[sensor]] came beside [ring]; allowed is [[sensor]] with [array] only")
+    if given.ring is not None and given.sensor is not None and len(given.sensor) != given.ring.count:
+        came = f"{len(given.sensor)} [[sensor]] came beside [ring]"
+        raise SonarError(f"{shown(file)}: {came}; allowed is one for each of its {given.ring.count} sensors, or none")
     if given.array is not None and not given.sensor:
         raise SonarError(f"{shown(file)}: sensor is missing; allowed with [array] is one [[sensor]] each, at least one")
 
@@ -108,6 +125,8 @@ def load_ring(filename: str | os.PathLike[str]) -> Ring:
 
 
 def _ring(given: _File) -> Ring:
+    sensors = given.sensor or []
+    names = [_name(k, sensor) for k, sensor in enumerate(sensors)]
     if given.ring is not None:
         return Ring.circular(
             count=given.ring.count,
@@ -118,9 +137,9 @@ def _ring(given: _File) -> Ring:
             first_heading=math.radians(given.ring.first_heading_deg),
             speed_of_sound=given.speed_of_sound,
             name=given.name,
+            names=names,
         )
     assert given.array is not None
-    sensors = given.sensor or []
     return Ring(
         np.array([(sensor.x, sensor.y) for sensor in sensors]),
         np.radians([sensor.heading_deg for sensor in sensors]),
@@ -130,7 +149,15 @@ def _ring(given: _File) -> Ring:
         range_offset=np.array([sensor.range_offset for sensor in sensors]),
         speed_of_sound=given.speed_of_sound,
         name=given.name,
+        names=names,
     )
+
+
+def _name(k: int, sensor: _SensorTable | _NameTable) -> str:
+    """The name of a sensor as in ``Ring.names``: topics begin with "/", frames do not."""
+    if sensor.frame and sensor.topic:
+        raise SonarError(f"sensor[{k}]: frame and topic came; allowed is one of them")
+    return f"/{sensor.topic.lstrip('/')}" if sensor.topic else sensor.frame.lstrip("/")
 
 
 def save_ring(ring: Ring, filename: str | os.PathLike[str]) -> None:
@@ -158,11 +185,14 @@ def ring_toml(ring: Ring, *, each: bool = False) -> str:
     """
     speed = float(np.asarray(ring.speed_of_sound, dtype=np.float64))
     head: dict[str, Any] = {"name": ring.name, "speed_of_sound": speed}
+    names = [{"topic" if one.startswith("/") else "frame": one} if one else {} for one in ring.names]
     if (circle := _circle(ring)) and not each:
-        return tomli_w.dumps({**head, "ring": circle})
-    text = tomli_w.dumps({**head, "array": {"neighbors": ring.neighbors, "max_range": ring.max_range}})
+        text, sensors = tomli_w.dumps({**head, "ring": circle}), names
+    else:
+        text = tomli_w.dumps({**head, "array": {"neighbors": ring.neighbors, "max_range": ring.max_range}})
+        sensors = [sensor | name for sensor, name in zip(_sensors(ring), names or [{}] * ring.count, strict=True)]
     # One table at a time, because the library writes lists of short tables as inline arrays.
-    return text + "".join(f"\n[[sensor]]\n{tomli_w.dumps(sensor)}" for sensor in _sensors(ring))
+    return text + "".join(f"\n[[sensor]]\n{tomli_w.dumps(sensor)}" for sensor in sensors)
 
 
 def _circle(ring: Ring) -> dict[str, Any] | None:
@@ -213,7 +243,7 @@ def _read(file: Path) -> _File:
     data = read_toml(file, what="a ring")
     _refuse_not_finite(file, {key: value for key, value in data.items() if key != "calibration"}, "")
     try:
-        return msgspec.convert(data, type=_File)
+        return msgspec.convert(data, type=_CircleFile if "ring" in data and "array" not in data else _File)
     except (msgspec.ValidationError, OverflowError) as failure:
         _refuse(file, data, str(failure))
 
@@ -239,8 +269,10 @@ def _refuse(file: Path, data: dict[str, Any], message: str) -> NoReturn:
         if field[1] == "missing required":
             raise SonarError(f"{shown(file)}: {key} is missing; needed is {_allowed(key)}")
         table = re.sub(r"\[\d+\]", "", place)
-        keys = ", ".join(_TABLES[table].__struct_fields__)
-        where = {"": "outside of tables", "sensor": "in [[sensor]]"}.get(table, f"in [{table}]")
+        tables = _CIRCLE_TABLES if "ring" in data and "array" not in data else _TABLES
+        keys = ", ".join(tables[table].__struct_fields__)
+        beside = " beside [ring]" if tables is _CIRCLE_TABLES else ""
+        where = {"": "outside of tables", "sensor": f"in [[sensor]]{beside}"}.get(table, f"in [{table}]")
         raise SonarError(f"{shown(file)}: unknown key {shown(key)}; allowed {where} are {keys}")
     value: Any = data
     for name, index in re.findall(r"(\w+)|\[(\d+)\]", place):

@@ -1,5 +1,6 @@
 """Ring files: lossless round trips, and errors that name the key and the allowed values."""
 
+import dataclasses
 import os
 import tempfile
 import tomllib
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.sensors.ring_toml import load_ring, save_ring, shipped_rings
+from jaxsonar.sensors.ring_toml import load_ring, ring_toml, save_ring, shipped_rings
 
 CIRCLE = """\
 name = "round"
@@ -171,6 +172,20 @@ def test_degrees_are_written_without_rounding_noise(tmp_path):
     assert "[[sensor]]\nx = 0.5\ny = 0.25\nheading_deg = 10.0\nbeam_deg = 50.0\nrange_offset = 0.125\n" in text
 
 
+@pytest.mark.parametrize("text", [CIRCLE.replace("count = 12", "count = 3"), BUMPER])
+def test_names_of_sensors_in_bags_are_kept(tmp_path, text):
+    names = ["topic = '/robot/us_left'", "", "frame = '/us_right'"]
+    expected = ["/robot/us_left", "", "us_right"]
+    parts = (text if "[[sensor]]" in text else text + "[[sensor]]\n" * 3).split("[[sensor]]\n")
+    named = parts[0] + "".join(f"[[sensor]]\n{name}\n{part}" for name, part in zip(names, parts[1:], strict=False))
+    ring = read(named)
+    assert ring.names == tuple(expected[: ring.count])
+    save_ring(ring, tmp_path / "ring.toml")
+    assert_same(load_ring(tmp_path / "ring.toml"), ring)
+    assert load_ring(tmp_path / "ring.toml").names == ring.names
+    assert ring_toml(dataclasses.replace(ring, names=())) == ring_toml(read(text))
+
+
 def test_other_toml_notations_of_the_same_ring():
     ring = read(CIRCLE)
     for text in (
@@ -223,7 +238,32 @@ def test_every_key_except_the_optional_ones_is_required(text):
         (CIRCLE, "[ring]", "", "unknown key "),
         (CIRCLE, "[ring]", "[[ring]]", "ring: [{"),
         (CIRCLE, "[ring]", "[array]\nneighbors = 0\nmax_range = 1.0\n[ring]", "both [ring] and [array] came"),
-        (CIRCLE, "[ring]", BUMPER[BUMPER.index("[[") :] + "[ring]", "[[sensor]] came beside [ring]; allowed is"),
+        (
+            CIRCLE,
+            "[ring]",
+            BUMPER[BUMPER.index("[[") :] + "[ring]",
+            "unknown key sensor[0].x; allowed in [[sensor]] beside [ring] are frame, topic",
+        ),
+        (
+            CIRCLE,
+            "[ring]",
+            "[[sensor]]\nframe = 'us0'\n[ring]",
+            "1 [[sensor]] came beside [ring]; allowed is one for each of its 12 sensors, or none",
+        ),
+        (
+            CIRCLE,
+            "[ring]",
+            "[[sensor]]\nframe = 'us0'\n" * 12 + "[ring]",
+            "ring: the name us0 came twice; allowed is one sensor for each name",
+        ),
+        (CIRCLE, "[ring]", "[[sensor]]\nframe = 7\n[ring]", "sensor[0].frame: 7 came; allowed is a text, the frame or"),
+        (BUMPER, "x = 0.5", "topic = '/'\nx = 0.5", "sensor[0].topic: '/' came; allowed is a text, the frame or the"),
+        (
+            BUMPER,
+            "x = 0.5",
+            "topic = '/us'\nframe = 'us'\nx = 0.5",
+            "sensor[0]: frame and topic came; allowed is one of them",
+        ),
         (
             CIRCLE,
             CIRCLE[CIRCLE.index("[ring]") :],
