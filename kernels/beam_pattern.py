@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .data_association import CandidateReflections
 from .landmarks import Landmarks, predict_reflection
 from .planar_geometry import signed_angle
-from .sensor_array import SensorArray, echo_paths
+from .sensor_array import SensorArray, echo_paths, transform_path
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ def off_axis_angles(
     candidates: CandidateReflections,
     poses: Float[Array, "scans 3"],
     map_index: Int[Array, " scans"],
+    motion: Float[Array, "scans sensors 3"] | None = None,
 ) -> Float[Array, "scans candidates sensors"]:
     """Direction of arrival of every sensor's direct echo of every candidate, from its heading, radians.
 
@@ -60,22 +61,24 @@ def off_axis_angles(
         candidates: reflections at these landmarks.
         poses: world_from_robot of the scans, metres and radians.
         map_index: index of the map in which each scan was taken.
+        motion: scan_from_robot when each sensor fired; None: the robot was at rest.
     """
     count = sensors.heading.shape[0]
     paths = jax.tree.map(lambda leaf: leaf[:count], echo_paths(sensors))
     wide = eqx.tree_at(lambda p: p.cone, paths, jnp.full_like(paths.cone, 2))  # half the plane
 
-    def one_echo(pose, map_of_scan, reflection, map_of_candidate, first, second, path):
+    def one_echo(pose, map_of_scan, reflection, map_of_candidate, first, second, path, motion):
+        path = path if motion is None else transform_path(path, motion)
         distance, visibility, arrival = predict_reflection(pose, reflection, first, second, path)
         angle = signed_angle(path.axes[0], arrival)
         exists = (visibility > 0) & (distance < sensors.max_range) & (map_of_scan == map_of_candidate)
         return jnp.where(exists, angle, jnp.nan)
 
     first, second = landmarks.take(candidates.reflection.first), landmarks.take(candidates.reflection.second)
-    each = jax.vmap(one_echo, in_axes=(None, None, None, None, None, None, 0))
-    each = jax.vmap(each, in_axes=(None, None, 0, 0, 0, 0, None))
-    each = jax.vmap(each, in_axes=(0, 0, None, None, None, None, None))
-    return each(poses, map_index, candidates.reflection, candidates.map_index, first, second, wide)
+    each = jax.vmap(one_echo, in_axes=(None, None, None, None, None, None, 0, 0))
+    each = jax.vmap(each, in_axes=(None, None, 0, 0, 0, 0, None, None))
+    each = jax.vmap(each, in_axes=(0, 0, None, None, None, None, None, 0))
+    return each(poses, map_index, candidates.reflection, candidates.map_index, first, second, wide, motion)
 
 
 def beam_negative_log_likelihood(

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from .landmarks import Landmarks, Reflection, landmark_in_robot_frame
 from .measurement_model import expected_range, reported_range
-from .planar_geometry import rotate_back, wrap_angle
+from .planar_geometry import rotate, rotate_back, wrap_angle
 from .sensor_array import SensorArray
 
 
@@ -32,6 +32,8 @@ class EchoFactors(eqx.Module):
     """(scans, echoes) the landmarks that cause each echo."""
     weight: Float[Array, "*scans echoes"]
     """Inverse variance, 1 / square metres; 0 leaves an echo out."""
+    motion: Float[Array, "*scans echoes 3"] | None = None
+    """scan_from_robot when each path was measured: x, y (metres), theta (radians); None: the robot was at rest."""
 
 
 class Unknowns(eqx.Module):
@@ -117,13 +119,14 @@ def residuals(problem: LeastSquaresProblem, unknowns: Unknowns) -> Float[Array, 
     sensors = apply_parameters(problem.sensors, problem.basis @ unknowns.coordinates)
     landmarks = problem.landmarks.with_parameters(unknowns.landmarks)
 
-    def one_echo(path, reported, reflection, pose):
+    def one_echo(path, reported, reflection, motion, pose):
         geometry, own = echo_geometry(sensors, landmarks, path, reflection, pose)
-        return reported - predicted_report(geometry, own, reflection.kind)
+        return reported - predicted_report(geometry, own, reflection.kind, motion)
 
-    each_echo = jax.vmap(one_echo, in_axes=(0, 0, 0, None))
+    each_echo = jax.vmap(one_echo, in_axes=(0, 0, 0, 0, None))
     factors = problem.factors
-    return jax.vmap(each_echo)(factors.path, factors.reported, factors.reflection, unknowns.poses)
+    echoes = (factors.path, factors.reported, factors.reflection, factors.motion)
+    return jax.vmap(each_echo)(*echoes, unknowns.poses)
 
 
 @jax.jit
@@ -164,9 +167,9 @@ def linearize(
 
     def one_echo(scan, echo):
         path, reported = factors.path[scan, echo], factors.reported[scan, echo]
-        reflection = jax.tree.map(lambda leaf: leaf[scan, echo], factors.reflection)
+        reflection, motion = jax.tree.map(lambda leaf: leaf[scan, echo], (factors.reflection, factors.motion))
         geometry, own = echo_geometry(sensors, landmarks, path, reflection, unknowns.poses[scan])
-        report, slope = jax.value_and_grad(predicted_report)(geometry, own, reflection.kind)
+        report, slope = jax.value_and_grad(predicted_report)(geometry, own, reflection.kind, motion)
         tx, rx = sensors.tx[path], sensors.rx[path]
         by_coordinates = slope.offset / 2 * (basis[tx] + basis[rx]) + slope.log_scale * basis[count]
         by_coordinates += slope.tx @ position_rows[tx] + slope.rx @ position_rows[rx]
@@ -217,14 +220,27 @@ def echo_geometry(
 
 
 def predicted_report(
-    geometry: EchoGeometry, landmarks: tuple[Landmarks, Landmarks], kind: Int[Array, ""]
+    geometry: EchoGeometry,
+    landmarks: tuple[Landmarks, Landmarks],
+    kind: Int[Array, ""],
+    motion: Float[Array, "3"] | None = None,
 ) -> Float[Array, ""]:
-    """The range that the path of ONE echo reports, metres."""
+    """The range that the path of ONE echo reports, metres.
+
+    Args:
+        geometry: what the range is differentiated by.
+        landmarks: the first and the second landmark; their parameters are those of ``geometry``.
+        kind: of the reflection.
+        motion: scan_from_robot when the path was measured; None if the robot did not move since the scan's pose.
+    """
     first, second = (
         landmark_in_robot_frame(geometry.pose, landmark.with_parameters(parameters))
         for landmark, parameters in zip(landmarks, (geometry.first, geometry.second), strict=True)
     )
-    true_range = expected_range(kind, first, second, geometry.tx, geometry.rx)
+    tx, rx = geometry.tx, geometry.rx
+    if motion is not None:
+        tx, rx = (motion[:2] + rotate(position, motion[2]) for position in (tx, rx))
+    true_range = expected_range(kind, first, second, tx, rx)
     return reported_range(true_range, range_offset=geometry.offset, range_scale=jnp.exp(geometry.log_scale))
 
 

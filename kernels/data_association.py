@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from .detection_cones import SETTINGS
 from .landmarks import AnyArray, Landmarks, Reflection, predict_reflection
 from .measurement_model import reported_range
-from .sensor_array import EchoPaths, SensorArray, echo_paths, widen_cones
+from .sensor_array import EchoPaths, SensorArray, echo_paths, transform_path, widen_cones
 
 
 class CandidateReflections(eqx.Module):
@@ -44,6 +44,7 @@ def associate(
     path: Int[Array, "scans echoes"],
     reported: Float[Array, "scans echoes"],
     near: Int[Array, "scans near"],
+    motion: Float[Array, "scans echoes 3"] | None = None,
 ) -> EchoAssociation:
     """Associate every echo with the candidate of the nearest range that its path can receive.
 
@@ -56,6 +57,7 @@ def associate(
         path: row of the ring's ``paths`` of each echo.
         reported: half path lengths as reported, metres; NaN where there is no echo.
         near: rows of the candidates that each scan may receive; -1 for unused entries.
+        motion: scan_from_robot when the path of each echo was measured; None: the robot was at rest.
     """
     paths = widen_cones(echo_paths(sensors), SETTINGS.association_cone_factor)
 
@@ -68,9 +70,11 @@ def associate(
     each_candidate = jax.vmap(each_path, in_axes=(None, 0, 0, 0, None))
 
     def associate_scan(scan):
-        pose, map_of_scan, path, reported, near = scan
+        pose, map_of_scan, path, reported, near, motion = scan
         # Expected ranges of all candidates on the path of each echo.
         echo_path = jax.tree.map(lambda leaf: leaf[path], paths)
+        if motion is not None:
+            echo_path = jax.vmap(transform_path)(echo_path, motion)
         reflection, map_of_candidate, group = jax.tree.map(
             lambda leaf: leaf[jnp.maximum(near, 0)], (candidates.reflection, candidates.map_index, candidates.group)
         )
@@ -89,4 +93,4 @@ def associate(
         competitor_gap = jnp.where(competes, gap, jnp.inf).min(axis=0)
         return jnp.where(found, near[best], -1), jnp.where(found, reported - nearest, jnp.inf), competitor_gap
 
-    return EchoAssociation(*jax.lax.map(associate_scan, (poses, map_index, path, reported, near)))
+    return EchoAssociation(*jax.lax.map(associate_scan, (poses, map_index, path, reported, near, motion)))

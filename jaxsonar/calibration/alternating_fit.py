@@ -24,6 +24,7 @@ from jaxsonar.estimation.sparse_adjustment import marginal_covariances, solve_ad
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.registration.sequential_registration import register_scans
+from jaxsonar.scans.measured_directions import measured_directions
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import ParameterBasis
@@ -180,6 +181,7 @@ class CalibrationProblem:
                     odometry_sd=self.odometry,
                     margin=margin,
                     noise_scale=noise_scale,
+                    directions=measured_directions(ring, log),
                 )
                 sizes = [np.isfinite(poses[:, 0]).sum() for poses in clusters]
                 large = [poses for poses, size in zip(clusters, sizes, strict=True) if size >= self.settings.min_scans]

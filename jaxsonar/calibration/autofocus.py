@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsonar import kernels
+from jaxsonar.geometry.se2 import compose
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.kernels.focus_measure import ring_focus_measure
 from jaxsonar.kernels.hough_accumulator import HoughSettings
@@ -145,18 +146,21 @@ def _pack_scans(
     echo = np.flatnonzero(row >= 0)
     row, column = row[echo], echo - flat.start[flat.scan[echo]]
     radius = float(np.hypot(*np.asarray(ring.position).T).max())
+    motion = None if flat.path_pose is None else flat.path_pose[flat.scan[echo], flat.path[echo]]
     # 3. Padded arrays.
     if poses:
-        echo_pose = log.pose[flat.scan[echo]]
+        echo_pose = log.pose[flat.scan[echo]] if motion is None else compose(log.pose[flat.scan[echo]], motion)
         centroid = echo_pose[:, :2].mean(axis=0)
         echo_pose = np.column_stack([echo_pose[:, :2] - centroid, echo_pose[:, 2]])
         row, column = np.zeros_like(row), np.arange(len(echo))
         shape = (1, bucket_size(len(echo), least=512))
+    else:
+        echo_pose, shape = motion, (bucket_size(len(index), least=8), bucket_size(int(column.max()) + 1, least=64))
+    pose = None
+    if echo_pose is not None:
         radius += float(np.hypot(*echo_pose[:, :2].T).max())
         pose = np.zeros((*shape, 3), np.float32)
         pose[row, column] = echo_pose
-    else:
-        pose, shape = None, (bucket_size(len(index), least=8), bucket_size(int(column.max()) + 1, least=64))
     path, reported = np.zeros(shape, np.int32), np.full(shape, np.nan, np.float32)
     path[row, column] = flat.path[echo]
     reported[row, column] = flat.reported[echo]

@@ -105,7 +105,8 @@ def _wall_detections(ring: Ring, data: BatchData, found: AdjustmentResult) -> _W
     landmark_map = found.state.landmark_map
     landmarks, candidates = (jax.tree.map(jnp.asarray, x) for x in (landmark_map.landmarks, landmark_map.candidates))
     poses, map_index = jnp.asarray(found.state.poses), jnp.asarray(data.map_index)
-    angle = np.asarray(kernels.off_axis_angles(ring.sensors, landmarks, candidates, poses, map_index))
+    motion = None if data.path_pose is None else jnp.asarray(data.path_pose[:, : ring.count])
+    angle = np.asarray(kernels.off_axis_angles(ring.sensors, landmarks, candidates, poses, map_index, motion))
     detected = np.zeros(angle.shape, dtype=bool)
     scan, echo = np.nonzero(found.used & (data.path < ring.count))
     detected[scan, found.candidate[scan, echo], data.path[scan, echo]] = True
@@ -115,5 +116,7 @@ def _wall_detections(ring: Ring, data: BatchData, found: AdjustmentResult) -> _W
     scan, echo = np.nonzero(np.isfinite(data.reported) & (data.path < ring.count) & ~found.used)
     ambiguous[scan, data.path[scan, echo]] = True
     kept = np.isfinite(angle) & is_wall & (~ambiguous[:, None] | detected)
+    if data.measured is not None:
+        kept &= data.measured[:, None, : ring.count]
     _, _, sensor = np.nonzero(kept)
     return _WallDetections(sensor, angle[kept], detected[kept])

@@ -65,6 +65,10 @@ class BatchData:
     """Absolute convergence tolerance of the cost (half a sum of squares in units of sigma)."""
     wall_explained: Bool[np.ndarray, "scans echoes"] | None = None
     """Echoes that a wall of their own scan explains: they are not assigned to points of the map. None: unknown."""
+    measured: Bool[np.ndarray, "scans paths"] | None = None
+    """Paths that each scan measured, whether or not they heard anything; None: all of them."""
+    path_pose: Float[np.ndarray, "scans paths 3"] | None = None
+    """scan_from_robot when each path was measured, metres and radians; None: all at the pose of the scan."""
     min_echoes_per_landmark: int = 1
     """Echoes of a landmark are used only in scans with at least this many of them. A pose that is hardly constrained in
     one direction would otherwise move to where one or two echoes of an unmapped object fit a landmark."""
@@ -91,7 +95,7 @@ class BatchData:
             settings: priors and array sizes.
         """
         flats = [FlatEchoes.from_log(ring, log)[0] for log in logs]
-        fresh = [is_fresh_reading(flat) for flat in flats]  # repeated readings are no new measurements
+        fresh = [_is_new(log, flat) for log, flat in zip(logs, flats, strict=True)]
         used, counts = [], []
         for log, flat, is_fresh, measured in zip(logs, flats, fresh, odometry, strict=True):
             count = np.bincount(flat.scan[is_fresh], minlength=len(log))
@@ -114,6 +118,8 @@ class BatchData:
             odometry_information=np.zeros((scans, 3)),
             scan_rows=tuple(used),
             first_row=tuple(begin[:-1].tolist()),
+            measured=_by_path(scans, begin, used, [flat.measured for flat in flats], np.ones(len(ring.paths), bool)),
+            path_pose=_by_path(scans, begin, used, [flat.path_pose for flat in flats], np.zeros((len(ring.paths), 3))),
         )
         for number, (log, flat, is_fresh, measured) in enumerate(zip(logs, flats, fresh, odometry, strict=True)):
             data._fill_echoes(number, log, flat, is_fresh)
@@ -149,6 +155,11 @@ class BatchData:
         """Number of echoes."""
         return int(np.isfinite(self.reported).sum())
 
+    @cached_property
+    def motion(self) -> Float[np.ndarray, "scans echoes 3"] | None:
+        """scan_from_robot when each echo was measured, metres and radians; None: all at the pose of the scan."""
+        return None if self.path_pose is None else self.path_pose[np.arange(len(self.path))[:, None], self.path]
+
     @property
     def scan_count(self) -> int:
         """Number of scans, without padding."""
@@ -179,3 +190,26 @@ class BatchData:
             pose[rows] = poses[first : first + len(rows)]
             out.append(replace(log, pose=pose))
         return out
+
+
+def _is_new(log: Log, flat: FlatEchoes) -> Bool[np.ndarray, " echoes"]:
+    """Echoes that are measurements of their own. A log without ages and silent readings does not say which are."""
+    declared = not len(log.asked) or log.age.any()
+    return np.ones(len(flat.scan), bool) if declared else is_fresh_reading(flat)
+
+
+def _by_path(
+    scans: int,
+    begin: Int[np.ndarray, " logs+1"],
+    used: Sequence[Int[np.ndarray, " _"]],
+    values: Sequence[np.ndarray | None],
+    default: np.ndarray,
+) -> np.ndarray | None:
+    """Values of the paths of all used scans, one row per scan; None if no log has any."""
+    if all(value is None for value in values):
+        return None
+    out = np.tile(default, (scans, *[1] * default.ndim))
+    for first, rows, value in zip(begin[:-1].tolist(), used, values, strict=True):
+        if value is not None:
+            out[first : first + len(rows)] = value[rows]
+    return out

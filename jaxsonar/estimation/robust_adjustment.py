@@ -131,6 +131,7 @@ def least_squares_problem(
             reported=jnp.asarray(np.nan_to_num(data.reported)),
             reflection=to_jax(reflection),
             weight=jnp.asarray(weight),
+            motion=None if data.motion is None else jnp.asarray(data.motion),
         ),
         prior_poses=jnp.asarray(data.poses),
         prior_information=jnp.asarray(data.prior_information),
@@ -205,6 +206,9 @@ class _GncJob:
         rows, columns = data.packed_echoes
         scan = rows[:, 0]
         max_range = float(self.ring.max_range) + settings.range_margin
+        motion = data.motion
+        if motion is not None:
+            max_range += float(np.hypot(motion[..., 0], motion[..., 1]).max())
         in_range = landmark_map.candidates_in_range(state.poses, data.map_index, max_range)
         found = kernels.associate(
             kernels.apply_parameters(self.ring.sensors, jnp.asarray(self.basis.columns @ state.coordinates)),
@@ -215,6 +219,7 @@ class _GncJob:
             jnp.asarray(data.path[rows, columns]),
             jnp.asarray(data.reported[rows, columns]),
             jnp.asarray(in_range[scan]),
+            None if motion is None else jnp.asarray(motion[rows, columns]),
         )
         candidate, residual, competitor_gap = np.full(data.path.shape, -1), *np.full((2, *data.path.shape), np.inf)
         for whole, part in zip(

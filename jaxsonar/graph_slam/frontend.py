@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.detection.local_model import LocalModel
@@ -20,6 +20,8 @@ from jaxsonar.geometry.se2 import diagonal_covariance, propagate, relative, tang
 from jaxsonar.graph_slam.feature_association import FeatureMeasurements, associate_features, feature_measurements
 from jaxsonar.graph_slam.scan_echoes import ScanEchoes, known_walls_missed, without_padding
 from jaxsonar.loop_closure.submap import Submap
+from jaxsonar.scans.measured_directions import directions_of_paths, stacked_directions
+from jaxsonar.scans.measured_paths import full_wall_paths, measured_paths
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -75,6 +77,8 @@ class SubmapState:
     """submap_from_robot of each of these scans."""
     covariances: tuple[Float[np.ndarray, "3 3"], ...] = ()
     """Covariances of ``poses``."""
+    directions: tuple[Bool[np.ndarray, " directions"] | None, ...] = ()
+    """Directions that each of these scans measured (``directions_of_paths``); None: all paths were measured."""
     odometry: Float[np.ndarray, "3"] | None = None
     """Odometry of the scan to which the pose of the belief belongs; None if it had none."""
     dead_reckoned: int = 0
@@ -165,6 +169,7 @@ def update_pose_only(
         rows=updated.rows,
         poses=updated.poses,
         covariances=updated.covariances,
+        directions=updated.directions,
         dead_reckoned=state.dead_reckoned + 1,
     )
 
@@ -198,8 +203,11 @@ def update(
         state = replace(state, sum_of_squares=credit * first**2, dof=credit)
     noise = state.sigma if sigma is None else sigma
     prior, features = state.belief, feature_measurements(model)
-    echoes = ScanEchoes.of(ring, scan, path_pose)
+    echoes, measured = ScanEchoes.of(ring, scan, path_pose), measured_paths(ring, scan.as_log())[0]
+    directions = None if measured.all() else directions_of_paths(ring, measured, path_pose)
     full_wall = float(np.asarray(ring.exact_paths.width).sum() / (2 * np.pi))
+    if directions is not None:
+        full_wall = float(full_wall_paths(ring, measured[None].astype(np.float64))[0])
     with jax.enable_x64(True):
         # 1. Associate features with landmarks; update the pose with the echoes of these features.
         first_association = associate_features(prior, features, full_wall_echoes=full_wall)
@@ -210,7 +218,7 @@ def update(
         # 3. If the track is lost, this place must not become part of the submap.
         unknown_place = len(features.kind) > 1 and len(state.scan_counts) > 1
         unknown_place = unknown_place and not (first_association.landmark >= 0).any()
-        suspect = unknown_place and known_walls_missed(ring, prior, state.scan_counts, scan, path_pose)
+        suspect = unknown_place and known_walls_missed(ring, prior, state.scan_counts, scan, path_pose, measured)
         # 4. Add new landmarks.
         new = np.flatnonzero(association.is_new & (add_landmarks and not suspect))
         belief = _with_new_landmarks(prior, features.take(new), np.asarray(found.belief.pose))
@@ -234,6 +242,7 @@ def update(
         rows=(*state.rows, row),
         poses=(*state.poses, belief.pose),
         covariances=(*state.covariances, belief.covariance[:3, :3]),
+        directions=(*state.directions, directions),
         sum_of_squares=state.sum_of_squares + squares,
         dof=state.dof + len(residual) * SETTINGS.dof_per_echo,
         track_loss_count=state.track_loss_count + 1 if suspect else 0,
@@ -261,6 +270,7 @@ def finish_submap(state: SubmapState) -> Submap:
         rows=np.array(state.rows, dtype=np.int64),
         poses=np.array(state.poses).reshape(-1, 3),
         pose_covariances=np.array(state.covariances).reshape(-1, 3, 3),
+        directions=stacked_directions(state.directions),
     )
 
 

@@ -16,6 +16,8 @@ from jaxsonar.graph_slam.tracker import Tracker, TrackerState
 from jaxsonar.loop_closure.submap_graph import SubmapGraph
 from jaxsonar.registration.agglomerative_registration import register_by_ranges
 from jaxsonar.registration.sequential_registration import register_scans
+from jaxsonar.scans.firing_poses import path_poses
+from jaxsonar.scans.measured_directions import measured_directions
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.smoothing.covisibility import Traversals
@@ -128,9 +130,12 @@ def _track(
     """Track all scans of a log with odometry, and close loops; without local models the tracker detects them."""
     # 1. The pose of every scan in its submap, and the graph of submaps.
     state, found, step_ms = tracker.start(), [], np.zeros(len(log))
+    motion = path_poses(tracker.ring, log)
     for row in range(len(log)):
         begin = perf_counter()
-        state, step = tracker.step(state, log[row], model=None if models is None else models[row])
+        path_pose = None if motion is None else motion[row]
+        model = None if models is None else models[row]
+        state, step = tracker.step(state, log[row], model=model, path_pose=path_pose)
         step_ms[row] = 1e3 * (perf_counter() - begin)
         found.append(step.model)
         progress("tracking", row + 1, len(log))
@@ -153,7 +158,8 @@ def _register(
         cluster = register_by_ranges(ring, log, models, sigma=sigma, progress=report)[0]
         return cluster.poses, cluster.pose_covariance
     scale = SMOOTHING_SETTINGS.local_model_noise_scale
-    poses = register_scans(models, None, noise_scale=scale, progress=report)[0]
+    directions = measured_directions(ring, log)
+    poses = register_scans(models, None, noise_scale=scale, directions=directions, progress=report)[0]
     return poses, np.full((len(log), 3, 3), np.nan)
 
 

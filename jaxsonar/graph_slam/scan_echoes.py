@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
@@ -138,6 +138,7 @@ def known_walls_missed(
     scan_counts: Int[np.ndarray, " landmarks"],
     scan: Scan,
     path_pose: Float[np.ndarray, "paths 3"] | None,
+    measured: Bool[np.ndarray, " paths"],
 ) -> bool:
     """Whether most of the sensors that face known walls receive no echo of them: the robot was moved by hand.
 
@@ -150,16 +151,17 @@ def known_walls_missed(
         scan_counts: number of scans that observed each landmark.
         scan: its echoes.
         path_pose: as for ``ScanEchoes.of``.
+        measured: paths that the scan measured; the others are neither detections nor missed ones.
     """
-    direct = np.flatnonzero(ring.paths[:, 0] == ring.paths[:, 1])
+    direct = np.flatnonzero((ring.paths[:, 0] == ring.paths[:, 1]) & measured)
     paths = jax.tree.map(lambda leaf: leaf[direct], ring.exact_paths)
     if path_pose is not None:
         paths = _transform_paths(paths, path_pose[direct])
-    # First measured range of every direct path.
-    measured = np.full(len(ring.paths), np.inf)
+    # First range of every direct path.
+    nearest = np.full(len(ring.paths), np.inf)
     path = ring.path_index[scan.tx, scan.rx]
     ranges = np.asarray(ring.corrected(scan.range, scan.tx, scan.rx), dtype=np.float64)
-    np.minimum.at(measured, path[path >= 0], np.where(ranges > 0, ranges, np.inf)[path >= 0])
+    np.minimum.at(nearest, path[path >= 0], np.where(ranges > 0, ranges, np.inf)[path >= 0])
     # Expected range of the nearest known wall.
     landmarks = belief.landmarks
     count = len(landmarks.kind)
@@ -168,7 +170,7 @@ def known_walls_missed(
     reliable = (landmarks.kind == kernels.PLANE) & (scan_counts >= SETTINGS.min_wall_scans)
     expected = np.where(reliable[:, None], expected, np.inf).min(axis=0)
     facing = expected < SETTINGS.reliable_range_fraction * float(ring.max_range)
-    detected = np.abs(measured[direct][facing] - expected[facing]) < SETTINGS.wall_echo_tolerance
+    detected = np.abs(nearest[direct][facing] - expected[facing]) < SETTINGS.wall_echo_tolerance
     return int(facing.sum()) >= SETTINGS.min_facing_sensors and int((~detected).sum()) > int(detected.sum())
 
 

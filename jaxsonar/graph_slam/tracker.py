@@ -24,6 +24,7 @@ from jaxsonar.graph_slam.frontend import (
 from jaxsonar.graph_slam.scan_echoes import SETTINGS as ECHO_SETTINGS
 from jaxsonar.loop_closure.submap_graph import SubmapGraph
 from jaxsonar.loop_closure.verification import ClosureDecision
+from jaxsonar.scans.firing_poses import path_poses_of_scan
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -98,11 +99,14 @@ class Tracker:
             state: after the scan before.
             scan: its pose is odometry; NaN where there is none.
             model: its local model, if it is known already.
-            path_pose: pose of the robot when each path fired, as ``local_model`` takes it.
+            path_pose: pose of the robot when each path fired, as ``local_model`` takes it; if left out, interpolated in
+                ``Scan.odometry``.
 
         Raises:
             SonarError: a sensor number that the ring does not have.
         """
+        if path_pose is None:
+            path_pose = path_poses_of_scan(self.ring, scan)
         # 1. Detect walls and points.
         if model is None:
             model = local_model(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from jaxsonar.localization.settings import SETTINGS
 from jaxsonar.registration.features import scan_features
 from jaxsonar.registration.pose_hypotheses import pose_hypotheses, thin_poses
 from jaxsonar.registration.pose_likelihood import pose_log_likelihood, refine_poses
+from jaxsonar.scans.firing_poses import path_poses
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -70,6 +72,11 @@ class HypothesisTracker:
     """NaN where a scan has none."""
     sigma: float | None
     odometry_noise: OdometryNoise
+
+    @cached_property
+    def path_pose(self) -> Float[np.ndarray, "scans paths 3"] | None:
+        """scan_from_robot when each path was measured; None: all at the pose of the scan."""
+        return path_poses(self.ring, self.log)
 
     @property
     def rows(self) -> Int[np.ndarray, " rows"]:
@@ -182,7 +189,16 @@ class HypothesisTracker:
         belief = self.known_map.belief_at(pose, covariance, self.ring.max_range)
         scan = self.log[row]
         prior = SubmapState(belief, np.full(len(belief.landmarks.kind), 2, np.int64))
-        found = update(self.ring, prior, scan, self.models[row], row=row, sigma=sigma, add_landmarks=False)
+        found = update(
+            self.ring,
+            prior,
+            scan,
+            self.models[row],
+            row=row,
+            sigma=sigma,
+            path_pose=None if self.path_pose is None else self.path_pose[row],
+            add_landmarks=False,
+        )
         pose, covariance = wrap_pose(found.pose), found.pose_covariance
         # Log-likelihood ratio of an explained echo against one from anywhere.
         gain = float(np.log(self.ring.max_range / (sigma * np.sqrt(2 * np.pi))))
@@ -193,7 +209,7 @@ class HypothesisTracker:
             (*hypothesis.poses, pose),
             (*hypothesis.covariances, covariance),
             hypothesis.log_likelihood + nats,
-            hypothesis.echoes + len(scan.range),
+            hypothesis.echoes + scan.echo_count,
             hypothesis.explained + found.explained,
             hypothesis.is_start,
         )

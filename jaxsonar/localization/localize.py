@@ -23,6 +23,7 @@ from jaxsonar.localization.known_map import KnownMap
 from jaxsonar.localization.settings import SETTINGS, AcceptanceSettings
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.registration.sequential_registration import register_scans
+from jaxsonar.scans.measured_directions import measured_directions
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -94,7 +95,7 @@ def localize(
     for model in local_models(ring, log, sigma=sigma):
         models.append(model)
         progress("local models", len(models), len(log))
-    odometry, noise = _odometry(log, models), odometry_noise or OdometryNoise()
+    odometry, noise = _odometry(ring, log, models), odometry_noise or OdometryNoise()
     tracker = HypothesisTracker(ring, KnownMap.of(world), log, models, odometry, sigma, noise)
     if not len(tracker.rows):
         raise SonarError("localize: no scan could be registered to another; allowed are scans with odometry, or nearby")
@@ -133,12 +134,15 @@ def _check(world: GlobalMap, log: Log, start: Sequence[float] | None, sigma: flo
         raise SonarError(f"localize: start {tuple(start)}; allowed are x, y (m) and theta (rad)")
 
 
-def _odometry(log: Log, models: Sequence[LocalModel]) -> Float[np.ndarray, "scans 3"]:
+def _odometry(ring: Ring, log: Log, models: Sequence[LocalModel]) -> Float[np.ndarray, "scans 3"]:
     """Odometry of the log; without it, poses by registration of the scans. NaN where a scan has none."""
     known = np.asarray(np.isfinite(log.pose).all(axis=1))
     if known.any():
         return np.where(known[:, None], log.pose, np.nan)
-    clusters = register_scans(models, None, noise_scale=SETTINGS.noise_scale) if len(models) > 1 else []
+    clusters = []
+    if len(models) > 1:
+        directions = measured_directions(ring, log)
+        clusters = register_scans(models, None, noise_scale=SETTINGS.noise_scale, directions=directions)
     if clusters and np.isfinite(clusters[0][:, 0]).sum() > 1:
         return clusters[0]
     # Use the one scan with the most features.

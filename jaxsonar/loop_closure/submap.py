@@ -7,7 +7,7 @@ submaps.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.registration.features import Features, landmark_features
@@ -31,6 +31,8 @@ class Submap:
     """submap_from_robot of these scans."""
     pose_covariances: Float[np.ndarray, "poses 3 3"]
     """Their covariances."""
+    directions: Bool[np.ndarray, "poses directions"] | None = None
+    """Directions that each of them measured (``measured_directions``), in the robot frame; None: all."""
 
     def __len__(self) -> int:
         return len(self.landmarks.kind)

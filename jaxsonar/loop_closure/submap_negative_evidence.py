@@ -93,6 +93,9 @@ def _one_sided(
     due = (distance > SETTINGS.min_range) & (distance < reliable_range) & other.is_certain
     due &= np.abs(along) < walls.half_length - SETTINGS.end_margin
     due &= ~_has_wall(viewer, other, poses, tolerance)[:, None]
+    if viewer.directions is not None:
+        normal = walls.theta + back[:, 2, None, None]
+        due &= viewer.measured_from(np.broadcast_to(normal, due.shape))
     foot = viewpoint[:, :, None] + 0.9 * distance[..., None] * walls.normal
     nats += _missed_nats(viewer, other, back, viewpoint, foot, due).sum(-1)
     # 3. Missed points.
@@ -102,6 +105,8 @@ def _one_sided(
     own = transform_points(poses[:, None], viewer.features.point)
     nearest = np.linalg.norm(own[:, :, None] - walls.point, axis=-1).min(axis=1, initial=np.inf)
     due &= ~(nearest < tolerance + 0.1)[:, None]
+    if viewer.directions is not None:
+        due &= viewer.measured_from(np.arctan2(offset[..., 1], offset[..., 0]) + back[:, 2, None, None])
     missed = _missed_nats(viewer, other, back, viewpoint, viewpoint[:, :, None] + 0.9 * offset, due)
     return nats + (other.point_factor * missed).sum(-1)
 

@@ -9,6 +9,7 @@ from jaxsonar import kernels
 from jaxsonar.loop_closure.settings import SETTINGS
 from jaxsonar.loop_closure.submap import Submap
 from jaxsonar.registration.features import Features
+from jaxsonar.scans.measured_directions import direction_sector, rotated_directions
 
 
 class SubmapView(NamedTuple):
@@ -28,6 +29,17 @@ class SubmapView(NamedTuple):
     """Start of each line of sight, one robot radius behind the viewpoint, metres."""
     sight_end: Float[np.ndarray, "sights 2"]
     """End of each line of sight, just before the detected reflector, metres."""
+    directions: Bool[np.ndarray, "viewpoints directions"] | None = None
+    """Directions that were measured at each viewpoint (``measured_directions``), in the frame of the submap; None: all.
+    """
+
+    def measured_from(
+        self, directions: Float[np.ndarray, "poses viewpoints reflectors"]
+    ) -> Bool[np.ndarray, "poses viewpoints reflectors"]:
+        """Whether directions (radians, frame of the submap) were measured at each viewpoint."""
+        if self.directions is None:
+            return np.ones(directions.shape, dtype=bool)
+        return self.directions[np.arange(len(self.viewpoint))[:, None], direction_sector(directions)]
 
     @property
     def center(self) -> Float[np.ndarray, "2"]:
@@ -46,6 +58,11 @@ class SubmapView(NamedTuple):
         chosen = np.linspace(0, max(len(submap.poses) - 1, 0), SETTINGS.viewpoints)
         chosen = np.unique(chosen.round().astype(int))
         viewpoint = submap.poses[chosen, :2] if len(submap.poses) else np.zeros((1, 2))
+        measured = None
+        if submap.directions is not None and len(submap.poses):
+            headings = submap.poses[chosen, 2].tolist()
+            pairs = zip(submap.directions[chosen], headings, strict=True)
+            measured = np.array([rotated_directions(one, heading) for one, heading in pairs])
         # Lines of sight: to each wall from all viewpoints whose foot point is on it, to each point from the nearest.
         offset = viewpoint[:, None] - features.reference
         along, distance = (offset * features.tangent).sum(-1), -(offset * features.normal).sum(-1)
@@ -61,7 +78,7 @@ class SubmapView(NamedTuple):
         factor = np.where(features.is_corner, SETTINGS.corner_factor, SETTINGS.edge_factor)
         certain = submap.scan_counts >= SETTINGS.min_scans
         wall = submap.landmarks.kind == kernels.PLANE
-        return cls(submap.walls, features, certain[wall], factor * certain[~wall], viewpoint, start, end)
+        return cls(submap.walls, features, certain[wall], factor * certain[~wall], viewpoint, start, end, measured)
 
 
 class SubmapNeighborhood(NamedTuple):

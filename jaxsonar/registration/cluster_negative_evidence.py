@@ -25,6 +25,7 @@ def cluster_negative_evidence(observations: ScanObservations, cluster: ScanClust
     due = view.in_front & (view.off_axis < SETTINGS.inner_cone) & (view.prediction.range < reliable_range)
     due &= ~wall[:, None, None] | _is_observed(cluster, view.along, SETTINGS.due_margin)
     due &= (cluster.kind != kernels.EDGE)[:, None, None]
+    due &= observations.measured[cluster.rows][:, wide]
     # Paths that detected something there, or whose earlier echo masks it.
     behind = view.prediction.range[..., None] - observations.ranges[cluster.rows][:, wide]
     tolerance = SETTINGS.range_tolerance + 3 * observations.sigma

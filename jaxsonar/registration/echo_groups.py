@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 from jaxsonar import kernels
@@ -16,6 +16,7 @@ from jaxsonar.geometry.se2 import unit
 from jaxsonar.registration.reflector_fit import fit_reflectors
 from jaxsonar.registration.settings import RANGE_SETTINGS as SETTINGS
 from jaxsonar.scans.flat_echoes import corrected_echoes
+from jaxsonar.scans.measured_paths import measured_paths
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.range_models import KINDS, RANGE_OF_KIND
 from jaxsonar.sensors.ring import Ring
@@ -74,6 +75,8 @@ class ScanObservations:
     """All ranges by path, metres, sorted; infinite where there is no echo."""
     paths: kernels.EchoPaths
     """Of the ring, NumPy arrays."""
+    measured: Bool[np.ndarray, "scans paths"]
+    """Paths that each scan measured, whether or not they heard anything."""
 
     @classmethod
     def of(cls, ring: Ring, log: Log, models: Sequence[LocalModel], sigma: float) -> "ScanObservations":
@@ -115,7 +118,7 @@ class ScanObservations:
             point=np.array([one.point for _, one in groups], dtype=np.float64).reshape(-1, 2),
             log_prior=np.array([one.log_prior for _, one in groups], dtype=np.float64).reshape(-1, 3),
         )
-        return cls(ring, sigma, some, rest, table, ranges, paths)
+        return cls(ring, sigma, some, rest, table, ranges, paths, measured_paths(ring, log))
 
     def paths_at(self, rows: Int[np.ndarray, " rows"]) -> kernels.EchoPaths:
         """Some of the paths."""

@@ -41,7 +41,7 @@ def fuse_scan(
     """
     seen = scan.transform(world_from_robot)
     segments = seen.segment
-    known = known._replace(**{name: getattr(known, name).copy() for name in Features._fields[1:-1]})
+    known = known._replace(**{name: getattr(known, name).copy() for name in Features._fields[1:10]})
     for row, match in enumerate(wall):
         if match >= 0:
             _update_wall(known, int(match), segments[row], float(seen.theta[row]), seen.covariance[row])

@@ -36,6 +36,8 @@ class Features(NamedTuple):
     """Standard deviation of each coordinate, metres."""
     detections: Float[np.ndarray, "reflectors 2"] = np.zeros((0, 2))
     """(distance, direction) of every reflector of a scan, including undecided ones; empty for maps."""
+    directions: Bool[np.ndarray, " directions"] | None = None
+    """Directions that a scan measured (``scans.measured_directions``), robot frame; None: all of them."""
 
     @property
     def normal(self) -> Float[np.ndarray, "walls 2"]:
@@ -125,12 +127,15 @@ def no_features() -> Features:
     return Features(walls, none, none, np.zeros((0, 2, 2)), walls, none, none, walls, np.zeros(0, dtype=bool), none)
 
 
-def scan_features(model: LocalModel, *, noise_scale: float = 1.0) -> Features:
+def scan_features(
+    model: LocalModel, *, noise_scale: float = 1.0, directions: Bool[np.ndarray, " directions"] | None = None
+) -> Features:
     """Features of a local model in the robot frame.
 
     Args:
         model: lines, points and undecided reflectors of one scan.
         noise_scale: factor on the added noise: 1 for an uncalibrated ring, less for a calibrated one.
+        directions: directions that the scan measured; None: all of them.
     """
     theta = np.array([line.theta for line in model.lines], dtype=np.float64)
     segment = np.array([line.segment for line in model.lines], dtype=np.float64).reshape(-1, 2, 2)
@@ -160,6 +165,7 @@ def scan_features(model: LocalModel, *, noise_scale: float = 1.0) -> Features:
         is_corner=np.array([one.kind == "corner" for one in points], dtype=bool),
         point_sd=np.sqrt(noise + (noise_scale * SETTINGS.point_sd_floor) ** 2),
         detections=np.array(reflectors, dtype=np.float64).reshape(-1, 2),
+        directions=directions,
     )
 
 

@@ -7,6 +7,7 @@ from jaxsonar.geometry.se2 import rotate, wrap_angle
 from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.registration.features import Features, crosses_walls
 from jaxsonar.registration.settings import FEATURE_SETTINGS as SETTINGS
+from jaxsonar.scans.measured_directions import direction_sector
 
 
 def scan_negative_evidence(
@@ -50,6 +51,8 @@ def scan_negative_evidence(
     turn = wrap_angle(known.theta[:, None] - poses[:, 2, None, None] - scan.detections[:, 1])
     due &= ~(near & (np.abs(turn) < SETTINGS.detection_match[1])).any(axis=-1)
     due &= ~(wall[..., None] == np.arange(len(known.theta))).any(axis=1)
+    if scan.directions is not None:
+        due &= scan.directions[direction_sector(known.theta - poses[:, 2, None])]
     # The farther the foot point is from the observed part, the less certain it is that the wall is there.
     beyond = np.maximum(known.beyond((displacement * known.tangent).sum(-1)), 0.0)
     probability = SETTINGS.detection_probability - np.where(

@@ -30,6 +30,7 @@ def register_scans(
     odometry_sd: float = SETTINGS.odometry_sd,
     margin: float = SETTINGS.margin,
     noise_scale: float = 1.0,
+    directions: Bool[np.ndarray, "scans directions"] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Float[np.ndarray, "scans 3"]]:
     """Poses of the scans of an unknown place, accurate to centimetres and degrees: a start for an adjustment.
@@ -45,6 +46,7 @@ def register_scans(
             more scans, but some of them wrongly.
         noise_scale: factor on the noise added to features: 1 for a ring that may be centimetres off, less for a
             calibrated one.
+        directions: directions that each scan measured (``measured_directions``); None: all of them.
         progress: called with (scans processed, scans) now and then.
 
     Returns:
@@ -62,7 +64,7 @@ def register_scans(
             f"register_scans: odometry of shape {given.shape}; allowed is ({count}, 3): x, y, theta for every scan"
         )
     given[~np.isfinite(given).all(axis=1)] = np.nan
-    scans = [scan_features(model, noise_scale=noise_scale) for model in models]
+    scans = _features(models, noise_scale, directions)
     registration = _Registration(scans, MotionModel(given, odometry_sd), margin)
     # 1. Scan after scan; a new cluster is started where the robot is lost.
     clusters = registration.clusters(progress)
@@ -81,6 +83,7 @@ def register_remaining(
     odometry_sd: float = SETTINGS.odometry_sd,
     margin: float = SETTINGS.margin,
     noise_scale: float = 1.0,
+    directions: Bool[np.ndarray, "scans directions"] | None = None,
 ) -> Float[np.ndarray, "scans 3"]:
     """Register scans without a pose to the map of the scans that have one.
 
@@ -91,12 +94,13 @@ def register_remaining(
         odometry_sd: as for ``register_scans``.
         margin: as for ``register_scans``.
         noise_scale: as for ``register_scans``.
+        directions: as for ``register_scans``.
 
     Returns:
         (scans, 3): the given poses, unchanged, and those that were found; NaN for the remaining scans.
     """
     given = np.full((len(models), 3), np.nan) if odometry is None else np.array(odometry, dtype=np.float64)
-    scans = [scan_features(model, noise_scale=noise_scale) for model in models]
+    scans = _features(models, noise_scale, directions)
     registration = _Registration(scans, MotionModel(given, odometry_sd), margin)
     base = _FeatureCluster(len(models))
     for scan in np.flatnonzero(np.isfinite(poses[:, 0])):
@@ -105,6 +109,15 @@ def register_remaining(
     registration.fill(base, free)
     others = [one for one in registration.clusters(None, free & ~base.registered) if one.count > 1]
     return registration.merged([base, *others])[0].poses
+
+
+def _features(
+    models: Sequence[LocalModel], noise_scale: float, directions: Bool[np.ndarray, "scans directions"] | None
+) -> list[Features]:
+    """Features of all scans."""
+    rows = [None] * len(models) if directions is None else list(directions)
+    pairs = zip(models, rows, strict=True)
+    return [scan_features(model, noise_scale=noise_scale, directions=row) for model, row in pairs]
 
 
 def _from_first(

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar.geometry.se2 import compose, interpolate, relative
 from jaxsonar.scans.measured_paths import measurement_times
-from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
 
@@ -68,6 +68,14 @@ def path_poses(ring: Ring, log: Log) -> Float[np.ndarray, "scans paths 3"] | Non
     poses = np.zeros((len(log), len(ring.paths), 3))
     poses[log.echo_scan[known], path[known]] = motion[known]
     return poses
+
+
+def path_poses_of_scan(ring: Ring, scan: Scan) -> Float[np.ndarray, "paths 3"] | None:
+    """The row of one scan in ``path_poses``; None if every reading belongs to the pose of the scan."""
+    if scan.odometry is None:
+        return None
+    poses = path_poses(ring, scan.as_log())
+    return None if poses is None else poses[0]
 
 
 def group_firings(log: Log) -> Log:

@@ -16,6 +16,7 @@ from jaxsonar.geometry.se2 import compose, relative
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.registration.sequential_registration import register_remaining
+from jaxsonar.scans.measured_directions import measured_directions
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import check_window
 from jaxsonar.sensors.ring import Ring
@@ -122,7 +123,12 @@ def smooth(
             break
         report("registering scans without a pose")
         registered = register_remaining(
-            models or [], fit.poses, measured, margin=margin, noise_scale=SETTINGS.local_model_noise_scale
+            models or [],
+            fit.poses,
+            measured,
+            margin=margin,
+            noise_scale=SETTINGS.local_model_noise_scale,
+            directions=measured_directions(ring, log),
         )
         if has_pose(registered).sum() > has_pose(fit.poses).sum():
             fit = _better_fit(fit, smoother.fit(registered))

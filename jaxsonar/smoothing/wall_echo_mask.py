@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.estimation.batch_data import BatchData
 from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
+from jaxsonar.geometry.se2 import rotate
 from jaxsonar.sensors.range_models import plane_range
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.smoothing.settings import SETTINGS
@@ -32,9 +33,13 @@ def wall_explained_mask(ring: Ring, data: BatchData, models: Sequence[LocalModel
     ranges = np.asarray(ring.corrected(data.reported, tx.T, rx.T), dtype=np.float64)
     for row, scan in enumerate(data.scan_rows[0].tolist()):
         model, path = models[scan], data.path[row]
+        middle, base = midpoint[path], half_baseline[path]
+        if data.path_pose is not None:
+            motion = data.path_pose[row, path]
+            middle, base = motion[:, :2] + rotate(middle, motion[:, 2]), rotate(base, motion[:, 2])
         gate = GNC_SETTINGS.gate_sigmas * (model.sigma if model.sigma > 0 else SETTINGS.default_sigma)
         for line in model.lines:
-            expected = plane_range(np.array([line.rho, line.theta]), midpoint[path], half_baseline[path]).range
+            expected = plane_range(np.array([line.rho, line.theta]), middle, base).range
             detected = np.isin(path, ring.path_index[line.paths[:, 0], line.paths[:, 1]])
             mask[row] |= detected & (np.abs(ranges[row] - expected) < gate)  # False for NaN: no echo
     return mask
