@@ -132,11 +132,15 @@ def load_inputs(options: argparse.Namespace) -> tuple["Ring", "Log"]:
 
 def load_all_inputs(options: argparse.Namespace, filenames: Sequence[str]) -> tuple["Ring", list["Log"]]:
     """Load the ring of a command and several logs, as ``load_inputs``."""
+    from jaxsonar.recordings.prepared_log import prepared_log
     from jaxsonar.sensors.ring_toml import load_ring
 
     messages = InputMessages(strict=options.strict)
-    ring = load_ring(options.ring)
-    logs = [prepared_log(ring, read_log(name, options, messages, ring=ring), messages, name) for name in filenames]
+    ring, logs = load_ring(options.ring), []
+    for name in filenames:
+        log = read_log(name, options, messages, ring=ring)
+        with errors_in(name):
+            logs.append(prepared_log(ring, log, on_note=messages.note))
     messages.check()
     return ring, logs
 
@@ -171,17 +175,3 @@ def read_log(name: str, options: argparse.Namespace, messages: InputMessages, *,
         else:
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     return log
-
-
-def prepared_log(ring: "Ring", log: "Log", messages: InputMessages, name: str) -> "Log":
-    """A log as computations need it: marks for no echo as silent readings, single firings merged into scans."""
-    from jaxsonar.scans.firing_poses import group_firings
-    from jaxsonar.scans.unheard_paths import unheard_warning
-
-    with errors_in(name):
-        if (text := unheard_warning(ring, log)) is not None:
-            messages.warn(text)
-        grouped = group_firings(log)
-    if grouped is not log:
-        messages.note(f"{plural(len(log), 'scan')} of single firings merged into {plural(len(grouped), 'scan')}")
-    return grouped

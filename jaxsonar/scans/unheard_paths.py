@@ -50,10 +50,11 @@ def unheard_warning(ring: Ring, log: Log) -> str | None:
     offsets = unheard_offsets(ring, log)
     if not offsets:
         return None
-    kinds = ["direct echo" if k == 0 else f"echo from neighbor {k}" for k in offsets]
-    listed = " or ".join(kinds) if len(kinds) < 3 else f"{', '.join(kinds[:-1])} or {kinds[-1]}"
+    neighbors = [str(k) for k in offsets if k]
+    listed = " or ".join(filter(None, [", ".join(neighbors[:-1]), *neighbors[-1:]]))
+    kinds = ["no direct echo"] * (0 in offsets) + [f"no echo from neighbor {listed}"] * bool(neighbors)
     paths = int(np.isin(neighbor_offsets(ring), offsets).sum())
-    what = f"no {listed} among {log.echo_count} echoes, but {ring.name!r} lists {paths} such paths"
+    what = f"{' and '.join(kinds)} among {log.echo_count} echoes, but {ring.name!r} lists {paths} such paths"
     if 0 in offsets:
         return f"{what}; the device probably leaves direct echoes out; record them, or check tx and rx of the log"
     if offsets == list(range(offsets[0], ring.neighbors + 1)):
