@@ -89,8 +89,12 @@ def _unusable_scans(shard: Shard, ring: Ring, first_row: int, log: Log) -> dict[
 def _concatenate(logs: list[Log]) -> Log:
     if len(logs) == 1:
         return logs[0]
-    names = ("scan", "stamp", "pose", "tx", "rx", "range", "amplitude")
+    names = ("scan", "stamp", "pose", "tx", "rx", "range", "amplitude", "t", "age")
     empty = Log.from_scans([])
     columns = {name: np.concatenate([getattr(log, name) for log in (empty, *logs)]) for name in names}
     echoes = np.concatenate([np.zeros(1, np.int64), *(np.diff(log.start) for log in logs)])
-    return Log(start=np.cumsum(echoes), **columns)
+    if not logs:
+        return empty
+    motion = [log.motion for log in logs if log.motion is not None]
+    odometry = np.unique(np.concatenate(motion), axis=0) if motion else None
+    return Log(start=np.cumsum(echoes), **columns, asked=logs[0].asked, odometry=odometry)

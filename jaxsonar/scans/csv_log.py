@@ -1,4 +1,7 @@
-"""Scan logs as CSV: one row per echo, ``scan,stamp,x,y,theta,tx,rx,range`` and optionally ``amplitude``.
+"""Scan logs as CSV: one row per reading, ``scan,stamp,x,y,theta,tx,rx,range`` and optionally ``amplitude,age,t``.
+
+A row with ``tx`` and ``rx`` but without ``range`` is a path that fired and heard nothing. A scan without any reading
+has one row without all three. The optional columns may have any order; an empty ``age`` or ``t`` is 0.
 
 NumPy parses all rows of a block at once. Only if a block is invalid are its rows examined one by one, to find the first
 invalid field. Row numbers are lines of the file; the header is row 1.
@@ -19,7 +22,14 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.scan_log import ALLOWED, LARGEST_SENSOR, InvalidLogValue, Log
 
 COLUMNS = ("scan", "stamp", "x", "y", "theta", "tx", "rx", "range")
-OPTIONAL = "amplitude"
+OPTIONAL = ("amplitude", "age", "t")
+"""Optional columns after the others, in the order in which they are written."""
+UNUSED = {
+    "amplitude": "nothing, in a row without an echo",
+    "age": "nothing, in a row without a path",
+    "t": "nothing, in a row without a path",
+}
+"""Allowed in the optional columns of a row that cannot hold their value."""
 FIRST_ECHO_COLUMN = 5
 """First column that belongs to an echo; the columns before it belong to the scan and repeat in all of its rows."""
 
@@ -43,7 +53,7 @@ class _Rows(NamedTuple):
     pose: Float[np.ndarray, "rows 4"]
     """Stamp, x, y, theta."""
     echo: Float[np.ndarray, "rows fields"]
-    """tx, rx, range, and amplitude if the file has that column."""
+    """tx, rx, range, and the optional columns of the file, in its order."""
 
 
 def read_csv(filename: str | os.PathLike[str]) -> Log:
@@ -72,7 +82,14 @@ def read_csv_text(filename: str | os.PathLike[str], text: bytes) -> Log:
     return read_csv_rows(filename, csv_header(filename, header), body)
 
 
-def read_csv_rows(filename: str | os.PathLike[str], columns: tuple[str, ...], body: bytes, *, first: int = 2) -> Log:
+def read_csv_rows(
+    filename: str | os.PathLike[str],
+    columns: tuple[str, ...],
+    body: bytes,
+    *,
+    first: int = 2,
+    asked: Int[np.ndarray, "pairs 2"] | None = None,
+) -> Log:
     """As ``read_csv``, from complete rows of a file.
 
     Args:
@@ -80,9 +97,10 @@ def read_csv_rows(filename: str | os.PathLike[str], columns: tuple[str, ...], bo
         columns: columns that ``csv_header`` returned.
         body: rows, each with its LF.
         first: row number of the first of them in the file; the header is row 1.
+        asked: ``Log.asked`` of the whole file; derived from these rows if omitted.
     """
     source = _CsvBody(filename, columns, body, first)
-    return source.log(source.rows())
+    return source.log(source.rows(), asked)
 
 
 def csv_header(filename: str | os.PathLike[str], line: bytes) -> tuple[str, ...]:
@@ -91,7 +109,7 @@ def csv_header(filename: str | os.PathLike[str], line: bytes) -> tuple[str, ...]
     Raises:
         SonarError: these are not the columns of a scan log.
     """
-    wanted = f"allowed is {','.join(COLUMNS)} and optionally ,{OPTIONAL}"
+    wanted = f"allowed is {','.join(COLUMNS)} and optionally {', '.join(OPTIONAL)}"
     if not line:
         raise SonarError(f"{shown(filename)}: row 1: no header came; {wanted}")
     text = line.decode(errors="replace")
@@ -99,14 +117,14 @@ def csv_header(filename: str | os.PathLike[str], line: bytes) -> tuple[str, ...]
         raise SonarError(f"{shown(filename)}: row 1: this is no text; {wanted}")
     names = tuple(text.split(","))
     for k, name in enumerate(names):
-        if name not in (*COLUMNS, OPTIONAL):
+        if name not in COLUMNS + OPTIONAL:
             raise SonarError(f"{shown(filename)}: row 1: unknown column '{shown(name, 40)}'; {wanted}")
         if name in names[:k]:
             raise SonarError(f"{shown(filename)}: row 1: column '{name}' came twice; {wanted}")
     for name in COLUMNS:
         if name not in names:
             raise SonarError(f"{shown(filename)}: row 1: column '{name}' is missing; {wanted}")
-    if names not in (COLUMNS, (*COLUMNS, OPTIONAL)):
+    if names[: len(COLUMNS)] != COLUMNS:
         raise SonarError(f"{shown(filename)}: row 1: columns in the order {','.join(names)}; {wanted}")
     return names
 
@@ -131,18 +149,20 @@ class _CsvBody:
             begin = end
         return _Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
-    def log(self, rows: _Rows) -> Log:
+    def log(self, rows: _Rows, asked: Int[np.ndarray, "pairs 2"] | None) -> Log:
         """The log of parsed rows."""
-        tx, rx, reported = rows.echo[:, :3].T
-        amplitude = rows.echo[:, 3] if len(self.columns) > len(COLUMNS) else np.full(len(tx), np.nan)
-        for name, column in (("tx", tx), ("rx", rx)):
-            is_sensor = (column == np.floor(column)) & (column >= 0) & (column <= LARGEST_SENSOR)
-            self.check(~is_sensor, name, ALLOWED[name], unless=np.isnan(column))
-
-        no_echo = np.all(np.isnan(rows.echo[:, :3]), axis=1)
-        for name, column in (("tx", tx), ("rx", rx), ("range", reported)):
-            self.check(np.isnan(column), name, "tx, rx and range, all three or none of them", unless=no_echo)
-        self.check(no_echo & ~np.isnan(amplitude), OPTIONAL, "nothing, in a row without an echo")
+        column = dict(zip(self.columns[FIRST_ECHO_COLUMN:], rows.echo.T, strict=True))
+        tx, rx, reported = column["tx"], column["rx"], column["range"]
+        for name in ("tx", "rx"):
+            sensor = column[name]
+            is_sensor = (sensor == np.floor(sensor)) & (sensor >= 0) & (sensor <= LARGEST_SENSOR)
+            self.check(~is_sensor, name, ALLOWED[name], unless=np.isnan(sensor))
+        empty = np.all(np.isnan(rows.echo[:, :3]), axis=1)
+        for name in ("tx", "rx"):
+            self.check(np.isnan(column[name]), name, "tx and rx with or without a range, or none of them", unless=empty)
+        for name in self.columns[len(COLUMNS) :]:
+            unused = empty | np.isnan(reported) if name == "amplitude" else empty
+            self.check(unused & ~np.isnan(column[name]), name, UNUSED[name])
         unknown = np.isnan(rows.pose[:, 1:])
         for k, name in enumerate(("x", "y", "theta")):
             self.check(unknown[:, k], name, ALLOWED["pose"], unless=np.all(unknown, axis=1))
@@ -152,10 +172,11 @@ class _CsvBody:
         for k, name in enumerate(("stamp", "x", "y", "theta")):
             self.check(_later_row(follows & ~same[:, k]), name, "the same in every row of a scan")
         alone = "tx, rx and range, unless the row is the only one of its scan"
-        self.check(_later_row(follows & (no_echo[1:] | no_echo[:-1])), "tx", alone)
+        self.check(_later_row(follows & (empty[1:] | empty[:-1])), "tx", alone)
 
         first = np.flatnonzero(~_later_row(follows))[: len(tx)]
-        echo = np.flatnonzero(~no_echo)
+        echo = np.flatnonzero(~empty)
+        optional = {name: column[name][echo] for name in self.columns[len(COLUMNS) :]}
         try:
             return Log(
                 scan=rows.scan[first],
@@ -165,11 +186,14 @@ class _CsvBody:
                 tx=tx[echo].astype(np.int64),
                 rx=rx[echo].astype(np.int64),
                 range=reported[echo],
-                amplitude=amplitude[echo],
+                amplitude=optional.get("amplitude", np.full(len(echo), np.nan)),
+                t=np.nan_to_num(optional.get("t", np.zeros(len(echo)))),
+                age=np.nan_to_num(optional.get("age", np.zeros(len(echo)))),
+                **({} if asked is None else {"asked": asked}),
             )
         except InvalidLogValue as fault:
             row = first[fault.scan] if fault.echo is None else echo[fault.echo]
-            self.fail(int(row), fault.column, ALLOWED[fault.column])
+            self.fail(int(row), fault.column, fault.allowed)
 
     def check(
         self,
@@ -292,7 +316,7 @@ def integers_of(text: Shaped[np.ndarray, " rows"]) -> Int[np.ndarray, " rows"]:
 def write_csv(log: Log, filename: str | os.PathLike[str]) -> None:
     """Write a scan log as CSV, each number with the fewest digits that restore it exactly.
 
-    The column ``amplitude`` is present only if any echo has an amplitude.
+    The column ``amplitude`` is present only if any echo has an amplitude, ``age`` and ``t`` only if any is not 0.
 
     Args:
         log: the scans.
@@ -307,18 +331,21 @@ def write_csv(log: Log, filename: str | os.PathLike[str]) -> None:
 
 def csv_lines(log: Log) -> Iterator[str]:
     """The lines of a scan log as CSV, header first, each with its line end."""
-    amplitudes = not np.isnan(log.amplitude).all()
-    yield ",".join((*COLUMNS, OPTIONAL) if amplitudes else COLUMNS) + "\n"
-    no_echo = ",,,,\n" if amplitudes else ",,,\n"
+    needed = {"amplitude": not np.isnan(log.amplitude).all(), "age": log.age.any(), "t": log.t.any()}
+    optional = [name for name in OPTIONAL if needed[name]]
+    yield ",".join((*COLUMNS, *optional)) + "\n"
+    no_reading = "," * (len(COLUMNS) - FIRST_ECHO_COLUMN + len(optional)) + "\n"
     for begin in range(0, len(log), SCANS_PER_WRITE):
         part = log[begin : begin + SCANS_PER_WRITE]
         heads = map(",".join, zip(*map(_texts, (part.scan, part.stamp, *part.pose.T)), strict=True))
-        echoes = (part.tx, part.rx, part.range, part.amplitude) if amplitudes else (part.tx, part.rx, part.range)
+        zero_is_empty = {name: np.where(getattr(part, name) == 0, np.nan, getattr(part, name)) for name in ("age", "t")}
+        columns = {"amplitude": part.amplitude, **zero_is_empty}
+        echoes = (part.tx, part.rx, part.range, *(columns[name] for name in optional))
         tails = list(map(",".join, zip(*map(_texts, echoes), strict=True)))
         start = part.start.tolist()
         for head, first, last in zip(heads, start, start[1:], strict=False):
             if first == last:
-                yield head + no_echo
+                yield head + no_reading
             else:
                 yield from [f"{head},{tail}\n" for tail in tails[first:last]]
 

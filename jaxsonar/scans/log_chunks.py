@@ -1,8 +1,14 @@
-"""Chunks of scan logs: location of the scans in a file of any size, and reading of any run of them."""
+"""Chunks of scan logs: location of the scans in a file of any size, and reading of any run of them.
+
+What the scans of a chunk measured does not depend on the split: every chunk has ``Log.asked`` of its file. A chunk
+whose readings have times or ages of their own is read with the scans around it, for the motion of the robot and the
+originals of repeated readings.
+"""
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +25,20 @@ from jaxsonar.scans.csv_log import (
     is_scan_number,
     read_csv_rows,
 )
+from jaxsonar.scans.log_survey import LogSurvey
 from jaxsonar.scans.parquet_log import open_parquet, read_batch
 from jaxsonar.scans.scan_log import Log
 
+
+@dataclass(frozen=True)
+class ChunkSettings:
+    """Constants of chunks. Chosen by hand."""
+
+    scans_around: int = 16
+    """Scans on each side of a chunk between whose poses the motion is interpolated, if readings have own times."""
+
+
+SETTINGS = ChunkSettings()
 ROWS_PER_READ = 65536
 """Rows of a Parquet file whose scan numbers are read at once."""
 NO_NUMBER = -(2**63)
@@ -44,6 +61,21 @@ class LogChunk:
     """CSV: line number of the first scan in the file; the header is line 1."""
     repeated: tuple[int, ...] = ()
     """Rows, counted from ``first``, of scans whose number already occurred in the file."""
+    asked: tuple[tuple[int, int], ...] = ()
+    """``Log.asked`` of the whole file."""
+    in_turn: bool = False
+    """Every scan of the file holds the firings of one transmitter; ``firing_poses.group_firings`` merges them."""
+    around: tuple[int, int, int, int] | None = None
+    """First scan, scans, CSV: begin and end in bytes, of this chunk with the scans around it that it needs; None: it
+    needs none."""
+
+    @property
+    def with_surroundings(self) -> "LogChunk | None":
+        """The chunk of the scans in ``around``."""
+        if self.around is None:
+            return None
+        first, scans, begin, end = self.around
+        return LogChunk(first, scans, begin, end, asked=self.asked)
 
 
 class _ScanStarts(NamedTuple):
@@ -69,14 +101,19 @@ def csv_chunks(filename: str | os.PathLike[str], *, name: str, scans: int) -> li
     """
     size = os.stat(filename).st_size
     chunks: list[LogChunk] = []
+    survey = LogSurvey()
+    offsets: dict[int, int] = {}
     count = 0
-    for starts in _csv_scans(filename, name):
+    for starts in _csv_scans(filename, name, survey):
         for k in range(-count % scans, len(starts.number), scans):
             chunks.append(LogChunk(count + k, scans, int(starts.offset[k]), size, int(starts.line[k])))
+        for margin in (-SETTINGS.scans_around, SETTINGS.scans_around):
+            for k in range((margin - count) % scans, len(starts.number), scans):
+                offsets[count + k] = int(starts.offset[k])
         count += len(starts.number)
     ends = [*(chunk.begin for chunk in chunks[1:]), size][: len(chunks)]
     numbers = lambda: (starts.number for starts in _csv_scans(filename, name))  # noqa: E731
-    return _complete_chunks(chunks, ends, count, numbers)
+    return _complete_chunks(chunks, ends, count, numbers, survey, offsets)
 
 
 def parquet_chunks(filename: str | os.PathLike[str], *, name: str, scans: int) -> list[LogChunk]:
@@ -93,11 +130,42 @@ def parquet_chunks(filename: str | os.PathLike[str], *, name: str, scans: int) -
     file = open_parquet(filename, name=name)
     count = file.metadata.num_rows
     chunks = [LogChunk(first, scans) for first in range(0, count, scans)]
-    return _complete_chunks(chunks, [0] * len(chunks), count, lambda: _parquet_numbers(file, name))
+    survey = _parquet_survey(file, name)
+    return _complete_chunks(chunks, [0] * len(chunks), count, lambda: _parquet_numbers(file, name), survey, {})
 
 
 def csv_chunk_reader(filename: str | os.PathLike[str], chunk: LogChunk, *, name: str) -> Callable[[int, int], Log]:
     """A function ``read(a, b)`` that reads the scans a to b (exclusive) of a chunk of a CSV log."""
+    return _with_surroundings(_csv_reader, filename, chunk, name)
+
+
+def parquet_chunk_reader(filename: str | os.PathLike[str], chunk: LogChunk, *, name: str) -> Callable[[int, int], Log]:
+    """As ``csv_chunk_reader`` for a Parquet log; only the row groups of the chunk are read."""
+    return _with_surroundings(_parquet_reader, filename, chunk, name)
+
+
+def _with_surroundings(
+    reader: Callable[[str | os.PathLike[str], LogChunk, str], Callable[[int, int], Log]],
+    filename: str | os.PathLike[str],
+    chunk: LogChunk,
+    name: str,
+) -> Callable[[int, int], Log]:
+    """Reader of a chunk; its scans come from a log that also holds the scans around it, if these are readable."""
+    plain, wider = reader(filename, chunk, name), chunk.with_surroundings
+    if wider is None:
+        return plain
+    from jaxsonar.scans.measured_paths import unique_readings
+
+    try:
+        log = unique_readings(reader(filename, wider, name)(0, wider.scans))
+    except SonarError:
+        return plain
+    before = chunk.first - wider.first
+    return lambda begin, end: log[before + begin : before + end]
+
+
+def _csv_reader(filename: str | os.PathLike[str], chunk: LogChunk, name: str) -> Callable[[int, int], Log]:
+    """Reader of a chunk of a CSV log by itself."""
     with _open(filename, name) as file:
         columns = csv_header(name, _header_line(file))
         file.seek(chunk.begin)
@@ -108,17 +176,18 @@ def csv_chunk_reader(filename: str | os.PathLike[str], chunk: LogChunk, *, name:
     offset, line = np.append(first, len(text)), lines + chunk.line
     if len(first) != chunk.scans:
         raise SonarError(f"{shown(name)}: the file changed during processing; needed is a log that does not change")
+    asked = np.array(chunk.asked, np.int64).reshape(-1, 2)
 
     def read(begin: int, end: int) -> Log:
         body = text[offset[begin] : offset[end]]
         body = body.replace(b"\r\n", b"\n") if b"\r" in body else body
-        return read_csv_rows(name, columns, body, first=int(line[begin]))
+        return read_csv_rows(name, columns, body, first=int(line[begin]), asked=asked)
 
     return read
 
 
-def parquet_chunk_reader(filename: str | os.PathLike[str], chunk: LogChunk, *, name: str) -> Callable[[int, int], Log]:
-    """As ``csv_chunk_reader`` for a Parquet log; only the row groups of the chunk are read."""
+def _parquet_reader(filename: str | os.PathLike[str], chunk: LogChunk, name: str) -> Callable[[int, int], Log]:
+    """Reader of a chunk of a Parquet log by itself."""
     import pyarrow as pa
 
     file = open_parquet(filename, name=name)
@@ -136,21 +205,58 @@ def parquet_chunk_reader(filename: str | os.PathLike[str], chunk: LogChunk, *, n
         (rows,) = pa.Table.from_batches(batches).combine_chunks().to_batches()
     except (pa.ArrowException, OSError, ValueError) as failure:
         raise SonarError(f"{shown(name)}: {reason(failure)}; needed is a scan log as a whole Parquet file") from None
-    return lambda begin, end: read_batch(name, rows.slice(begin, end - begin), chunk.first + begin)
+    asked = np.array(chunk.asked, np.int64).reshape(-1, 2)
+    return lambda begin, end: read_batch(name, rows.slice(begin, end - begin), chunk.first + begin, asked=asked)
 
 
 def _complete_chunks(
-    chunks: list[LogChunk], ends: list[int], count: int, numbers: Callable[[], Iterator[Any]]
+    chunks: list[LogChunk],
+    ends: list[int],
+    count: int,
+    numbers: Callable[[], Iterator[Any]],
+    survey: LogSurvey,
+    offsets: dict[int, int],
 ) -> list[LogChunk]:
-    """Chunks with their ends, the number of scans of the last one, and the repeated scans of each."""
+    """Chunks with their ends, the number of scans of the last one, the repeated scans of each, and the survey."""
     repeated = _repeated_rows(numbers)
+    asked = tuple((tx, rx) for tx, rx in survey.asked.pairs().tolist())
     complete = []
     for chunk, end in zip(chunks, ends, strict=True):
         scans = min(chunk.scans, count - chunk.first)
         first, last = np.searchsorted(repeated, [chunk.first, chunk.first + scans])
         rows = tuple((repeated[first:last] - chunk.first).tolist())
-        complete.append(LogChunk(chunk.first, scans, chunk.begin, end, chunk.line, rows))
+        around = _surroundings(chunk, scans, chunks, ends, count, survey, offsets)
+        complete.append(
+            replace(
+                chunk, scans=scans, end=end, repeated=rows, asked=asked, in_turn=survey.asked.in_turn, around=around
+            )
+        )
     return complete
+
+
+def _surroundings(
+    chunk: LogChunk,
+    scans: int,
+    chunks: list[LogChunk],
+    ends: list[int],
+    count: int,
+    survey: LogSurvey,
+    offsets: dict[int, int],
+) -> tuple[int, int, int, int] | None:
+    """``LogChunk.around``: some scans on each side, and all chunks before that may hold the originals of readings."""
+    if not (survey.times or survey.age) or scans == count:
+        return None
+    first = max(chunk.first - SETTINGS.scans_around, 0)
+    last = min(chunk.first + scans + SETTINGS.scans_around, count)
+    begin = offsets.get(first, chunks[0].begin)
+    end = offsets.get(last, ends[-1])
+    if survey.age:
+        oldest = survey.stamp(chunk.first) - survey.age
+        k = chunk.first // chunk.scans
+        while k and (chunks[k].first > first or not survey.stamp(chunks[k].first) < oldest):
+            k -= 1
+        first, begin = chunks[k].first, chunks[k].begin
+    return first, last - first, begin, end
 
 
 def _repeated_rows(numbers: Callable[[], Iterator[Int[np.ndarray, " scans"]]]) -> Int[np.ndarray, " repeated"]:
@@ -180,11 +286,26 @@ def _parquet_numbers(file: Any, name: str) -> Iterator[Int[np.ndarray, " scans"]
         raise SonarError(f"{shown(name)}: {reason(failure)}; needed is a scan log as a whole Parquet file") from None
 
 
-def _csv_scans(filename: str | os.PathLike[str], name: str) -> Iterator[_ScanStarts]:
-    """Starts of the scans of a CSV log, block by block."""
+def _parquet_survey(file: Any, name: str) -> LogSurvey:
+    """What the readings of a Parquet log are, from one pass through the file."""
+    import pyarrow as pa
+
+    survey = LogSurvey()
+    fields = {field.name for field in file.schema_arrow.field("echoes").type.value_type}
+    try:
+        for batch in file.iter_batches(batch_size=ROWS_PER_READ // 8, columns=["scan", "stamp", "echoes"]):
+            survey.add_batch(pa, batch, fields)
+    except (pa.ArrowException, OSError) as failure:
+        raise SonarError(f"{shown(name)}: {reason(failure)}; needed is a scan log as a whole Parquet file") from None
+    return survey
+
+
+def _csv_scans(filename: str | os.PathLike[str], name: str, survey: LogSurvey | None = None) -> Iterator[_ScanStarts]:
+    """Starts of the scans of a CSV log, block by block; a survey gets all rows."""
     with _open(filename, name) as file:
-        csv_header(name, _header_line(file))
-        for starts in _find_starts(name, iter(lambda: file.read(BLOCK), b""), file.tell()):
+        columns = csv_header(name, _header_line(file))
+        add_rows = None if survey is None else partial(survey.add_rows, columns)
+        for starts in _find_starts(name, iter(lambda: file.read(BLOCK), b""), file.tell(), add_rows):
             yield _ScanStarts(starts.number, starts.offset, starts.line + 2)
 
 
@@ -201,8 +322,16 @@ def _header_line(file: Any) -> bytes:
     return file.readline(BLOCK).removeprefix(b"\xef\xbb\xbf").rstrip(b"\n").removesuffix(b"\r")
 
 
-def _find_starts(name: str, blocks: Iterator[bytes], offset: int) -> Iterator[_ScanStarts]:
-    """Starts of scans in blocks of rows; ``offset`` is that of the first block, whose first line is 0."""
+def _find_starts(
+    name: str,
+    blocks: Iterator[bytes],
+    offset: int,
+    add_rows: Callable[[bytes, Int[np.ndarray, " scans"]], None] | None = None,
+) -> Iterator[_ScanStarts]:
+    """Starts of scans in blocks of rows; ``offset`` is that of the first block, whose first line is 0.
+
+    ``add_rows`` is called with complete rows and the bytes at which scans start in them.
+    """
     rest, line, state = b"", 0, None
     for read in blocks:
         block = rest + read
@@ -212,10 +341,14 @@ def _find_starts(name: str, blocks: Iterator[bytes], offset: int) -> Iterator[_S
         rest = block[complete:]
         if complete:
             starts, lines, state = _starts_in_block(block[:complete], state)
+            if add_rows is not None:
+                add_rows(block[:complete], starts.offset)
             yield _ScanStarts(starts.number, starts.offset + offset, starts.line + line)
             offset, line = offset + complete, line + lines
     if rest:
         starts, _, _ = _starts_in_block(rest + b"\n", state)
+        if add_rows is not None:
+            add_rows(rest + b"\n", starts.offset)
         yield _ScanStarts(starts.number, starts.offset + offset, starts.line + line)
 
 

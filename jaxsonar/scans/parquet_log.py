@@ -1,6 +1,7 @@
-"""Scan logs as Parquet: one row per scan, with a list of echoes. Needs the extra ``parquet``.
+"""Scan logs as Parquet: one row per scan, with a list of readings. Needs the extra ``parquet``.
 
-Error messages count rows (scans) from 1 and echoes within a row from 0.
+The list is the column ``echoes``. A null range is a path that fired and heard nothing. Error messages count rows
+(scans) from 1 and readings within a row from 0.
 """
 
 import os
@@ -8,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any, NoReturn
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxsonar.fileio.atomic_files import atomic_write, read_bytes, reason, shown
 from jaxsonar.hardware.errors import SonarError
@@ -17,16 +19,19 @@ SCANS_PER_GROUP = 8192
 """Scans of a row group; keeps memory and the 32-bit list offsets far below their limits."""
 
 SCAN_COLUMNS = ("scan", "stamp", "x", "y", "theta", "echoes")
-ECHO_COLUMNS = ("tx", "rx", "range", "amplitude")
+ECHO_COLUMNS = ("tx", "rx", "range", "amplitude", "age", "t")
+OPTIONAL_COLUMNS = ("amplitude", "age", "t")
+"""Fields of a reading that a file may omit."""
 INTEGER_COLUMNS = ("scan", "tx", "rx")
-OPTIONAL_VALUES = ("stamp", "x", "y", "theta", "amplitude")
+OPTIONAL_VALUES = ("stamp", "x", "y", "theta", "range", "amplitude", "age", "t")
+"""Values that may be null."""
 
 
 def read_parquet(filename: str | os.PathLike[str]) -> Log:
     """Read a scan log from Parquet.
 
-    Columns may have any order and any integer or floating type. Null and NaN both mean a missing value. The column
-    ``amplitude`` is optional.
+    Columns may have any order and any integer or floating type. Null and NaN both mean a missing value. The fields
+    ``amplitude``, ``age`` and ``t`` are optional; a missing ``age`` or ``t`` is 0.
 
     Args:
         filename: the file.
@@ -51,16 +56,19 @@ def read_parquet(filename: str | os.PathLike[str]) -> Log:
     return _log(filename, parts)
 
 
-def read_batch(filename: str | os.PathLike[str], batch: Any, row: int) -> Log:
+def read_batch(
+    filename: str | os.PathLike[str], batch: Any, row: int, *, asked: Int[np.ndarray, "pairs 2"] | None = None
+) -> Log:
     """As ``read_parquet``, from a record batch of a file with a valid schema (``open_parquet``).
 
     Args:
         filename: the file, for error messages.
         batch: rows of the file.
         row: index of the first of them in the file, from 0.
+        asked: ``Log.asked`` of the whole file; derived from these rows if omitted.
     """
     pa, _ = _pyarrow(filename)
-    return _log(filename, [_batch(filename, pa, batch, row)], row)
+    return _log(filename, [_batch(filename, pa, batch, row)], row, asked)
 
 
 def open_parquet(filename: str | os.PathLike[str], *, name: str | None = None) -> Any:
@@ -83,7 +91,12 @@ def open_parquet(filename: str | os.PathLike[str], *, name: str | None = None) -
     return file
 
 
-def _log(filename: str | os.PathLike[str], parts: list[dict[str, np.ndarray]], row: int = 0) -> Log:
+def _log(
+    filename: str | os.PathLike[str],
+    parts: list[dict[str, np.ndarray]],
+    row: int = 0,
+    asked: Int[np.ndarray, "pairs 2"] | None = None,
+) -> Log:
     """The log of some record batches; ``row`` is the index of the first scan in the file."""
     none = {"scan": np.zeros(0, np.int64), "tx": np.zeros(0, np.int64), "rx": np.zeros(0, np.int64)}
     column = {
@@ -99,11 +112,12 @@ def _log(filename: str | os.PathLike[str], parts: list[dict[str, np.ndarray]], r
             pose=np.stack([column["x"], column["y"], column["theta"]], axis=-1),
             start=start,
             **{name: column[name] for name in ECHO_COLUMNS},
+            **({} if asked is None else {"asked": asked}),
         )
     except InvalidLogValue as fault:
         name = fault.column if fault.echo is None else f"echoes[{fault.echo - start[fault.scan]}].{fault.column}"
         name = "x, y, theta" if name == "pose" else name
-        _fail(filename, row + fault.scan, name, str(fault.value), ALLOWED[fault.column])
+        _fail(filename, row + fault.scan, name, str(fault.value), fault.allowed)
 
 
 def write_parquet(log: Log, filename: str | os.PathLike[str]) -> None:
@@ -116,22 +130,30 @@ def write_parquet(log: Log, filename: str | os.PathLike[str]) -> None:
     Raises:
         SonarError: the file cannot be written, or the extra is missing.
     """
-    write_parquet_chunks([log], filename)
+    needed = {"range": bool(np.isnan(log.range).any()), "age": bool(log.age.any()), "t": bool(log.t.any())}
+    _write_parts([log], filename, needed)
 
 
 def write_parquet_chunks(parts: Iterable[Log], filename: str | os.PathLike[str]) -> None:
-    """As ``write_parquet``, from consecutive parts of a log, each written before the next one is requested."""
+    """As ``write_parquet``, from consecutive parts of a log, each written before the next one is requested.
+
+    The file has all optional fields, because later parts may need them.
+    """
+    _write_parts(parts, filename, {"range": True, "age": True, "t": True})
+
+
+def _write_parts(parts: Iterable[Log], filename: str | os.PathLike[str], needed: dict[str, bool]) -> None:
+    """Write parts of a log; ``needed`` states whether a range may be null, and whether there are ages and times."""
     pa, pq = _pyarrow(filename)
     number = pa.float64()
-    echo = pa.struct(
-        [
-            pa.field("tx", pa.int32(), nullable=False),
-            pa.field("rx", pa.int32(), nullable=False),
-            pa.field("range", number, nullable=False),
-            pa.field("amplitude", number),
-        ]
-    )
-    echoes = pa.list_(pa.field("element", echo, nullable=False))
+    fields = [
+        pa.field("tx", pa.int32(), nullable=False),
+        pa.field("rx", pa.int32(), nullable=False),
+        pa.field("range", number, nullable=needed["range"]),
+        pa.field("amplitude", number),
+        *(pa.field(name, number) for name in ("age", "t") if needed[name]),
+    ]
+    echoes = pa.list_(pa.field("element", pa.struct(fields), nullable=False))
     schema = pa.schema(
         [
             pa.field("scan", pa.int64(), nullable=False),
@@ -141,14 +163,11 @@ def write_parquet_chunks(parts: Iterable[Log], filename: str | os.PathLike[str])
     )
     with atomic_write(filename, binary=True) as file, pq.ParquetWriter(file, schema) as writer:
         for part in _row_groups(parts):
+            readings = {"tx": part.tx.astype(np.int32), "rx": part.rx.astype(np.int32), "range": part.range}
+            readings |= {"amplitude": part.amplitude, "age": part.age, "t": part.t}
             values = pa.StructArray.from_arrays(
-                [
-                    pa.array(part.tx.astype(np.int32)),
-                    pa.array(part.rx.astype(np.int32)),
-                    pa.array(part.range),
-                    pa.array(part.amplitude, from_pandas=True),  # NaN becomes null
-                ],
-                fields=list(echo),
+                [pa.array(readings[field.name], from_pandas=True) for field in fields],  # NaN becomes null
+                fields=fields,
             )
             columns = [
                 pa.array(part.scan),
@@ -191,7 +210,8 @@ def _check_schema(filename: str | os.PathLike[str], pa: Any, schema: Any) -> Non
         raise SonarError(f"{shown(filename)}: column echoes: type {shown(str(echoes), 80)} came; allowed is {wanted}")
     fields = {field.name: field.type for field in echoes.value_type}
     names = [field.name for field in echoes.value_type]
-    _check_names(filename, names if "amplitude" in names else [*names, "amplitude"], ECHO_COLUMNS, "echoes.")
+    omitted = [name for name in OPTIONAL_COLUMNS if name not in names]
+    _check_names(filename, [*names, *omitted], ECHO_COLUMNS, "echoes.")
     for name, kind in fields.items():
         _check_type(filename, pa, name, f"echoes.{name}", kind)
 
@@ -238,7 +258,7 @@ def _batch(filename: str | os.PathLike[str], pa: Any, batch: Any, row: int) -> d
     place = np.repeat(np.arange(len(batch)), column["echoes"])
     first = np.cumsum(column["echoes"]) - column["echoes"]
     fields = dict(zip((field.name for field in structs.type), structs.flatten(), strict=True))
-    column["amplitude"] = np.full(len(structs), np.nan)
+    column |= {"amplitude": np.full(len(structs), np.nan), "age": np.zeros(len(structs)), "t": np.zeros(len(structs))}
     for name, values in fields.items():
         missing = _nulls(values) if name not in OPTIONAL_VALUES else _nulls(structs)
         if missing.any():
@@ -246,6 +266,8 @@ def _batch(filename: str | os.PathLike[str], pa: Any, batch: Any, row: int) -> d
             i = int(place[echo])
             _fail(filename, row + i, f"echoes[{echo - first[i]}].{name}", "null", ALLOWED[name])
         column[name] = _array(pa, name, values)
+    for name in ("age", "t"):
+        column[name] = np.where(np.isnan(column[name]), 0.0, column[name])
     return column
 
 

@@ -7,6 +7,7 @@ import operator
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
@@ -15,6 +16,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.scans.asked_pairs import AskedPairs
 
 LARGEST_SENSOR = 2**31 - 1
 """Largest sensor index; sensor indices have 32 bits in Parquet."""
@@ -84,7 +86,7 @@ class Scan:
     asked: Int[np.ndarray, "pairs 2"] | None = None
     """As in ``Log``; None: unknown, ``as_log`` and ``Log.from_scans`` derive it from the readings."""
     odometry: Float[np.ndarray, "samples 4"] | None = None
-    """As in ``Log``."""
+    """``Log.motion`` of the log of the scan."""
 
     @property
     def echo_count(self) -> int:
@@ -141,10 +143,11 @@ class Log:
     the robot at stamp + t - age."""
     asked: _Pairs = _DERIVED
     """The (tx, rx) pairs that every scan measured, whether or not it holds a reading of them; derived from the readings
-    if omitted (``derive_asked``). Parts of a log keep the pairs of the whole log."""
+    if omitted (``AskedPairs``). Parts of a log keep the pairs of the whole log."""
     odometry: Float[np.ndarray, "samples 4"] | None = None
     """Stamp (s), x, y (m), theta (rad) of odometry at its own rate, in ascending order; None: only the poses of the
-    scans are known. Motion between the readings of a scan is interpolated in it. Files do not hold it."""
+    scans are known. Motion between the readings of a scan is interpolated in it. Files do not hold it. Parts of a log
+    have the ``motion`` of the whole log."""
 
     def __post_init__(self):
         scans, readings = np.size(self.scan), np.size(self.tx)
@@ -167,7 +170,9 @@ class Log:
             raise SonarError(f"log: start must not fall and go from 0 to the number of readings, {readings}")
         self._check()
         if self.asked is None:
-            object.__setattr__(self, "asked", derive_asked(self.echo_scan, self.tx, self.rx, self.range))
+            pairs = AskedPairs()
+            pairs.add(self.echo_scan, self.tx, self.rx, np.isnan(self.range))
+            object.__setattr__(self, "asked", pairs.pairs())
         self._set("asked", np.int64, (np.size(self.asked) // 2, 2))
 
     def _set(self, name: str, dtype: type, shape: tuple[int, ...]) -> None:
@@ -319,6 +324,17 @@ class Log:
         """Number of echoes: readings that heard something."""
         return int(np.isfinite(self.range).sum())
 
+    @cached_property
+    def motion(self) -> Float[np.ndarray, "samples 4"] | None:
+        """``odometry``, or else the stamps and poses of the scans, if a reading has a time of its own; otherwise None.
+
+        Keep it as ``odometry`` before changing the poses: the motion between the readings of a scan does not change.
+        """
+        if self.odometry is not None or not (self.t.any() or self.age.any()):
+            return self.odometry
+        known = np.isfinite(self.stamp) & np.isfinite(self.pose).all(axis=1)
+        return np.column_stack([self.stamp, self.pose])[known]
+
     def __len__(self) -> int:
         return len(self.scan)
 
@@ -345,7 +361,7 @@ class Log:
             t=self.t[echoes],
             age=self.age[echoes],
             asked=self.asked,
-            odometry=self.odometry,
+            odometry=self.motion,
         )
 
     def _part(self, rows: Int[np.ndarray, " part"]) -> "Log":
@@ -364,7 +380,7 @@ class Log:
             t=self.t[echoes],
             age=self.age[echoes],
             asked=self.asked,
-            odometry=self.odometry,
+            odometry=self.motion,
         )
 
     def __iter__(self) -> Iterator[Scan]:
@@ -380,34 +396,6 @@ class Log:
     def __repr__(self) -> str:
         silent = len(self.tx) - self.echo_count
         return f"Log({len(self)} scans, {self.echo_count} echoes{f', {silent} silent readings' if silent else ''})"
-
-
-def derive_asked(
-    scan: Int[np.ndarray, " readings"],
-    tx: Int[np.ndarray, " readings"],
-    rx: Int[np.ndarray, " readings"],
-    range: Float[np.ndarray, " readings"],
-) -> Int[np.ndarray, "pairs 2"]:
-    """The pairs that every scan of a log measured, whether or not it holds a reading of them.
-
-    - None, if the log is explicit: it holds a reading without a range, so all that was measured has a reading.
-    - None, if sensors fire in turn: every scan holds one transmitter at most, and the log holds several.
-    - Otherwise all pairs that are heard anywhere in the log. A pair that is never heard was not measured.
-
-    Args:
-        scan: row of the scan of each reading, not decreasing.
-        tx: transmitter.
-        rx: receiver.
-        range: metres, NaN for a path that heard nothing.
-    """
-    nothing = np.zeros((0, 2), np.int64)
-    if not len(tx) or np.isnan(range).any():
-        return nothing
-    alone = scan[1:] != scan[:-1]
-    if (alone | (tx[1:] == tx[:-1])).all() and (alone & (tx[1:] != tx[:-1])).sum() > 0.5 * alone.sum():
-        return nothing
-    pairs = np.unique(tx.astype(np.int64) << 32 | rx)
-    return np.stack([pairs >> 32, pairs & 0xFFFFFFFF], axis=-1)
 
 
 def _column(scan: Scan, name: str) -> np.ndarray:
