@@ -19,6 +19,7 @@ from jaxsonar.mapping.segment_fusion import estimate_systematic_error, fuse_segm
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_endpoints import blocks_gap, detached_points, snap_endpoints, spurious_walls
 from jaxsonar.mapping.wall_segments import WallSegments
+from jaxsonar.scans.firing_poses import group_firings
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -39,6 +40,8 @@ def build_map(
 ) -> GlobalMap:
     """The walls, corners and edges of the world, from a log of scans with poses (paper, section 5).
 
+    Firings that stand in scans of their own are grouped (``group_firings``). The map names the first scan of a group.
+
     Args:
         ring: the sensors.
         log: scans; those without a pose are left out.
@@ -54,6 +57,7 @@ def build_map(
     """
     check_merging(merging)
     check_poses(log)
+    log = group_firings(log)
     # Detect lines, corners and edges in every scan or window.
     models = local_models(
         ring, log, method=method, settings=settings, sigma=sigma, window=window, on_left_out=on_left_out

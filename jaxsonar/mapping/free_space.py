@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.geometry.se2 import perpendicular, rotate, tangent_of, unit
+from jaxsonar.geometry.se2 import compose, perpendicular, rotate, tangent_of, unit
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.sensors.ring import Ring
 
@@ -105,12 +105,16 @@ def observe_free_space(
     path: Int[np.ndarray, " echoes"],
     distance: Float[np.ndarray, " echoes"],
     walls: Sequence[Float[np.ndarray, "_ 2 2"]],
+    *,
+    measured: Bool[np.ndarray, "scans paths"] | None = None,
+    path_pose: Float[np.ndarray, "scans paths 3"] | None = None,
 ) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, " cells"]]:
     """Cells in which each scan would have detected a wall and did not.
 
-    Only direct paths contribute. A cell is free for a sensor that faces it if its first echo comes from farther away.
-    If the cones cover every direction at least twice, two sensors must agree within 20 cm. Cells that the echo arc of
-    any path crosses, and cells behind a wall that the scan itself shows, are left out.
+    Only direct paths that were measured contribute. A cell is free for a sensor that faces it if its first echo comes
+    from farther away. If the cones cover every direction at least twice, two sensors must agree within 20 cm; one is
+    enough where the scan did not measure the others. Cells that the echo arc of any path crosses, and cells behind a
+    wall that the scan itself shows, are left out.
 
     Args:
         ring: the sensors.
@@ -119,34 +123,74 @@ def observe_free_space(
         path: row of ``ring.paths`` of each echo.
         distance: corrected half path length of each echo, metres.
         walls: for each scan, the wall segments that it shows, world frame, metres.
+        measured: paths that each scan measured, among them all with an echo; all of them if omitted.
+        path_pose: scan_from_robot when each path was measured; all at the pose of the scan if omitted.
 
     Returns:
         The cells (cell x, cell y, direction), and the row of ``pose`` of the scan that saw through each.
     """
     direct = np.flatnonzero((ring.paths[:, 0] == ring.paths[:, 1]) & (np.asarray(ring.echo_paths.width) > 0))
-    first = np.full((len(pose), len(ring.paths)), _FREE.certain * ring.max_range + _FREE.margin)
+    path_at = np.broadcast_to(pose[:, None], (len(pose), len(ring.paths), 3))
+    if path_pose is not None:
+        path_at = compose(path_at, path_pose)
+    measured = np.ones((len(pose), len(ring.paths)), bool) if measured is None else measured
+    reach = _FREE.certain * ring.max_range + _FREE.margin
+    first = np.where(measured, reach, 0.0)
     np.minimum.at(first, (scan, path), distance)
-    free, sensor = _free_cells(ring, pose, direct, first[:, direct], walls)
-    on_arcs = _cells_on_arcs(ring, pose, scan, path, distance)
+    free, sensor = _free_cells(ring, path_at, direct, first[:, direct], walls)
+    on_arcs = _cells_on_arcs(ring, path_at[scan, path], path, distance, scan)
 
     code, low, size = _encode(np.concatenate([free, on_arcs], axis=1))
     cells, echo_cells = code[: free.shape[1]], code[free.shape[1] :]
     if np.asarray(ring.echo_paths.width)[direct].sum() >= 2 * 2 * np.pi:
-        # Sensors that see the same wall differ by up to a cell in its position: compare blocks of 2 x 2 cells.
-        who, x, y, direction = free
-        block, _, _ = _encode(np.stack([who, x // 2, y // 2, direction]))
-        block_of_view = _sorted_unique(block * len(direct) + sensor) // len(direct)
-        agreed = block_of_view[1:][block_of_view[1:] == block_of_view[:-1]]
-        cells = cells[_is_in(block, agreed)]
+        visible, observer = free[:, :0], sensor[:0]
+        partial = ~measured[:, direct].all(axis=1)
+        if partial.any():
+            reach = np.where(partial, reach, 0.0)
+            visible, observer = _free_cells(ring, path_at, direct, np.tile(reach[:, None], len(direct)), walls)
+        cells = cells[_is_agreed(free, sensor, visible, observer, measured[:, direct])]
     cells = _sorted_unique(cells)
     cells = cells[~_is_in(cells, np.sort(echo_cells))]
     who, x, y, direction = (value + least for value, least in zip(np.unravel_index(cells, size), low, strict=True))
     return np.column_stack([x, y, direction]), who
 
 
+def _is_agreed(
+    free: Int[np.ndarray, "4 views"],
+    sensor: Int[np.ndarray, " views"],
+    visible: Int[np.ndarray, "4 visible"],
+    observer: Int[np.ndarray, " visible"],
+    measured: Bool[np.ndarray, "scans direct"],
+) -> Bool[np.ndarray, " views"]:
+    """Which views of free cells a second sensor confirms, or no other sensor could confirm for lack of a measurement.
+
+    Args:
+        free: scan, cell x, cell y, direction of each view.
+        sensor: index into the direct paths of each view.
+        visible: as ``free``, all views that all sensors would have without echoes, in the scans that did not measure
+            all direct paths.
+        observer: index into the direct paths of each of these.
+        measured: direct paths that each scan measured.
+    """
+    # Sensors that see the same wall differ by up to a cell in its position: compare blocks of 2 x 2 cells.
+    scan, x, y, direction = np.concatenate([free, visible], axis=1)
+    block, _, _ = _encode(np.stack([scan, x // 2, y // 2, direction]))
+    sensors = int(max(sensor.max(initial=0), observer.max(initial=0))) + 1
+    block, visible_block = block[: len(sensor)], block[len(sensor) :]
+    view = _sorted_unique(block * sensors + sensor) // sensors
+    agreed = _is_in(block, view[1:][view[1:] == view[:-1]])
+    if not len(visible_block):
+        return agreed
+    # One view is enough if other sensors can see the block, but its own is the only one of them with a measurement.
+    view, first = np.unique(visible_block * sensors + observer, return_index=True)
+    blocks, of_view = np.unique(view // sensors, return_inverse=True)
+    alone = (np.bincount(of_view) > 1) & (np.bincount(of_view, measured[visible[0, first], view % sensors]) == 1)
+    return agreed | _is_in(block, blocks[alone])
+
+
 def _free_cells(
     ring: Ring,
-    pose: Float[np.ndarray, "scans 3"],
+    path_at: Float[np.ndarray, "scans paths 3"],
     direct: Int[np.ndarray, " direct"],
     first: Float[np.ndarray, "scans direct"],
     walls: Sequence[Float[np.ndarray, "_ 2 2"]],
@@ -155,7 +199,7 @@ def _free_cells(
 
     Args:
         ring: the sensors.
-        pose: world_from_robot.
+        path_at: world_from_robot when each path was measured.
         direct: rows of ``ring.paths``, the direct paths.
         first: distance of the first echo of each scan and direct path, metres.
         walls: segments that each scan shows, world frame, metres.
@@ -168,8 +212,9 @@ def _free_cells(
     distances = np.arange(_FREE.cell / 2, _FREE.certain * ring.max_range, _FREE.cell * 0.7)
     # Arrays are (scans, direct paths, rays).
     fraction = 0.5 + _FREE.certain * np.linspace(-0.5, 0.5, _FREE.rays)
-    theta = pose[:, None, None, 2] + (start[:, None] + width[:, None] * fraction)
-    sensor = pose[:, None, :2] + rotate(midpoint[None], pose[:, 2, None])
+    robot = path_at[:, direct]
+    theta = robot[..., None, 2] + (start[:, None] + width[:, None] * fraction)
+    sensor = robot[..., :2] + rotate(midpoint[None], robot[..., 2])
     ray = unit(theta)
     free_until = np.broadcast_to(first[..., None] - _FREE.margin, theta.shape).copy()
     for k, segments in enumerate(walls):
@@ -178,7 +223,7 @@ def _free_cells(
             free_until[k] = np.minimum(free_until[k], occluded_from - _FREE.margin)
     # A sensor faces a cell only if it would hear walls of every direction in the cell's sector.
     direction = _sector_of(theta)
-    begin = direction * _FREE.sector - pose[:, None, None, 2] - start[:, None]
+    begin = direction * _FREE.sector - robot[..., None, 2] - start[:, None]
     faces = np.mod(begin, 2 * np.pi) <= width[:, None] - _FREE.sector
     who, sensor_row, ray_row, step = np.nonzero((distances < free_until[..., None]) & faces[..., None])
     ray_of = (who * len(direct) + sensor_row) * theta.shape[-1] + ray_row
@@ -195,16 +240,16 @@ def _free_cells(
 
 def _cells_on_arcs(
     ring: Ring,
-    pose: Float[np.ndarray, "scans 3"],
-    scan: Int[np.ndarray, " echoes"],
+    robot: Float[np.ndarray, "echoes 3"],
     path: Int[np.ndarray, " echoes"],
     distance: Float[np.ndarray, " echoes"],
+    scan: Int[np.ndarray, " echoes"],
 ) -> Int[np.ndarray, "4 points"]:
     """Cells that the arcs of echoes cross: rows of scan, cell x, cell y, direction. A cell may be repeated."""
     geometry = ring.echo_paths
     midpoint, start, width = (np.asarray(v)[path] for v in (geometry.midpoint, geometry.start, geometry.width))
-    theta = pose[scan, 2][:, None] + (start[:, None] + width[:, None] * np.linspace(0, 1, _FREE.arc_points))
-    origin = pose[scan, :2] + rotate(midpoint, pose[scan, 2])
+    theta = robot[:, 2, None] + (start[:, None] + width[:, None] * np.linspace(0, 1, _FREE.arc_points))
+    origin = robot[:, :2] + rotate(midpoint, robot[:, 2])
     reach = distance[:, None] + np.array([-_FREE.cell / 2, 0.0, _FREE.cell / 2])
     point = origin[:, None, None] + reach[:, None, :, None] * unit(theta)[:, :, None]
     who = np.broadcast_to(scan[:, None, None], point.shape[:3]).ravel()

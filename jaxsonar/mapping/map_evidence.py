@@ -125,6 +125,15 @@ def _free_space(
         echo = echo[(distance[echo] > 0) & (distance[echo] < ring.max_range) & np.isin(flat.scan[echo], block)]
         scan = np.searchsorted(block, flat.scan[echo])
         walls = [walls_of_model[k] for k in np.searchsorted(rows, block)]
-        cells, who = observe_free_space(ring, log.pose[block], scan, flat.path[echo], distance[echo], walls)
+        cells, who = observe_free_space(
+            ring,
+            log.pose[block],
+            scan,
+            flat.path[echo],
+            distance[echo],
+            walls,
+            measured=None if flat.measured is None else flat.measured[block],
+            path_pose=None if flat.path_pose is None else flat.path_pose[block],
+        )
         free_space = free_space.updated(cells, time[block][who])
     return free_space

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
-from jaxsonar.geometry.se2 import rotation, transform_points, wrap_angle
-from jaxsonar.hardware.errors import SonarError
+from jaxsonar.geometry.se2 import compose, rotation, transform_points, wrap_angle
 from jaxsonar.occupancy.settings import SETTINGS
 from jaxsonar.occupancy.wall_visibility import WallMap, estimate_extensions, explained_by_walls, visible_range
+from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -46,51 +46,83 @@ class TransducerArrays(NamedTuple):
         return cls(position, np.asarray(ring.heading), half_width, ring.max_range, max_distance, outline)
 
 
-def first_echoes(ring: Ring, log: Log) -> Float[np.ndarray, "scans sensors"]:
-    """Range of the first direct echo of each sensor, metres; inf without an echo within the maximum range."""
-    direct = log.tx == log.rx
-    sensor, scan = log.tx[direct], log.echo_scan[direct]
-    if sensor.max(initial=0) >= ring.count:
-        raise SonarError(
-            f"grid: echo of sensor {sensor.max()}; allowed are 0 to {ring.count - 1}, the sensors of {ring.name!r}"
-        )
-    corrected = np.asarray(ring.corrected(log.range[direct], sensor, sensor))
-    first = np.full((len(log), ring.count), np.inf)
-    np.minimum.at(first, (scan, sensor), np.where(corrected < ring.max_range, corrected, np.inf))
-    return first
+class DirectReadings(NamedTuple):
+    """What the direct paths of a ring measured in the scans of a log."""
+
+    measured: Bool[np.ndarray, "scans sensors"]
+    """Which sensors fired and listened."""
+    first_echo: Float[np.ndarray, "scans sensors"]
+    """Range of the first echo of each sensor, metres; inf without an echo within the maximum range."""
+    robot: Float[np.ndarray, "scans sensors 3"]
+    """world_from_robot when each sensor fired: x, y (m), theta (rad). May be a broadcast array."""
+
+    @classmethod
+    def of(cls, ring: Ring, log: Log) -> "DirectReadings":
+        """The readings of a log.
+
+        Raises:
+            SonarError: the log contains a sensor index that the ring does not have.
+        """
+        flat, _ = FlatEchoes.from_log(ring, log)
+        sensors = np.arange(ring.count)
+        direct = ring.path_index[sensors, sensors]
+        echo = np.flatnonzero(np.isin(flat.path, direct))
+        sensor = ring.paths[flat.path[echo], 0]
+        corrected = np.asarray(ring.corrected(flat.reported[echo], sensor, sensor))
+        first = np.full((len(log), ring.count), np.inf)
+        np.minimum.at(first, (flat.scan[echo], sensor), np.where(corrected < ring.max_range, corrected, np.inf))
+        measured = np.ones(first.shape, bool) if flat.measured is None else flat.measured[:, direct]
+        robot = np.broadcast_to(log.pose[:, None], (*first.shape, 3))
+        if flat.path_pose is not None:
+            robot = compose(robot, flat.path_pose[:, direct])
+        return cls(measured, first, robot)
+
+
+class CellEvidence(NamedTuple):
+    """Cells that one scan observed, as indices into a flat grid. A cell is repeated for each beam that observed it."""
+
+    free: Int[np.ndarray, " free"]
+    """A beam passed through."""
+    occluded: Int[np.ndarray, " occluded"]
+    """A beam ended in front of it."""
+    arcs: Int[np.ndarray, " arcs"]
+    """The arc of an unexplained echo crosses it."""
+    arc_sensor: Int[np.ndarray, " arcs"]
+    """The sensor that received this echo."""
 
 
 def inverse_sensor_model(
     sensors: TransducerArrays,
-    pose: Float[np.ndarray, " 3"],
+    robot: Float[np.ndarray, "sensors 3"],
     first_echo: Float[np.ndarray, " sensors"],
-    listening: Bool[np.ndarray, " sensors"],
+    measured: Bool[np.ndarray, " sensors"],
     walls: WallMap,
-    corner: Int[np.ndarray, " 2"],
-    size: int,
-) -> Int[np.ndarray, "5 size size"]:
-    """Counts that one scan adds to the square of cells around the robot, one layer for each of ``LAYERS``.
+    low: Int[np.ndarray, " 2"],
+    columns: int,
+) -> CellEvidence:
+    """Cells that one scan observed.
 
     Args:
         sensors: the ring.
-        pose: world_from_robot, metres and radians.
+        robot: world_from_robot when each sensor fired, metres and radians.
         first_echo: range of the first echo of each sensor, metres; inf for none.
-        listening: which sensors were active.
+        measured: which sensors fired and listened.
         walls: the known walls around the robot.
-        corner: first cell (column, row) of the square, in cells of the world.
-        size: side of the square, cells.
+        low: first cell (column, row) of the grid, in cells of the world.
+        columns: number of columns of the grid.
     """
     resolution, max_range = walls.resolution, sensors.max_range
-    position = transform_points(pose, sensors.position[listening])
-    heading = sensors.heading[listening] + pose[2]
-    half_width, first_echo = sensors.half_width[listening], first_echo[listening]
+    sensor = np.flatnonzero(measured)
+    position = transform_points(robot[sensor], sensors.position[sensor])
+    heading = sensors.heading[sensor] + robot[sensor, 2]
+    half_width, first_echo = sensors.half_width[sensor], first_echo[sensor]
     explained = explained_by_walls(position, heading, half_width, first_echo, walls) | (first_echo <= 0)
 
     # Cells of each beam. An echo of a known wall is no evidence for the cells behind the wall, so the beam ends there.
     limit = np.where(explained, np.minimum(first_echo, max_range), max_range)
-    polar, in_square = _polar_cells(max_range, resolution, size), position / resolution - corner
     width = half_width + SETTINGS.shadow
-    beam, cell, distance, off_axis = _cells_in_beams(polar, in_square, heading, width, limit, size)
+    polar, in_grid = _polar_cells(max_range, resolution), position / resolution - low
+    beam, cell, distance, off_axis = _cells_in_beams(polar, in_grid, heading, width, limit, columns)
     # A beam sees a cell only in front of the known walls, including their possible extensions.
     certain = SETTINGS.certain * half_width
     extension = estimate_extensions(position, heading, certain, np.minimum(first_echo, max_range), walls)
@@ -111,16 +143,7 @@ def inverse_sensor_model(
     # Occluded cells lie beyond the tangent of the arc; outside of the cone, beyond the tangent at the arc's end.
     depth = distance * np.cos(np.maximum(off_axis - half_width, 0))
     occluded = unexplained & (depth > first_echo + tolerance)
-    counts = np.zeros((len(LAYERS), size, size), int)
-    for layer, chosen in enumerate((free, occluded, arcs)):
-        counts[layer] = np.bincount(cell[chosen], minlength=size**2).reshape(size, size)
-    free_layer, _, _, wall_layer, footprint_layer = counts
-    column, row = (walls.cells - corner).T
-    free_layer[row, column] = 0
-    wall_layer[row, column] = 1
-    column, row = _footprint_cells(sensors, pose, corner, size, resolution).T
-    footprint_layer[row, column] = 1
-    return counts
+    return CellEvidence(cell[free], cell[occluded], cell[arcs], sensor[beam[arcs]])
 
 
 class _PolarCells(NamedTuple):
@@ -131,11 +154,12 @@ class _PolarCells(NamedTuple):
 
     angle: np.ndarray  # (16, 2 cells) directions, radians, ascending over two turns
     distance: np.ndarray  # (16, 2 cells) metres
-    cell: np.ndarray  # (16, 2 cells) flat index in a square with ``size`` columns, relative to the point's own cell
+    column: np.ndarray  # (16, 2 cells) relative to the point's own cell
+    row: np.ndarray  # (16, 2 cells)
 
 
 @lru_cache(maxsize=2)
-def _polar_cells(max_range: float, resolution: float, size: int) -> _PolarCells:
+def _polar_cells(max_range: float, resolution: float) -> _PolarCells:
     far = max_range / resolution + 1
     column, row = np.meshgrid(*[np.arange(-int(far), int(far) + 1)] * 2)
     inside = np.hypot(column, row) <= far
@@ -146,10 +170,8 @@ def _polar_cells(max_range: float, resolution: float, size: int) -> _PolarCells:
     angle = np.arctan2(dy, dx)
     order = np.argsort(angle, axis=1, kind="stable")
     angle, distance = (np.take_along_axis(values, order, axis=1) for values in (angle, np.hypot(dx, dy)))
-    cell = (row * size + column)[order]
-    return _PolarCells(
-        np.concatenate([angle, angle + 2 * np.pi], axis=1), np.tile(distance, 2), np.tile(cell.astype(np.int64), 2)
-    )
+    column, row = (np.tile(values.astype(np.int32)[order], 2) for values in (column, row))
+    return _PolarCells(np.concatenate([angle, angle + 2 * np.pi], axis=1), np.tile(distance, 2), column, row)
 
 
 def _cells_in_beams(
@@ -158,17 +180,17 @@ def _cells_in_beams(
     heading: Float[np.ndarray, " beams"],
     half_width: Float[np.ndarray, " beams"],
     limit: Float[np.ndarray, " beams"],
-    size: int,
+    columns: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cells of each beam: (beam, cell of the square, distance in metres, angle off the axis in radians).
+    """Cells of each beam: (beam, cell of the grid, distance in metres, angle off the axis in radians).
 
     Args:
         polar: cells around a point.
-        position: of the sensors, in cells from the corner of the square; used to a quarter of a cell.
+        position: of the sensors, in cells from the first cell of the grid; used to a quarter of a cell.
         heading: of the sensors, radians.
         half_width: of the beams, radians.
         limit: end of each beam, metres.
-        size: side of the square, cells.
+        columns: number of columns of the grid.
     """
     own = np.floor(position)
     quarter = np.floor((position - own) * 4).astype(int)
@@ -184,21 +206,24 @@ def _cells_in_beams(
     near = distance <= limit[beam]
     beam, index, distance = beam[near], index[near], distance[near]
     off_axis = polar.angle.ravel()[index] - (begin + half_width)[beam]
-    return beam, polar.cell.ravel()[index] + (own @ (1, size)).astype(int)[beam], distance, off_axis
+    own = (own @ (1, columns)).astype(int)
+    cell = polar.row.ravel()[index] * columns + polar.column.ravel()[index] + own[beam]
+    return beam, cell, distance, off_axis
 
 
-def _footprint_cells(
-    sensors: TransducerArrays, pose: Float[np.ndarray, " 3"], corner: np.ndarray, size: int, resolution: float
+def footprint_cells(
+    sensors: TransducerArrays, pose: Float[np.ndarray, " 3"], resolution: float
 ) -> Int[np.ndarray, "cells 2"]:
-    """Cells (column, row) under the robot, relative to ``corner``.
+    """Cells (column, row) of the world under the robot.
 
     These are the cells inside the outline of the sensors; if there is none, the cells of the sensors.
     """
     if len(sensors.outline):
         half = int(np.ceil(np.linalg.norm(sensors.position, axis=-1).max() / resolution)) + 1
-        cells = np.stack(np.meshgrid(*[np.arange(size // 2 - half, size // 2 + half + 1)] * 2), axis=-1).reshape(-1, 2)
-        p_robot = ((cells + corner + 0.5) * resolution - pose[:2]) @ rotation(pose[2])
+        around = np.stack(np.meshgrid(*[np.arange(-half, half + 1)] * 2), axis=-1).reshape(-1, 2)
+        cells = np.floor(pose[:2] / resolution).astype(int) + around
+        p_robot = ((cells + 0.5) * resolution - pose[:2]) @ rotation(pose[2])
         cells = cells[(p_robot @ sensors.outline[:, :2].T + sensors.outline[:, 2] <= 0).all(axis=1)]
         if len(cells):
             return cells
-    return np.floor(transform_points(pose, sensors.position) / resolution).astype(int) - corner
+    return np.unique(np.floor(transform_points(pose, sensors.position) / resolution).astype(int), axis=0)

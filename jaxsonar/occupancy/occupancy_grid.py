@@ -3,13 +3,20 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8, UInt16
+from jaxtyping import Float, Int, UInt8, UInt16
 from scipy import ndimage
 
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.occupancy.inverse_sensor_model import LAYERS, TransducerArrays, first_echoes, inverse_sensor_model
+from jaxsonar.occupancy.inverse_sensor_model import (
+    LAYERS,
+    DirectReadings,
+    TransducerArrays,
+    footprint_cells,
+    inverse_sensor_model,
+)
 from jaxsonar.occupancy.settings import SETTINGS
 from jaxsonar.occupancy.wall_visibility import WallMap
+from jaxsonar.scans.firing_poses import group_firings
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -143,53 +150,60 @@ def occupancy(
     *,
     walls: Float[np.ndarray, "walls 2 2"] = NO_WALLS,
     resolution: float = 0.05,
-    fired: Bool[np.ndarray, "scans sensors"] | None = None,
 ) -> OccupancyGrid:
     """The occupancy grid of a log, from its direct echoes and known walls.
 
-    A sensor without an echo counts as one that received nothing, and its cone as free. If a log leaves out readings
-    that were merely not renewed, pass the sensors that fired.
+    The cone of a sensor that fired and heard nothing is free. A sensor that a scan did not measure is no evidence
+    (``measured_paths``). Every reading counts at the pose of the robot when it was measured. Firings that stand in
+    scans of their own are grouped (``group_firings``).
 
     Args:
         ring: the sensors.
         log: scans; those without a pose are counted and skipped.
         walls: ends (x, y) of the known walls, world frame, metres.
         resolution: side of a cell, metres.
-        fired: which sensors were active in each scan; None means all.
 
     Raises:
         SonarError: poses too far apart, or cells too small, for a grid; a wall that is not finite; a sensor number that
             the ring does not have.
     """
     empty = OccupancyGrid.empty(resolution=resolution)
-    sensors, first = TransducerArrays.of(ring), first_echoes(ring, log)
-    listening = np.ones((len(log), ring.count), bool) if fired is None else fired
+    log = group_firings(log)
+    sensors, readings = TransducerArrays.of(ring), DirectReadings.of(ring, log)
     posed = np.flatnonzero(np.isfinite(log.pose).all(axis=-1))
     skipped = len(log) - len(posed)
     _check(ring, walls, resolution)
     if not len(posed):
         return replace(empty, skipped=skipped)
     # Allocate the cells that any scan can observe.
-    robot_cell = np.floor(log.pose[posed, :2] / resolution)
+    robot = readings.robot[posed][readings.measured[posed]]
+    robot = np.concatenate([log.pose[posed, :2], robot[:, :2]])
     half = int(np.ceil(sensors.max_distance / resolution)) + 2
-    if np.prod(np.ptp(robot_cell, axis=0) + 2 * half + 1) > SETTINGS.max_cells:
-        span = np.ptp(log.pose[posed, :2], axis=0) + 2 * sensors.max_distance
+    low, high = (np.floor(end(robot, axis=0) / resolution) for end in (np.min, np.max))
+    if np.prod(high - low + 2 * half + 1) > SETTINGS.max_cells:
+        span = np.ptp(robot, axis=0) + 2 * sensors.max_distance
         area = " x ".join(f"{side:g}" for side in span)
         raise SonarError(f"grid: {area} m in cells of {resolution:g} m; allowed are {SETTINGS.max_cells} cells at most")
-    robot_cell = robot_cell.astype(int)
-    low = robot_cell.min(axis=0) - half
-    counts, viewpoints = _allocate(low, robot_cell.max(axis=0) + half + 1)
+    low = low.astype(int) - half
+    counts, viewpoints = _allocate(low, high.astype(int) + half + 1)
     # Add the counts of every scan.
-    wall_map = WallMap.of(walls, resolution)
-    for cell, scan in zip(robot_cell, posed, strict=True):
-        pose, corner = log.pose[scan], cell - half
-        near = wall_map.near(pose[:2], sensors.max_distance)
-        seen = inverse_sensor_model(sensors, pose, first[scan], listening[scan], near, corner, 2 * half + 1)
-        here = _window(corner - low, seen.shape[1:])
-        counts[:, *here] += seen
-        column, row = np.floor(pose[:2] / SETTINGS.viewpoint_cell).astype(int) % 4
-        arcs = seen[LAYERS.index("arcs")]
-        viewpoints[here] |= np.where(arcs > 0, 1 << (4 * row + column), 0).astype(np.uint16)
+    wall_map, columns = WallMap.of(walls, resolution), counts.shape[2]
+    flat_counts = counts.reshape(len(LAYERS), -1)
+    for scan in posed:
+        pose, robot, measured = log.pose[scan], readings.robot[scan], readings.measured[scan]
+        motion = np.linalg.norm(robot[measured, :2] - pose[:2], axis=-1).max(initial=0.0)
+        near = wall_map.near(pose[:2], sensors.max_distance, margin=motion)
+        seen = inverse_sensor_model(sensors, robot, readings.first_echo[scan], measured, near, low, columns)
+        footprint = footprint_cells(sensors, pose, resolution)
+        walls_and_footprint = ((cells - low) @ (1, columns) for cells in (near.cells, footprint))
+        for layer, cells in zip(flat_counts, (*seen[:3], *walls_and_footprint), strict=True):
+            np.add.at(layer, cells, np.int32(1))
+        column, row = np.floor(robot[seen.arc_sensor, :2] / SETTINGS.viewpoint_cell).astype(int).T % 4
+        np.bitwise_or.at(viewpoints.ravel(), seen.arcs, (1 << (4 * row + column)).astype(np.uint16))
+    # The cells of walls are not free.
+    column, row = (wall_map.cells - low).T
+    inside = (column >= 0) & (row >= 0) & (column < counts.shape[2]) & (row < counts.shape[1])
+    counts[0, row[inside], column[inside]] = 0
     return _cropped(resolution, low, counts, viewpoints, len(posed), skipped)
 
 

@@ -45,10 +45,13 @@ class WallMap(NamedTuple):
         extension_limit = np.where(touches, 0.0, SETTINGS.max_extension).reshape(-1, 2)
         return cls(walls, np.concatenate([walls.reshape(-1, 2), corners]), cells, extension_limit, resolution)
 
-    def near(self, position: Float[np.ndarray, "2"], radius: float) -> "WallMap":
-        """The part of the map within a radius of a position, metres, with the walls extended as far as possible."""
-        walls = (point_to_segments(position[None], self.segments) <= radius + SETTINGS.max_extension)[0]
-        points = np.linalg.norm(self.points - position, axis=-1) <= radius + SETTINGS.explained
+    def near(self, position: Float[np.ndarray, "2"], radius: float, *, margin: float = 0.0) -> "WallMap":
+        """The part of the map within a radius of a position, metres, with the walls extended as far as possible.
+
+        The walls and points, but not the cells, extend farther by the margin, metres.
+        """
+        walls = (point_to_segments(position[None], self.segments) <= radius + margin + SETTINGS.max_extension)[0]
+        points = np.linalg.norm(self.points - position, axis=-1) <= radius + margin + SETTINGS.explained
         cells = np.linalg.norm((self.cells + 0.5) * self.resolution - position, axis=-1) <= radius
         return WallMap(
             self.segments[walls], self.points[points], self.cells[cells], self.extension_limit[walls], self.resolution

@@ -337,10 +337,12 @@ def test_only_scans_with_a_pose_and_echoes_within_range_count(faw_ring):
     """An echo beyond the maximum range counts as none; a scan without a pose adds no free space."""
     far = Log.from_echoes(
         np.array([0, 1]), np.array([3, 3]), np.array([3, 3]), np.array([2.6, 1.0]),
-        stamp=np.arange(2.0), pose=np.array([[0.0, 0.0, 0.0], [np.nan] * 3]),
+        stamp=np.arange(2.0), pose=np.array([[0.0, 0.0, 0.0], [np.nan] * 3]), asked=faw_ring.paths,
     )  # fmt: skip
     silent = Log.from_echoes(
-        np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0), stamp=np.zeros(1), pose=np.zeros((1, 3))
-    )
+        np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0),
+        stamp=np.zeros(1), pose=np.zeros((1, 3)), asked=faw_ring.paths,
+    )  # fmt: skip
     came = [gather_evidence(faw_ring, log, list(local_models(faw_ring, log))).free_space for log in (far, silent)]
     assert_same(*came)
+    assert came[0].tiles

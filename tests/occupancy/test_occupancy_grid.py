@@ -20,6 +20,7 @@ from jaxsonar.occupancy.settings import SETTINGS
 from jaxsonar.occupancy.wall_visibility import WallMap, estimate_extensions
 
 QUARTER = np.pi / 2
+RING = Ring.circular()
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +41,11 @@ def listen(ring, walls, poses, *, poles=(), **errors):
     return simulate(ring, room, poses, **errors).as_log(ring, poses)
 
 
-def silent(poses):
-    """A log without echoes."""
+def silent(poses, ring=RING):
+    """A log in which all sensors fired and heard nothing."""
     nothing = np.zeros(0, int)
-    return Log.from_echoes(nothing, nothing, nothing, np.zeros(0), stamp=np.arange(len(poses)) / 10, pose=poses)
+    stamp = np.arange(len(poses)) / 10
+    return Log.from_echoes(nothing, nothing, nothing, np.zeros(0), stamp=stamp, pose=poses, asked=ring.paths)
 
 
 def centers(grid):
@@ -193,8 +195,9 @@ def test_no_echo_is_free_space_and_never_a_wall(faw_ring):
     assert (image[reach < 2.0] == FREE).mean() > 0.99
     assert (image[reach > 2.28 + 0.05] == UNKNOWN).all()
     at_max = Log.from_echoes(
-        np.zeros(1, int), np.zeros(1, int), np.zeros(1, int), np.array([2.0]), stamp=np.zeros(12), pose=poses
-    )
+        np.zeros(1, int), np.zeros(1, int), np.zeros(1, int), np.array([2.0]),
+        stamp=np.zeros(12), pose=poses, asked=faw_ring.paths,
+    )  # fmt: skip
     assert occupancy(faw_ring, at_max) == grid
 
 
@@ -308,19 +311,20 @@ def test_free_cells_are_connected_to_the_trajectory(rng):
     assert 3 < reached.sum() < (grid.free > 0).sum()
 
 
-def test_sensors_that_did_not_fire_contribute_nothing(faw_ring):
+def test_a_scan_that_measured_nothing_only_frees_the_robots_own_body(faw_ring):
     poses = circle((0.0, 0.0), 0.5, 12)
-    fired = np.zeros((12, 24), bool)
-    grid = occupancy(faw_ring, silent(poses), fired=fired)
+    nothing = np.zeros(0, int)
+    log = Log.from_echoes(nothing, nothing, nothing, np.zeros(0), stamp=np.arange(12.0), pose=poses)
+    grid = occupancy(faw_ring, log)
     points = centers(grid)
     gap = np.linalg.norm(points[:, :, None] - poses[:, :2], axis=-1).min(axis=2)
-    assert gap[grid.classify() == FREE].max() < 0.28  # only the robot's own body
+    assert gap[grid.classify() == FREE].max() < 0.28
 
 
 def test_sensors_without_an_outline_have_no_footprint_area():
     for position in ([(0.2, 0.0)], [(0.2, -0.2), (0.2, 0.0), (0.2, 0.2)]):
         ring = Ring(position, np.zeros(len(position)), beam=0.5, neighbors=0, max_range=1.0)
-        grid = occupancy(ring, silent(np.zeros((3, 3))))
+        grid = occupancy(ring, silent(np.zeros((3, 3)), ring))
         points = centers(grid)
         assert points[grid.classify() == FREE][:, 0].min() > 0.2
         assert points[grid.classify() == FREE][:, 0].max() == pytest.approx(1.175)
