@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .measurement_model import PredictedEcho, reflector_echo
 from .planar_geometry import dot, signed_angle
-from .sensor_array import EchoPaths
+from .sensor_array import EchoPaths, transform_path
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,18 @@ class PredictionTable(eqx.Module):
 
 @jax.jit
 def predict_all_echoes(
-    paths: EchoPaths, kind: Int[Array, "scans reflectors"], reflectors: Float[Array, "scans reflectors 2"]
+    paths: EchoPaths,
+    kind: Int[Array, "scans reflectors"],
+    reflectors: Float[Array, "scans reflectors 2"],
+    path_pose: Float[Array, "scans paths 3"] | None = None,
 ) -> PredictionTable:
     """Predict the echo of every path from every reflector of a batch of scans.
 
     Args:
         paths: of the ring.
         kind: PLANE, CORNER or EDGE; -1 where there is no reflector.
-        reflectors: (rho, theta) of planes, (x, y) of corners and edges; robot frame, metres, radians.
+        reflectors: (rho, theta) of planes, (x, y) of corners and edges; robot frame of the scan, metres, radians.
+        path_pose: scan_from_robot when each path was measured: x, y (m), theta (rad); None for a robot at rest.
     """
 
     def one(kind: Int[Array, ""], reflector: Float[Array, "2"], path: EchoPaths) -> PredictionTable:
@@ -79,4 +83,8 @@ def predict_all_echoes(
         )
 
     each_path = jax.vmap(one, in_axes=(None, None, 0))
-    return jax.vmap(jax.vmap(each_path, in_axes=(0, 0, None)), in_axes=(0, 0, None))(kind, reflectors, paths)
+    each_reflector = jax.vmap(each_path, in_axes=(0, 0, None))
+    if path_pose is None:
+        return jax.vmap(each_reflector, in_axes=(0, 0, None))(kind, reflectors, paths)
+    moved = jax.vmap(jax.vmap(transform_path), in_axes=(None, 0))(paths, path_pose)
+    return jax.vmap(each_reflector)(kind, reflectors, moved)

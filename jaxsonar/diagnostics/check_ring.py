@@ -11,18 +11,25 @@ from jaxsonar.diagnostics.beam_width import count_by_angle, fit_cone, fit_each_c
 from jaxsonar.diagnostics.echo_residuals import ResidualTable, explained_fraction, predict_and_match
 from jaxsonar.diagnostics.findings import describe_findings
 from jaxsonar.diagnostics.health_report import Health as Health
+from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
 from jaxsonar.diagnostics.range_offsets import OffsetEstimate, estimate_offsets
 from jaxsonar.diagnostics.reference_scene import (
     ReferenceScene,
     evenly_spaced,
+    renumber,
     scene_from_map,
     scene_from_scans,
     select_scans,
 )
+from jaxsonar.diagnostics.repeated_ranges import RepeatedRanges
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.diagnostics.swapped_sensors import find_exchanged_sensors
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.scans.firing_poses import group_firings
 from jaxsonar.scans.flat_echoes import FlatEchoes
+from jaxsonar.scans.held_readings import find_held_readings, with_ages
+from jaxsonar.scans.measured_paths import is_repeated
+from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import check_speed_of_sound
@@ -53,6 +60,8 @@ def check(
     check_speed_of_sound(ring)
     if not len(log):
         raise SonarError("check: the log holds no scan; allowed are one or more")
+    # Prepare the log: no marks for no echo, ages of held readings, firings grouped into scans.
+    log, faults = _prepared(ring, log)
     _, left_out = FlatEchoes.from_log(ring, log)
     if left_out and on_left_out is not None:
         on_left_out(left_out)
@@ -63,7 +72,7 @@ def check(
     in_place = np.arange(ring.count)
     place = find_exchanged_sensors(ring, part, scene, sigma=sigma) if source else in_place
     if (place != in_place).any():
-        renumbered = replace(part, tx=place[part.tx], rx=place[part.rx])
+        renumbered = renumber(part, place)
         scene = scene if scene.from_map else scene_from_scans(ring, renumbered, sigma, progress)
         table = predict_and_match(ring, scene, renumbered)
     # Estimate range offsets and the noise of the ranges.
@@ -84,8 +93,9 @@ def check(
     quantiles, spread = _residual_statistics(table, offsets, ring.count)
     gate = SETTINGS.detection.explained_gate * noise + SETTINGS.detection.explained_margin
     explained = explained_fraction(as_numbered, gate, ring.count), explained_fraction(table, gate, ring.count)[place]
-    repeats, pairs = _repeated_ranges(log, ring.count)
-    cross = log.tx != log.rx
+    repeated, measured = RepeatedRanges.of(log, ring.count), MeasuredSensors.of(ring, log)
+    heard = np.isfinite(log.range) & ~is_repeated(log)
+    direct, cross = heard & (log.tx == log.rx), heard & (log.tx != log.rx)
     # Report by the sensor numbers of the log.
     health = Health(
         ring=ring,
@@ -96,7 +106,7 @@ def check(
         empty=empty,
         left_out=left_out,
         sigma=offsets.sigma if source else float("nan"),
-        direct=np.bincount(log.tx[~cross], minlength=ring.count),
+        direct=np.bincount(log.tx[direct], minlength=ring.count),
         cross=np.bincount(np.append(log.tx[cross], log.rx[cross]), minlength=ring.count),
         expected=expected_count[place],
         heard=detected_count[place],
@@ -107,8 +117,8 @@ def check(
         median=quantiles[place, 2],
         quartiles=quantiles[place][:, [0, 1, 3, 4]],
         spread=spread[place],
-        repeats=repeats,
-        constant=_most_frequent_range(log, ring.count),
+        repeats=repeated.repeats,
+        constant=repeated.constant,
         beam=2 * np.array([curve[0], half_width_error]),
         curve=curve,
         asked=expected_in_all,
@@ -117,9 +127,23 @@ def check(
         centre=direction[place] * scale[place],
         remarks=("",) * ring.count,
         findings=(),
+        unmeasured=measured.unmeasured,
     )
-    remarks, findings = describe_findings(health, pairs, sigma)
+    remarks, findings = describe_findings(health, measured, repeated.pairs, sigma, faults)
     return replace(health, remarks=remarks, findings=findings)
+
+
+def _prepared(ring: Ring, log: Log) -> tuple[Log, list[str]]:
+    """The log as the check needs it, and what had to be changed: faults of the driver."""
+    faults = []
+    if values := find_no_echo_values(log):
+        listed = ", ".join(map(str, values))
+        faults.append(f"most sensors read {listed}, wherever the robot is: a mark for no echo, which counts as silence")
+        log = without_no_echo_values(log, values)
+    log = group_firings(log)
+    if held := find_held_readings(ring, log):
+        faults.append(held.describe())
+    return with_ages(log, held), faults
 
 
 def _reference_walls(
@@ -132,9 +156,9 @@ def _reference_walls(
     if scene.is_wall.sum() >= max(settings.min_walls, len(part) // 10):
         return part, scene, "scans", ""
     if not (np.asarray(ring.corrected(part.range, part.tx, part.rx)) < ring.max_range).any():
-        if not len(log.range):
+        if not log.echo_count:
             return part, scene, "", "no echo in any scan"
-        reach = f"none of the {len(log.range)} echoes is within the maximum range, {ring.max_range:g} m"
+        reach = f"none of the {log.echo_count} echoes is within the maximum range, {ring.max_range:g} m"
         return part, scene, "", f"{reach}: are ranges half path lengths in metres?"
     if np.isfinite(part.pose).all(axis=1).sum() < 2:
         return part, scene, "", "single scans show too few walls, and the log has no poses to gather them by"
@@ -185,27 +209,6 @@ def _residual_statistics(
     quantiles = [np.percentile(x, (5, 25, 50, 75, 95)) if len(x) >= least else np.full(5, np.nan) for x in direct]
     spread = [[_scaled_mad(x), _scaled_mad(y)] for x, y in zip(direct, both, strict=True)]
     return np.array(quantiles), np.array(spread)
-
-
-def _repeated_ranges(log: Log, sensors: int) -> tuple[Float[np.ndarray, " sensors"], Int[np.ndarray, " sensors"]]:
-    """Fraction of first direct ranges that equal that of the previous scan, and the number of compared pairs."""
-    own = np.flatnonzero(log.tx == log.rx)
-    first = np.full((len(log), sensors), np.inf)
-    np.minimum.at(first, (log.echo_scan[own], log.tx[own]), log.range[own])
-    both = np.isfinite(first[1:]) & np.isfinite(first[:-1])
-    pairs = both.sum(axis=0)
-    same = (both & (first[1:] == first[:-1])).sum(axis=0)
-    return np.where(pairs > 0, same / np.maximum(pairs, 1), np.nan), pairs
-
-
-def _most_frequent_range(log: Log, sensors: int) -> Float[np.ndarray, "sensors 2"]:
-    """Each sensor's most frequent range, metres, and the fraction of its direct echoes with that range."""
-    constant = np.full((sensors, 2), np.nan)
-    for k in range(sensors):
-        values, times = np.unique(log.range[(log.tx == k) & (log.rx == k)], return_counts=True)
-        if len(values):
-            constant[k] = values[times.argmax()], times.max() / times.sum()
-    return constant
 
 
 def _scaled_mad(values: Float[np.ndarray, " echoes"]) -> float:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.diagnostics.reference_scene import ReferenceScene, predict_reports
 from jaxsonar.diagnostics.settings import SETTINGS
-from jaxsonar.geometry.se2 import tangent_of, unit
+from jaxsonar.geometry.se2 import tangent_of, transform_points, unit
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
@@ -29,7 +29,8 @@ class ResidualTable(NamedTuple):
     rx: Int[np.ndarray, " rows"]
     """Receiver."""
     residual: Float[np.ndarray, " rows"]
-    """Reported minus predicted range of the path's nearest echo, metres; inf without an echo."""
+    """Reported minus predicted range of the path's nearest echo, metres; inf without an echo. Only a path that was
+    measured has a row."""
     is_nearest: Bool[np.ndarray, " rows"]
     """Whether no other reflector predicts a range closer to that echo."""
     d_range_d_wall: Float[np.ndarray, "rows 2"]
@@ -41,7 +42,7 @@ class ResidualTable(NamedTuple):
     beyond_end: Float[np.ndarray, " rows"]
     """Distance of the point of reflection from the wall's ends, metres; 0 between them."""
     unobstructed: Bool[np.ndarray, " rows"]
-    """Whether no known wall is in the way, and the reading is a new one."""
+    """Whether no known wall is in the way, and the reading is a new one as far as the log shows."""
     independent_echoes: Int[np.ndarray, " rows"]
     """Echoes that support the wall without those of the sensor itself (for a cross path: of the path, both ways)."""
     echo_tx: Int[np.ndarray, " echoes"]
@@ -53,14 +54,22 @@ class ResidualTable(NamedTuple):
 
 
 def predict_and_match(ring: Ring, scene: ReferenceScene, log: Log) -> ResidualTable:
-    """Predict what each path should hear of each wall, and match it with the nearest echo."""
+    """Predict what each measured path should hear of each wall, and match it with the nearest echo.
+
+    Args:
+        ring: the sensors.
+        scene: the reflectors of each scan.
+        log: the scans; readings with a time of their own are predicted from the robot's pose at that time.
+    """
     flat, _ = FlatEchoes.from_log(ring, log)
-    fresh = is_fresh_reading(flat) if scene.from_map else np.ones(len(flat.scan), bool)
+    # Only a log that marks neither silence nor ages needs a guess which readings are new.
+    unmarked = len(log.asked) > 0 and not log.age.any()
+    fresh = is_fresh_reading(flat) if scene.from_map and unmarked else np.ones(len(flat.scan), bool)
     wall_number = np.cumsum(scene.is_wall).reshape(scene.is_wall.shape) - 1
     size = SETTINGS.reference.block_scans
     blocks = [slice(first, min(first + size, len(log))) for first in range(0, max(1, len(log)), size)]
     tables = [
-        _match_block(ring, scene, block, *_dense_ranges(flat, block, fresh, len(ring.paths)), wall_number)
+        _match_block(ring, scene, block, flat, *_dense_ranges(flat, block, fresh, len(ring.paths)), wall_number)
         for block in blocks
     ]
     return ResidualTable(*(np.concatenate(column) for column in zip(*tables, strict=True)))
@@ -70,13 +79,14 @@ def _match_block(
     ring: Ring,
     scene: ReferenceScene,
     block: slice,
+    flat: FlatEchoes,
     reported: Float[np.ndarray, "block paths slots"],
     is_new: Bool[np.ndarray, "block paths"],
     wall_number: Int[np.ndarray, "scans reflectors"],
 ) -> ResidualTable:
     """The table of one block of scans, from reported ranges and whether they are new readings."""
     tx, rx = ring.paths.T
-    predicted, expected = predict_reports(ring, scene, block)
+    predicted, expected = predict_reports(ring, scene, block, flat.path_pose)
     is_wall = scene.is_wall[block]
     # Each echo belongs to the nearest reflector. Each wall gets the nearest echo of each path.
     difference = reported[:, None] - expected[..., None]
@@ -91,11 +101,15 @@ def _match_block(
     beyond_end = np.maximum(start[..., None] - predicted.footpoint, predicted.footpoint - end[..., None])
     unobstructed = ~_is_behind_wall(scene, block, predicted.footpoint) & is_new[:, None]
     if scene.from_map:
-        midpoint = np.asarray(ring.echo_paths.midpoint, np.float64)
+        midpoint = np.broadcast_to(ring.exact_paths.midpoint, (len(is_wall), len(tx), 2))
+        if flat.path_pose is not None:
+            midpoint = transform_points(flat.path_pose[block], midpoint)
         unobstructed &= ~_is_occluded(midpoint, scene, block, predicted.footpoint)
     # Walls that a path may hear; direct paths also if the wall is outside of the cone, to measure the cone.
     kept = is_wall[..., None] & predicted.exists & (predicted.range < ring.max_range - SETTINGS.reference.range_margin)
     kept &= (predicted.visibility > 0) | (tx == rx)
+    if flat.measured is not None:
+        kept &= flat.measured[block][:, None]
     row = s, r, p = np.nonzero(kept)
     own = np.where(tx[p] == rx[p], scene.echoes_of_sensor[block][s, r, tx[p]], 2)
     scale = REFERENCE_SPEED_OF_SOUND / float(ring.speed_of_sound)
@@ -152,21 +166,21 @@ def _is_behind_wall(
 
 
 def _is_occluded(
-    midpoint: Float[np.ndarray, "paths 2"],
+    midpoint: Float[np.ndarray, "block paths 2"],
     scene: ReferenceScene,
     block: slice,
     footpoint: Float[np.ndarray, "block reflectors paths"],
 ) -> Bool[np.ndarray, "block reflectors paths"]:
-    """Points of reflection that another wall occludes from the virtual sensor of the path."""
+    """Points of reflection that another wall occludes from the virtual sensor of the path, which is in ``midpoint``."""
     rho, theta = np.moveaxis(scene.parameters[block].astype(np.float64), -1, 0)
     n, t = unit(theta), tangent_of(theta)
     point = (rho[..., None] * n)[:, :, None] + footpoint[..., None] * t[:, :, None]  # (scans, walls, paths, 2)
-    ray = point - midpoint
+    ray = point - midpoint[:, None]
     # Where the ray to the point of wall w crosses the line of wall j, as a fraction of the ray and along the wall.
     toward = np.einsum("swpx,sjx->swjp", ray, n)
-    height = rho[:, None, :, None] - np.einsum("px,sjx->sjp", midpoint, n)[:, None]
+    height = rho[:, None, :, None] - np.einsum("spx,sjx->sjp", midpoint, n)[:, None]
     fraction = height / np.where(toward == 0, 1, toward)
-    along = np.einsum("px,sjx->sjp", midpoint, t)[:, None] + fraction * np.einsum("swpx,sjx->swjp", ray, t)
+    along = np.einsum("spx,sjx->sjp", midpoint, t)[:, None] + fraction * np.einsum("swpx,sjx->swjp", ray, t)
     start, end = np.moveaxis(scene.extent[block], -1, 0)[..., None, :, None]
     crosses = (
         (fraction > 0) & (fraction < 0.97) & (along > start) & (along < end) & scene.is_wall[block][:, None, :, None]

@@ -1,15 +1,18 @@
 """Findings of the health check: what is wrong with a ring, in sentences."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.diagnostics.health_report import Health
+from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
 from jaxsonar.diagnostics.settings import SETTINGS
 
 _FINDINGS = SETTINGS.findings
+_ROLES = ("mute", "no other sensor hears it"), ("deaf", "it hears no other sensor")
+"""Remark and meaning if a sensor has no cross echo as transmitter, as receiver."""
 
 
 class Finding(NamedTuple):
@@ -24,29 +27,39 @@ class Finding(NamedTuple):
 
 
 def describe_findings(
-    health: Health, pairs: Int[np.ndarray, " sensors"], sigma: float | None
+    health: Health,
+    measured: MeasuredSensors,
+    pairs: Int[np.ndarray, " sensors"],
+    sigma: float | None,
+    faults: Sequence[str] = (),
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """A remark for each sensor, and a sentence for each finding, the most severe first.
 
     Args:
         health: the measurements.
+        measured: what was measured at all.
         pairs: number of direct ranges of each sensor that were compared with the previous scan.
         sigma: standard deviation of the ranges, metres, if it is known.
+        faults: sentences about the log as a whole, which come first.
     """
-    found = [*_silent_sensors(health), *_exchanged_sensors(health), *_stuck_sensors(health, pairs)]
+    found = [Finding(sentence, {}) for sentence in faults]
+    found += [*_silent_sensors(health, measured), *_exchanged_sensors(health), *_stuck_sensors(health, pairs)]
     excluded = {k for finding in found if finding.exclusive for k in finding.remarks}
     minor = (*_range_offsets(health, sigma), *_weak_or_turned_sensors(health))
     found += [finding for finding in minor if not excluded & set(finding.remarks)]
-    found += [Finding(sentence, {}) for sentence in _ring_findings(health)]
+    found += [Finding(sentence, {}) for sentence in _ring_findings(health, measured)]
     remarks = ["; ".join(f.remarks[k] for f in found if k in f.remarks) for k in range(health.ring.count)]
     return tuple(remarks), tuple(finding.sentence for finding in found)
 
 
-def _silent_sensors(health: Health) -> Iterator[Finding]:
-    """Sensors that are dead, deaf (do not receive) or mute (do not transmit)."""
+def _silent_sensors(health: Health, measured: MeasuredSensors) -> Iterator[Finding]:
+    """Sensors that are dead, deaf (do not receive) or mute (do not transmit).
+
+    If the log does not mark paths that heard nothing, sensors that are never heard are named with both explanations.
+    """
     usual = _usual_rates(health)
     echoes = health.direct + health.cross
-    others = float(np.median(echoes))
+    others, others_cross = float(np.median(echoes)), float(np.median(health.cross))
     for k in range(health.ring.count):
         expected, detected = health.expected[k], health.heard[k]
         low = _is_low(expected, detected, usual, _FINDINGS.dead_rate)
@@ -62,19 +75,32 @@ def _silent_sensors(health: Health) -> Iterator[Finding]:
                 {k: "hears no wall" if elsewhere else "dead"},
                 exclusive=True,
             )
-        elif echoes[k] == 0 and others >= 10:
+        elif echoes[k] == 0 and others >= _FINDINGS.min_echoes and (measured.any[k] or not measured.certain):
             sentence = f"sensor {k} hears nothing: no echo in the log, the others {others:.0f} each"
-            yield Finding(sentence, {k: "dead"}, exclusive=True)
-        elif low[1] != low[2] and np.isfinite(usual[1:]).all():
-            role, remark, meaning = (
-                (1, "mute", "no other sensor hears it") if low[1] else (2, "deaf", "it hears no other sensor")
+            doubt = "" if measured.any[k] else "; or it was not measured"
+            yield Finding(sentence + doubt, {k: "dead"}, exclusive=True)
+        elif _never_in_one_role(measured, k) and others_cross >= _FINDINGS.min_echoes:
+            remark, meaning = _ROLES[int(measured.cross[k, 0])]
+            yield Finding(
+                f"sensor {k} is {remark}, {meaning}: no such echo in the log; or these paths were not measured",
+                {k: remark},
+                exclusive=True,
             )
+        elif low[1] != low[2] and np.isfinite(usual[1:]).all():
+            role = 1 if low[1] else 2
+            remark, meaning = _ROLES[role - 1]
             yield Finding(
                 f"sensor {k} is {remark}, {meaning}: {detected[role]} of {expected[role]} expected cross echoes, the "
                 f"others {100 * usual[role]:.0f} %",
                 {k: remark},
                 exclusive=True,
             )
+
+
+def _never_in_one_role(measured: MeasuredSensors, sensor: int) -> bool:
+    """Whether the cross echoes of a sensor are all received or all sent, in a log that does not mark silence."""
+    sends, receives = measured.cross[sensor]
+    return not measured.certain and bool(sends != receives)
 
 
 def _exchanged_sensors(health: Health) -> Iterator[Finding]:
@@ -159,7 +185,7 @@ def _weak_or_turned_sensors(health: Health) -> Iterator[Finding]:
             yield Finding(f"sensor {k} points {abs(turn):.0f} ± {error:.0f} deg too far to the {side}", {k: "turned"})
 
 
-def _ring_findings(health: Health) -> Iterator[str]:
+def _ring_findings(health: Health, measured: MeasuredSensors) -> Iterator[str]:
     """Findings about the ring as a whole."""
     explained = health.fits[:, 1][np.isfinite(health.fits[:, 1])]
     if health.source == "scans" and len(explained) and np.median(explained) < _FINDINGS.min_explained:
@@ -178,7 +204,7 @@ def _ring_findings(health: Health) -> Iterator[str]:
             f"echoes"
         )
     all_echoes = int(health.direct.sum() + health.cross.sum() // 2)
-    if health.ring.neighbors and not health.cross.any() and all_echoes:
+    if measured.any_cross and not health.cross.any() and all_echoes:
         yield f"no cross echo in {health.scans} scans, the ring listens to {health.ring.neighbors} neighbors"
     in_place = (health.place == np.arange(health.ring.count)).all()
     if health.left_out > max(2, 0.001 * all_echoes) and in_place:

@@ -36,7 +36,7 @@ class Health:
     sigma: float
     """Robust standard deviation of the ranges about the walls, metres; NaN without walls."""
     direct: Int[np.ndarray, " sensors"]
-    """Number of direct echoes in the log."""
+    """Number of direct echoes in the log; a reading that was not renewed counts once."""
     cross: Int[np.ndarray, " sensors"]
     """Number of cross echoes in the log that the sensor sent or received."""
     expected: Int[np.ndarray, "sensors 3"]
@@ -79,6 +79,8 @@ class Health:
     """Short remark for each sensor; empty if nothing is wrong."""
     findings: tuple[str, ...]
     """One sentence per fault, the most severe first; none if the ring is healthy."""
+    unmeasured: tuple[str, ...] = ()
+    """Kinds of paths, and sensors, of which the log holds no measurement; they are not judged."""
 
     @property
     def nominal(self) -> float:

@@ -1,6 +1,7 @@
 """Reference reflectors around the robot in every scan, from each scan alone or from a map."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -56,8 +57,15 @@ def evenly_spaced(count: int, most: int) -> Int[np.ndarray, " rows"]:
 
 
 def select_scans(log: Log, rows: Int[np.ndarray, " rows"]) -> Log:
-    """The given scans of a log."""
-    return log if len(rows) == len(log) else Log.from_scans([log[int(row)] for row in rows])
+    """The given scans of a log, with the motion between all of its scans."""
+    if len(rows) == len(log):
+        return log
+    return replace(Log.from_scans([log[int(row)] for row in rows]), odometry=log.motion)
+
+
+def renumber(log: Log, place: Int[np.ndarray, " sensors"]) -> Log:
+    """The log with other sensor numbers: sensor k becomes ``place[k]``."""
+    return replace(log, tx=place[log.tx], rx=place[log.rx], asked=place[log.asked])
 
 
 def scene_from_scans(
@@ -141,10 +149,33 @@ def scene_from_map(ring: Ring, log: Log) -> ReferenceScene:
     )
 
 
+def move_scene(scene: ReferenceScene, robot_from_other: Float[np.ndarray, "scans 3"]) -> ReferenceScene:
+    """The reflectors in another frame in each scan; the extent of the walls is not kept.
+
+    Args:
+        scene: reflectors, robot frame.
+        robot_from_other: pose of the other frame, robot frame: x, y (m), theta (rad).
+    """
+    turn = robot_from_other[:, None, 2]
+    plane = scene.kind == kernels.PLANE
+    first, second = np.moveaxis(scene.parameters.astype(np.float64), -1, 0)
+    rho = first - (robot_from_other[:, None, :2] * unit(second)).sum(axis=-1)
+    theta = np.where(rho < 0, second + np.pi, second) - turn
+    point = rotate(scene.parameters - robot_from_other[:, None, :2], -turn)
+    parameters = np.where(plane[..., None], np.stack([np.abs(rho), theta], axis=-1), point)
+    return scene._replace(parameters=parameters, extent=np.full_like(scene.extent, np.nan))
+
+
 def predict_reports(
-    ring: Ring, scene: ReferenceScene, block: slice
+    ring: Ring, scene: ReferenceScene, block: slice, path_pose: Float[np.ndarray, "scans paths 3"] | None = None
 ) -> tuple[Any, Float[np.ndarray, "block reflectors paths"]]:
     """Predicted echoes of all paths from all reflectors in a block of scans.
+
+    Args:
+        ring: the sensors.
+        scene: the reflectors of all scans.
+        block: rows of the scans.
+        path_pose: scan_from_robot of all scans when each path was measured; None for a robot at rest.
 
     Returns:
         A ``PredictionTable`` of NumPy arrays, and the ranges that the paths would report, metres.
@@ -153,7 +184,8 @@ def predict_reports(
     padding = ((0, SETTINGS.reference.block_scans - size), (0, 0))
     kind = np.pad(scene.kind[block], padding, constant_values=-1)
     parameters = np.pad(scene.parameters[block], (*padding, (0, 0)))
-    padded = predict_all_echoes(ring.echo_paths, kind.astype(np.int32), parameters.astype(np.float32))
+    pose = None if path_pose is None else np.pad(path_pose[block], (*padding, (0, 0))).astype(np.float32)
+    padded = predict_all_echoes(ring.echo_paths, kind.astype(np.int32), parameters.astype(np.float32), pose)
     predicted: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[:size], padded)
     scale = REFERENCE_SPEED_OF_SOUND / float(ring.speed_of_sound)
     return predicted, predicted.range * scale + np.asarray(ring.echo_paths.range_offset, np.float64)

@@ -152,6 +152,8 @@ class FindingSettings:
     """Fraction of echoes that reflectors must explain; below, the ring or the units are probably wrong."""
     min_expected: int = 8
     """Expected echoes that a detection rate needs."""
+    min_echoes: int = 10
+    """Echoes of the median sensor from which on a sensor without any is reported."""
     dead_rate: float = 0.15
     """A sensor with less than this fraction of the usual detection rate is dead, deaf or mute."""
     min_elsewhere: float = 0.3

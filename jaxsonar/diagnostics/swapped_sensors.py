@@ -11,11 +11,15 @@ from jaxsonar import kernels
 from jaxsonar.diagnostics.reference_scene import (
     ReferenceScene,
     evenly_spaced,
+    move_scene,
     predict_reports,
+    renumber,
     scene_from_scans,
     select_scans,
 )
 from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.scans.firing_poses import reading_motion
+from jaxsonar.scans.measured_paths import is_repeated
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -55,7 +59,7 @@ def find_exchanged_sensors(
 
     def evaluate(place: Int[np.ndarray, " sensors"]) -> _Hypothesis:
         # Detect the walls again with the exchanged numbers: they improve if the hypothesis is right.
-        renumbered = replace(log, tx=place[log.tx], rx=place[log.rx])
+        renumbered = renumber(log, place)
         improved = scene if scene.from_map else scene_from_scans(ring, renumbered, sigma, None)
         return _Hypothesis(place, position_log_likelihood(ring, improved, renumbered))
 
@@ -109,24 +113,46 @@ def position_log_likelihood(ring: Ring, scene: ReferenceScene, log: Log) -> Floa
     path_of, positions = all_pairs.path_index, np.arange(ring.count)
     odds = detector.detection_probability / detector.clutter_density
     log_likelihood = np.zeros((ring.count, ring.count))
+    scan, (tx, rx, reported), scene = _echoes_by_pose(log, scene)
+    start = np.searchsorted(scan, np.arange(len(scene.kind) + 1))
     size = SETTINGS.reference.block_scans
-    for first in range(0, len(log), size):
-        block = slice(first, min(first + size, len(log)))
+    for first in range(0, len(scene.kind), size):
+        block = slice(first, min(first + size, len(scene.kind)))
         if not scene.is_wall[block].any():
             continue
         predicted, expected = predict_reports(all_pairs, scene, block)
         visibility = predicted.visibility * listens
-        of = slice(int(log.start[block.start]), int(log.start[block.stop]))
-        scan, tx, rx, reported = log.echo_scan[of] - first, log.tx[of], log.rx[of], log.range[of]
-        direct, cross = np.flatnonzero(tx == rx), np.flatnonzero(tx != rx)
+        of = np.arange(start[block.start], start[block.stop])
+        direct, cross = of[tx[of] == rx[of]], of[tx[of] != rx[of]]
         # Echoes, the sensor that is judged, and the path that they would have with that sensor at each position.
         for echo, sensor, paths in (
             (direct, tx[direct], np.broadcast_to(path_of[positions, positions], (len(direct), ring.count))),
             (cross, tx[cross], path_of[:, rx[cross]].T),
             (cross, rx[cross], path_of[tx[cross], :]),
         ):
-            index = (scan[echo, None, None], np.arange(visibility.shape[1])[:, None], paths[:, None, :])
+            index = (scan[echo, None, None] - first, np.arange(visibility.shape[1])[:, None], paths[:, None, :])
             normalized = (reported[echo, None, None] - expected[index]) / sigma
             density = (visibility[index] * np.exp(-0.5 * normalized**2) / (sigma * np.sqrt(2 * np.pi))).sum(axis=1)
             np.add.at(log_likelihood, sensor, np.log1p(odds * density))
     return log_likelihood
+
+
+def _echoes_by_pose(log: Log, scene: ReferenceScene) -> tuple[np.ndarray, tuple[np.ndarray, ...], ReferenceScene]:
+    """The echoes, and the scene in the robot frame at the time of each of them.
+
+    The position of a sensor is in doubt, but not the time of its echo. Therefore the echoes of a scan with several
+    poses are divided by pose, and the scene of each part is moved to it.
+
+    Returns:
+        The part of each echo, ascending; tx, rx and range (metres) of the echoes; the scene of each part.
+    """
+    heard = np.isfinite(log.range) & ~is_repeated(log)
+    part = scan = log.echo_scan[heard]
+    columns = tuple(column[heard] for column in (log.tx, log.rx, log.range))
+    motion = reading_motion(log)
+    if motion is None:
+        return scan, columns, scene
+    each, part = np.unique(np.column_stack([scan, motion[heard]]), axis=0, return_inverse=True)
+    order = np.argsort(part, kind="stable")
+    moved = move_scene(scene.at(each[:, 0].astype(np.int64)), each[:, 1:])
+    return part[order], tuple(column[order] for column in columns), moved

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from jaxsonar.scans.firing_poses import group_firings
+from jaxsonar.scans.held_readings import find_held_readings, with_ages
 from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.unheard_paths import unheard_warning
@@ -14,6 +15,7 @@ def prepared_log(ring: Ring, log: Log, *, on_note: Callable[[str], None]) -> Log
 
     - Ranges that mean no echo (``find_no_echo_values``) become silent readings.
     - Firings that are scans of their own are merged into scans (``group_firings``).
+    - Readings that repeat the last range because the sensor heard nothing get an age (``find_held_readings``).
 
     Args:
         ring: the sensors.
@@ -33,4 +35,6 @@ def prepared_log(ring: Ring, log: Log, *, on_note: Callable[[str], None]) -> Log
     grouped = group_firings(log)
     if grouped is not log:
         on_note(f"{len(log)} scans with one firing each are merged into {len(grouped)} scans")
-    return grouped
+    if held := find_held_readings(ring, grouped):
+        on_note(f"warning: {held.describe()}; each range counts once; let the driver report nothing instead")
+    return with_ages(grouped, held)

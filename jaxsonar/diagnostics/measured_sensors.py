@@ -1,0 +1,59 @@
+"""Which sensors and which kinds of paths a log measured. What was not measured tells nothing about a sensor."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from jaxsonar.scans.measured_paths import measured_paths
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.unheard_paths import neighbor_offsets, unheard_offsets
+from jaxsonar.sensors.ring import Ring
+
+
+class MeasuredSensors(NamedTuple):
+    """Paths of each sensor that a log measured in any scan."""
+
+    any: Bool[np.ndarray, " sensors"]
+    """Whether any path of the sensor was measured."""
+    cross: Bool[np.ndarray, "sensors 2"]
+    """Whether any cross path was measured with the sensor as transmitter, as receiver; True if it has no such path, or
+    if such paths were measured for no sensor."""
+    any_cross: bool
+    """Whether any cross path was measured."""
+    certain: bool
+    """Whether the log marks paths that heard nothing. Otherwise a path that is never heard may be silent or unmeasured,
+    and it counts as unmeasured."""
+    unmeasured: tuple[str, ...]
+    """Names of the kinds of paths, and of the sensors, that were never measured."""
+
+    @classmethod
+    def of(cls, ring: Ring, log: Log) -> "MeasuredSensors":
+        """Find what a log measured of a ring."""
+        tx, rx = ring.paths.T
+        measured, offset = measured_paths(ring, log).any(axis=0), neighbor_offsets(ring)
+        audible = np.asarray(ring.exact_paths.width) > 0
+        missing = [k for k in unheard_offsets(ring, log) if not measured[offset == k].any()]
+        kinds = ["direct echoes"] if 0 in missing else []
+        if neighbors := [k for k in missing if k]:
+            kinds.append(f"echoes from neighbor{'s' * (len(neighbors) > 1)} {_listed(neighbors)}")
+        # A sensor is judged by the kinds of paths that were measured at all.
+        exists = audible & ~np.isin(offset, missing)
+        cross = exists & (tx != rx)
+
+        def has(which: Bool[np.ndarray, " paths"], sensor: np.ndarray) -> Bool[np.ndarray, " sensors"]:
+            return np.bincount(sensor[which], minlength=ring.count) > 0
+
+        either = has(measured, tx) | has(measured, rx)
+        absent = np.flatnonzero(~either & (has(exists, tx) | has(exists, rx)))
+        if len(absent) and len(absent) < ring.count:
+            kinds.append(f"sensor{'s' * (len(absent) > 1)} {_listed(absent.tolist())}")
+        roles = np.stack([~has(cross, sensor) | has(cross & measured, sensor) for sensor in (tx, rx)], axis=-1)
+        any_cross = bool((measured & (tx != rx)).any())
+        return cls(either, roles, any_cross, bool(np.isnan(log.range).any()), tuple(kinds))
+
+
+def _listed(numbers: list[int]) -> str:
+    """Numbers as text: "1, 2 and 3"."""
+    *most, last = map(str, numbers)
+    return f"{', '.join(most)} and {last}" if most else last
