@@ -1,4 +1,4 @@
-"""The input logs of a batch: search, format, and fingerprint."""
+"""The input logs of a batch: search, format, and fingerprint. The content of a file decides, not its suffix."""
 
 import hashlib
 import os
@@ -10,9 +10,10 @@ from pathlib import Path
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.recorder_base import recording_marker
+from jaxsonar.recordings.file_content import SUFFIXES, file_content
 
-FORMATS = {".csv": "csv", ".parquet": "parquet", ".mcap": "mcap", ".bag": "bag", ".db3": "bag"}
-"""Format by suffix. A folder with a ``metadata.yaml`` is a bag, too."""
+UNREADABLE = "unreadable"
+"""Format of a file in a folder that is no recording although its suffix is that of one."""
 
 
 @dataclass(frozen=True)
@@ -22,9 +23,11 @@ class Input:
     source: str
     """Name in tables and manifest: the name of the file."""
     filename: str
-    """The file, or the folder of a bag."""
+    """The file, or the folder of a bag or a data set."""
     format: str
-    """csv, parquet, mcap, bag, or recording (a log whose recording has not ended)."""
+    """What the file holds (``recordings.file_content``), or ``UNREADABLE``."""
+    recording: bool = False
+    """The recording of this log has not ended."""
 
     @property
     def key(self) -> str:
@@ -38,11 +41,12 @@ def find_inputs(filenames: Iterable[str | os.PathLike[str]]) -> list[Input]:
     """Find the input logs, sorted by name. A folder stands for the logs in it.
 
     Raises:
-        SonarError: a missing file, an unknown suffix, a folder without logs, or two logs of one name.
+        SonarError: a missing file, a file that is no recording, a folder without logs, or two logs of one name.
     """
     found: dict[str, Input] = {}
     for name in {os.fspath(name): None for name in filenames}:
-        inputs = _folder_inputs(name) if os.path.isdir(name) and not _is_bag(name) else [_input(name, Path(name).name)]
+        is_folder = "\0" not in name and os.path.isdir(name) and not _is_recording(name)
+        inputs = _folder_inputs(name) if is_folder else [_input(name, Path(name).name)]
         for one in inputs:
             other = found.setdefault(one.source, one)
             if os.path.realpath(other.filename) != os.path.realpath(one.filename):
@@ -76,38 +80,38 @@ def _folder_inputs(folder: str) -> Sequence[Input]:
     except OSError as failure:
         raise SonarError(f"{shown(folder)}: {reason(failure)}; needed is a readable folder of logs") from None
     logs = [
-        _input(os.fspath(path), path.name)
+        _input(os.fspath(path), path.name, format_=None if _is_recording(path) else UNREADABLE)
         for path in entries
         if not path.name.startswith(".")
         and not path.name.endswith(".recording.csv")  # the journal of a Parquet recording
-        and (_is_bag(path) if path.is_dir() else path.is_file() and path.suffix.lower() in FORMATS)
+        and (_is_recording(path) if path.is_dir() else path.is_file() and path.suffix.lower() in SUFFIXES)
     ]
     if not logs:
-        raise SonarError(f"{shown(folder)}: no log in this folder; allowed are {', '.join(FORMATS)}")
+        raise SonarError(f"{shown(folder)}: no log in this folder; allowed are {', '.join(SUFFIXES)}")
     return logs
 
 
-def _input(filename: str, name: str) -> Input:
+def _input(filename: str, name: str, *, format_: str | None = None) -> Input:
     if "\0" in filename or not os.path.exists(filename):
         raise SonarError(f"{shown(filename)}: no such file or folder; needed is a log, or a folder of logs")
     if not name:  # "." and "/"
         name = Path(filename).resolve().name
-    format_ = "bag" if _is_bag(filename) else FORMATS.get(Path(filename).suffix.lower())
-    if format_ is None:
-        suffix = Path(filename).suffix
-        came = f"suffix '{shown(suffix)}'" if suffix else "no suffix"
-        raise SonarError(
-            f"{shown(filename)}: {came} came; allowed for a log is {', '.join(FORMATS)}, or a folder of logs"
-        )
-    if not os.path.isfile(filename) and not _is_bag(filename):
+    if not os.path.isfile(filename) and not os.path.isdir(filename):
         raise SonarError(f"{shown(filename)}: not a regular file, but a log is read more than once; needed is a log")
-    if format_ in ("csv", "parquet") and recording_marker(filename).exists():
-        format_ = "recording"
-    return Input(name.encode("utf-8", "surrogateescape").decode("utf-8", "replace"), filename, format_)
+    is_recording = recording_marker(filename).exists()
+    if format_ is None:
+        format_ = "csv" if is_recording else file_content(filename)
+    name = name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    return Input(name, filename, format_, recording=is_recording)
 
 
-def _is_bag(filename: str | os.PathLike[str]) -> bool:
-    return (Path(filename) / "metadata.yaml").is_file() if "\0" not in os.fspath(filename) else False
+def _is_recording(filename: str | os.PathLike[str]) -> bool:
+    """Whether a file or folder is one that ``load_log`` reads."""
+    try:
+        file_content(filename)
+    except SonarError:
+        return recording_marker(filename).exists()
+    return True
 
 
 def _sha256(filename: str | os.PathLike[str]) -> str:

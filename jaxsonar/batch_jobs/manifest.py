@@ -149,6 +149,8 @@ def open_manifest(folder: str | os.PathLike[str], run: Record) -> Iterator[Manif
     """
     folder = Path(folder)
     make_folder(folder)
+    if (folder / STAGING_NAME).is_symlink():
+        raise SonarError(f"{shown(folder / STAGING_NAME)}: a symbolic link came; allowed is a folder of the batch")
     with _locked(folder):
         records = _read_records(folder)
         if not records and any((folder / name).exists() and any((folder / name).iterdir()) for name in TABLES):

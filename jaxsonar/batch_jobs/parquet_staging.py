@@ -1,23 +1,21 @@
-"""Staging: Parquet copies of inputs that cannot be read in parts (bags, raw recordings, large row groups)."""
+"""Staging: Parquet copies of inputs that cannot be read in parts."""
 
-import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
 from importlib.util import find_spec
-from itertools import islice
+
+import numpy as np
 
 from jaxsonar.batch_jobs.inputs import Input
 from jaxsonar.fileio.atomic_files import atomic_write, reason, shown
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.hardware.mcap_recorder import MESSAGES, PROFILE, read_mcap
-from jaxsonar.hardware.protocol import Decoder
-from jaxsonar.hardware.scan_assembler import ScanAssembler
-from jaxsonar.scans.log_file import load_log
+from jaxsonar.recordings.input_options import InputOptions
+from jaxsonar.recordings.load_log import load_log
+from jaxsonar.recordings.prepared_log import prepared_log
+from jaxsonar.scans.measured_paths import unique_readings
 from jaxsonar.scans.parquet_log import open_parquet, write_parquet_chunks
-from jaxsonar.scans.raw_scans import scan_from_raw
-from jaxsonar.scans.scan_log import Log, Scan
-
-MCAP_MAGIC = b"\x89MCAP0\r\n"
+from jaxsonar.scans.recording_journal import TruncatedRecording
+from jaxsonar.sensors.ring import Ring
 
 
 def check_extras(logs: Iterable[Input]) -> None:
@@ -27,40 +25,51 @@ def check_extras(logs: Iterable[Input]) -> None:
         SonarError: an extra is missing.
     """
     for log in logs:
-        is_raw = log.format == "mcap" and _is_raw_recording(log.filename)
-        if log.format in ("mcap", "bag") and find_spec("mcap" if is_raw else "rosbags") is None:
+        is_raw = log.format == "record"
+        if log.format in ("record", "bag") and find_spec("mcap" if is_raw else "rosbags") is None:
             what, extra = ("records", "live") if is_raw else ("bags", "ros")
             raise SonarError(f"{shown(log.source)}: {what} need the extra {extra}: pip install 'jaxsonar[{extra}]'")
 
 
-def stage_as_parquet(log: Input, filename: str, *, sensors: int, rows: int) -> None:
-    """Write an input as a Parquet log with small row groups. Memory is bounded by one row group.
+def stage_whole(
+    log: Input, filename: str, *, ring: Ring, rows: int, options: InputOptions, on_note: Callable[[str], None]
+) -> str:
+    """Load and prepare an input, and write it as a Parquet log with small row groups.
 
     Args:
         log: the input.
         filename: the copy.
-        sensors: number of sensors of the ring.
-        rows: maximum number of rows in a row group.
+        ring: the sensors.
+        rows: number of rows in a row group.
+        options: how the input is read.
+        on_note: as in ``prepared_log``.
+
+    Returns:
+        The NumPy file with the motion of the robot (``Log.motion``), beside the copy; empty if there is none.
 
     Raises:
         SonarError: the input cannot be read, or an extra is missing.
     """
-    if log.format == "parquet":
-        _regroup(log, filename, rows)
-    elif log.format == "recording":
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            scans = load_log(log.filename)
-        write_parquet_chunks([scans], filename)
-    elif log.format == "mcap" and _is_raw_recording(log.filename):
-        write_parquet_chunks(_row_groups(_raw_recording_scans(log.filename, log.source, sensors), rows), filename)
-    else:
-        from jaxsonar.scans.rosbag_log import read_bag_scans
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", TruncatedRecording)
+        whole = load_log(log.filename, ring=ring, options=options, on_note=on_note)
+    for one in caught:
+        on_note(f"warning: {one.message}; the recording was interrupted; its complete scans are used")
+    whole = unique_readings(prepared_log(ring, whole, on_note=on_note))
+    write_parquet_chunks((whole[k : k + rows] for k in range(0, len(whole), rows)), filename)
+    if whole.motion is None:
+        return ""
+    odometry = f"{filename}.odometry.npy"
+    np.save(odometry, whole.motion)
+    return odometry
 
-        write_parquet_chunks(_row_groups(read_bag_scans(log.filename, name=log.source), rows), filename)
 
+def regroup(log: Input, filename: str, *, rows: int) -> None:
+    """Copy a Parquet log with small row groups. Memory is bounded by one row group.
 
-def _regroup(log: Input, filename: str, rows: int) -> None:
+    Raises:
+        SonarError: the input cannot be read.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -71,33 +80,3 @@ def _regroup(log: Input, filename: str, rows: int) -> None:
                 writer.write_batch(batch)
     except pa.ArrowException as failure:
         raise SonarError(f"{shown(log.source)}: {reason(failure)}; needed is a whole Parquet file") from None
-
-
-def _is_raw_recording(filename: str | os.PathLike[str]) -> bool:
-    """Whether an MCAP file is a raw recording of ``jaxsonar stream --record``, by the profile in its header."""
-    try:
-        with open(filename, "rb") as file:
-            head = file.read(64)
-    except OSError:
-        return False  # the error is reported when the file is read
-    # magic, opcode 1, length of the record (8 bytes), length of the profile (4 bytes), profile
-    profile = PROFILE.encode()
-    return head.startswith(MCAP_MAGIC) and head[21 : 21 + len(profile)] == profile
-
-
-def _raw_recording_scans(filename: str, name: str, sensors: int) -> Iterator[Scan]:
-    """The scans of a raw recording, each at the pose of its last firing group."""
-    decoder, assembler = Decoder(sensors=sensors), ScanAssembler(sensors=sensors)
-    for topic, received, frame in read_mcap(filename):
-        if topic == MESSAGES:
-            for message in decoder.feed(frame):
-                assembler.unknown_messages = decoder.counts.unknown + decoder.counts.newer > 0
-                yield from map(scan_from_raw, assembler.push(message, received))
-            if decoder.counts.out_of_ring:
-                raise SonarError(f"{shown(name)}: an unknown sensor came; allowed is 0 to {sensors - 1}")
-    yield from map(scan_from_raw, assembler.flush())
-
-
-def _row_groups(scans: Iterator[Scan], rows: int) -> Iterator[Log]:
-    while group := list(islice(scans, rows)):
-        yield Log.from_scans(group)

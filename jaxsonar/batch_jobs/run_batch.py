@@ -4,12 +4,12 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 
 from jaxsonar.batch_jobs.inputs import Input, find_inputs, fingerprint
-from jaxsonar.batch_jobs.manifest import MANIFEST_NAME, STAGING_NAME, Manifest, open_manifest
+from jaxsonar.batch_jobs.manifest import MANIFEST_NAME, STAGING_NAME, Manifest, Record, open_manifest
 from jaxsonar.batch_jobs.parquet_staging import check_extras
 from jaxsonar.batch_jobs.parquet_tables import check_parquet
 from jaxsonar.batch_jobs.shards import SHARD_SCANS, Shard, split_input
@@ -18,6 +18,8 @@ from jaxsonar.detection.settings import check_method, check_sigma, hough_setting
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.kernels import HoughSettings
+from jaxsonar.recordings.input_options import InputOptions
+from jaxsonar.scans.unused_echoes import EchoCounts
 from jaxsonar.sensors.ring import Ring
 
 ENGINES = ("local", "dask")
@@ -48,6 +50,10 @@ class BatchReport:
     """Whole logs that were set aside."""
     manifest: Path
     """The manifest file."""
+    unused: tuple[str, ...] = ()
+    """For each log of which no echo could be used: name and reason."""
+    used_echoes: int = 0
+    """Echoes on paths of the ring within the maximum range, in all scans of the tables."""
 
     @property
     def set_aside_summary(self) -> str:
@@ -68,6 +74,8 @@ def batch(
     scheduler: str | None = None,
     workers: int | None = None,
     shard_scans: int = SHARD_SCANS,
+    options: InputOptions = InputOptions(),  # noqa: B008  immutable
+    on_note: Callable[[str], None] | None = None,
     on_planned: Callable[[int], None] | None = None,
     on_done: Callable[[int], None] | None = None,
 ) -> BatchReport:
@@ -78,7 +86,7 @@ def batch(
     interruptions.
 
     Args:
-        inputs: logs (.csv, .parquet, .mcap, .bag, .db3), and folders of logs.
+        inputs: logs of every kind that ``load_log`` reads, and folders of logs.
         ring: the sensors.
         output: folder of the results.
         method: "ml" or "hough", as in ``local_models``.
@@ -89,6 +97,8 @@ def batch(
         scheduler: address of a running Dask cluster; a local cluster by default.
         workers: processes on this machine; by default one per GPU, or one per core if there is no GPU.
         shard_scans: scans per shard.
+        options: how the logs are read.
+        on_note: called with one line for each choice and each warning about a log; a warning begins with ``warning:``.
         on_planned: called once with the number of scans to process.
         on_done: called after every shard with the number of scans processed so far.
 
@@ -103,14 +113,17 @@ def batch(
     check_parquet()
     settings = hough_settings(ring, settings)
     # 2. Find the logs.
+    inputs = list(inputs)
     logs = find_inputs(inputs)
+    _check_output(output, [*inputs, *(log.filename for log in logs)])
     check_extras(logs)
     job = job_spec(ring, method=method, settings=settings, sigma=sigma)
     # 3. Open the manifest: it lists what an earlier run has finished.
-    with open_manifest(output, _run_record(job, method, sigma, settings, shard_scans)) as manifest:
+    with open_manifest(output, _run_record(job, method, sigma, settings, shard_scans, options)) as manifest:
         manifest.check_inputs(log.source for log in logs)
+        note = on_note or _no_note
         # 4. Split the logs into shards; this depends on the logs alone.
-        shards = [shard for log in logs for shard in _plan(log, manifest, ring, shard_scans)]
+        shards = [shard for log in logs for shard in _plan(log, manifest, ring, shard_scans, options, note)]
         pending = [shard for shard in shards if not manifest.is_done(shard)]
         if on_planned is not None:
             on_planned(sum(shard.chunk.scans for shard in pending))
@@ -123,7 +136,7 @@ def batch(
                 on_done(done)
         # 6. Sort the manifest and summarize it.
         manifest.finish(shards)
-        return _report(manifest, resumed=len(shards) - len(pending))
+        return _report(manifest, ring, resumed=len(shards) - len(pending))
 
 
 def _run_shards(
@@ -140,31 +153,62 @@ def _run_shards(
     return run_local(job, shards, workers=workers)
 
 
-def _plan(log: Input, manifest: Manifest, ring: Ring, scans: int) -> list[Shard]:
+def _plan(
+    log: Input, manifest: Manifest, ring: Ring, scans: int, options: InputOptions, on_note: Callable[[str], None]
+) -> list[Shard]:
     """Split a log into shards and record it in the manifest. An unreadable log has no shards."""
     record: dict[str, int | str] = {}
     try:
         record |= fingerprint(log)
-        shards = split_input(log, staging=manifest.folder / STAGING_NAME, sensors=ring.count, scans=scans)
+        shards = split_input(
+            log,
+            staging=manifest.folder / STAGING_NAME,
+            ring=ring,
+            scans=scans,
+            options=options,
+            on_note=lambda text: on_note(_of_log(text, log)),
+        )
     except SonarError as error:
-        manifest.add_input(log.source, record | {"reason": str(error)})
+        reason = str(error).removeprefix(f"{shown(log.filename)}: ").removeprefix(f"{shown(log.source)}: ")
+        manifest.add_input(log.source, record | {"reason": f"{shown(log.source)}: {reason}"})
         return []
     record |= {"scans": sum(shard.chunk.scans for shard in shards), "shards": len(shards)}
     manifest.add_input(log.source, record)
     return shards
 
 
-def _run_record(job: str, method: str, sigma: float | None, settings: HoughSettings, scans: int) -> dict[str, object]:
+def _of_log(text: str, log: Input) -> str:
+    """A note or warning about an input, with the name of the input."""
+    warning, name = "warning: " * text.startswith("warning: "), shown(log.source)
+    text = text.removeprefix(warning).removeprefix(f"{shown(log.filename)}: ").removeprefix(f"{name}: ")
+    return f"{warning}{name}: {text}"
+
+
+def _no_note(text: str) -> None:
+    """Drop a note."""
+
+
+def _check_output(output: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]]) -> None:
+    """Check that the output folder is not one of the inputs, which may be folders."""
+    if os.path.exists(output) and any(os.path.samefile(output, one) for one in inputs):
+        raise SonarError(f"-o {shown(output)}: this is an input; allowed is another folder")
+
+
+def _run_record(
+    job: str, method: str, sigma: float | None, settings: HoughSettings, scans: int, options: InputOptions
+) -> dict[str, object]:
     """The first line of the manifest: everything that the results depend on, except the inputs."""
     spec = json.loads(job)
     ring_digest = hashlib.sha256(json.dumps(spec["ring"], sort_keys=True).encode()).hexdigest()
     versions = {name: metadata.version(name) for name in ("jaxsonar", "jax")}
     ring = {"name": spec["ring"]["name"], "sha256": ring_digest}
     parameters = {"method": method, "sigma": sigma, "settings": spec["settings"], "shard_scans": scans}
-    return {"batch": 1, **versions, "ring": ring, **parameters}
+    if options != InputOptions():
+        parameters["reading"] = json.loads(json.dumps(asdict(options), default=str))
+    return {"batch": 2, **versions, "ring": ring, **parameters}
 
 
-def _report(manifest: Manifest, *, resumed: int) -> BatchReport:
+def _report(manifest: Manifest, ring: Ring, *, resumed: int) -> BatchReport:
     done = [record for record in manifest.shards.values() if record["state"] == "done"]
     inputs = manifest.inputs.values()
     reasons = [record["reason"] for record in (*inputs, *manifest.shards.values()) if "reason" in record]
@@ -181,7 +225,28 @@ def _report(manifest: Manifest, *, resumed: int) -> BatchReport:
         bad_shards=len(manifest.shards) - len(done),
         bad_logs=sum("reason" in record for record in inputs),
         manifest=manifest.folder / MANIFEST_NAME,
+        unused=tuple(f"{shown(source)}: {why}" for source, why in _unused_logs(manifest, ring, done).items()),
+        used_echoes=sum(record["in_range"] for record in done),
     )
+
+
+def _unused_logs(manifest: Manifest, ring: Ring, done: Iterable[Record]) -> dict[str, str]:
+    """Logs that were read and of which no echo could be used, and why."""
+    names = ("scans", "echoes", "left_out", "in_range")
+    sums = {source: dict.fromkeys(names, 0) for source, record in manifest.inputs.items() if "reason" not in record}
+    incomplete = {record["source"] for record in manifest.shards.values() if record["state"] != "done"}
+    for record in done:
+        counts = sums.setdefault(record["source"], dict.fromkeys(names, 0))
+        for name in names:
+            counts[name] += record[name]
+    reasons = {
+        source: EchoCounts(
+            count["scans"], count["echoes"], count["echoes"] - count["left_out"], count["in_range"]
+        ).why_none_is_used(ring)
+        for source, count in sums.items()
+        if source not in incomplete
+    }
+    return {source: why for source, why in sorted(reasons.items()) if why}
 
 
 def _check_executor(engine: str, scheduler: str | None, workers: int | None, scans: int) -> None:

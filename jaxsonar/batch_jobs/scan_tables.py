@@ -48,7 +48,8 @@ def scan_tables(
         sigma: standard deviation of the ranges, metres, for ml; None: estimated for each scan.
     """
     echoes, _ = FlatEchoes.from_log(ring, log)
-    on_paths = np.bincount(echoes.scan, minlength=len(log))
+    heard = np.isfinite(log.range)
+    off_paths = heard & (ring.path_index[log.tx, log.rx] < 0)
     ranges = np.minimum(echoes.reported, 1e6).astype(np.float32)  # as in the kernels
     within_range = np.asarray(ring.corrected(ranges, *ring.paths[echoes.path].T)) < ring.max_range
     in_range = np.bincount(echoes.scan[within_range], minlength=len(log))
@@ -60,8 +61,8 @@ def scan_tables(
     scans, lines, points = (_concatenate([getattr(batch, name) for batch in batches], name) for name in TABLES)
 
     counts = {
-        "echoes": np.diff(log.start),
-        "left_out": np.diff(log.start) - on_paths,
+        "echoes": np.bincount(log.echo_scan[heard], minlength=len(log)),
+        "left_out": np.bincount(log.echo_scan[off_paths], minlength=len(log)),
         "in_range": in_range,
         "lines": np.bincount(lines["row"], minlength=len(log)),
         "points": np.bincount(points["row"][points["kind"] != "undecided"], minlength=len(log)),

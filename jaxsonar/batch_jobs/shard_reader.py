@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Int
@@ -44,7 +45,10 @@ def read_shard(shard: Shard, ring: Ring) -> tuple[Log, Int[np.ndarray, " scans"]
         reasons |= {first_row + k: why for k, why in unusable.items()}
         logs.append(log._part(usable) if unusable else log)
         rows.append(first_row + usable)
-    return _concatenate(logs), np.concatenate(rows), reasons
+    log = concatenate(logs)
+    if shard.odometry:
+        log = replace(log, odometry=np.load(shard.odometry, mmap_mode="r"))
+    return log, np.concatenate(rows), reasons
 
 
 def _readable_runs(read: Callable[[int, int], Log], scans: int) -> tuple[list[tuple[int, Log]], dict[int, str]]:
@@ -86,7 +90,8 @@ def _unusable_scans(shard: Shard, ring: Ring, first_row: int, log: Log) -> dict[
     return reasons
 
 
-def _concatenate(logs: list[Log]) -> Log:
+def concatenate(logs: list[Log]) -> Log:
+    """One log from consecutive parts of a log."""
     if len(logs) == 1:
         return logs[0]
     names = ("scan", "stamp", "pose", "tx", "rx", "range", "amplitude", "t", "age")

@@ -24,6 +24,10 @@ MAX_REASONS = 20
 """Number of unusable scans of a shard whose reasons are recorded. The others are only counted."""
 
 
+COUNTS = ("lines", "points", "undecided", "left_out", "echoes", "in_range")
+"""Columns of the table of scans whose sums are recorded for each shard."""
+
+
 @dataclass(frozen=True)
 class ShardResult:
     """The tables of a shard, or the reason why there are none."""
@@ -31,7 +35,7 @@ class ShardResult:
     tables: dict[str, bytes] = field(default_factory=dict)
     """Parquet files, by name of the table."""
     counts: dict[str, int] = field(default_factory=dict)
-    """Numbers of rows in the tables."""
+    """Sums over the scans, by the names in ``COUNTS``."""
     bad_scans: int = 0
     """Number of scans that were set aside."""
     reasons: list[str] = field(default_factory=list)
@@ -79,7 +83,7 @@ def _shard_tables(job: str, shard: Shard) -> ShardResult:
     tables = scan_tables(
         ring, log, rows + shard.chunk.first, source=shard.source, method=method, settings=settings, sigma=sigma
     )
-    counts = {name: int(np.sum(tables["scans"][name])) for name in ("lines", "points", "undecided", "left_out")}
+    counts = {name: int(np.sum(tables["scans"][name])) for name in COUNTS}
     encoded = {name: encode_parquet(name, columns) for name, columns in tables.items()}
     return ShardResult(encoded, counts, len(reasons), [reasons[row] for row in sorted(reasons)[:MAX_REASONS]])
 
@@ -95,7 +99,8 @@ def _decode_job(job: str) -> "tuple[Ring, str, HoughSettings, float | None]":
     use_compilation_cache()
     spec: dict[str, Any] = json.loads(job)
     ring: dict[str, Any] = {
-        name: np.array(value) if isinstance(value, list) else value for name, value in spec["ring"].items()
+        name: np.array(value) if isinstance(value, list) and name != "names" else value
+        for name, value in spec["ring"].items()
     }
     settings = spec["settings"] | {"smoothing": tuple(spec["settings"]["smoothing"])}
     return Ring(**ring), spec["method"], HoughSettings(**settings), spec["sigma"]

@@ -6,6 +6,7 @@ from contextlib import ExitStack
 
 from jaxsonar.cli.arguments import add_detection_arguments, filename, number
 from jaxsonar.cli.console import check_sigma_is_used, print_left_out, print_status, progress_bar
+from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, input_options
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Lines of every scan of many logs, as Parquet; resumes after an interruption."
@@ -13,13 +14,7 @@ SUMMARY = "Lines of every scan of many logs, as Parquet; resumes after an interr
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar batch``."""
-    parser.add_argument(
-        "inputs",
-        nargs="+",
-        type=filename,
-        metavar="IN",
-        help="logs (.csv, .parquet, .mcap; .bag, .db3: extra ros), and folders of logs",
-    )
+    add_log_arguments(parser, name="inputs", metavar="IN", nargs="+", help=f"folder of logs, or {LOG_HELP}")
     add_detection_arguments(parser)
     parser.add_argument(
         "-o", "--output", type=filename, metavar="DIR", required=True, help="scans/, lines/, points/, manifest.jsonl"
@@ -39,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run ``jaxsonar batch``. Returns 1 if anything was set aside."""
+    """Run ``jaxsonar batch``. Returns 1 if anything was set aside, or if no echo could be used."""
     from jaxsonar.batch_jobs.run_batch import batch as run_batch
     from jaxsonar.detection.settings_toml import load_settings
     from jaxsonar.fileio.atomic_files import shown
@@ -51,8 +46,14 @@ def run(options: argparse.Namespace) -> int:
         raise SonarError("-o - came; allowed is a folder, which can hold tables")
     ring = load_ring(options.ring)
     settings = load_settings(options.settings) if options.settings else None
+    messages = InputMessages(strict=options.strict)
     with ExitStack() as stack:
         show: list[Callable[[int], None]] = []
+
+        def start(scans: int) -> None:
+            messages.check()
+            show.append(stack.enter_context(progress_bar("scans", scans)))
+
         report = run_batch(
             options.inputs,
             ring,
@@ -63,7 +64,9 @@ def run(options: argparse.Namespace) -> int:
             engine=options.engine,
             scheduler=options.scheduler,
             workers=options.workers,
-            on_planned=lambda scans: show.append(stack.enter_context(progress_bar("scans", scans))),
+            options=input_options(options),
+            on_note=messages.note,
+            on_planned=start,
             on_done=lambda scans: show[0](scans),
         )
     if report.left_out:
@@ -72,10 +75,11 @@ def run(options: argparse.Namespace) -> int:
         f", {report.resumed} of them by an earlier run" if report.resumed else ""
     )
     print_status(f"{report.scans} scans, {report.lines} lines, {shards}: {shown(options.output)}")
+    for reason in report.unused:
+        print_status(f"nothing found: {reason}")
     if report.set_aside:
         print_status(
             f"set aside: {report.set_aside_summary}; the reasons are in {shown(report.manifest)}; the first: "
             f"{report.set_aside[0]}"
         )
-        return 1
-    return 0
+    return 1 if report.set_aside or not report.used_echoes else 0

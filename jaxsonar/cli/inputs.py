@@ -20,6 +20,9 @@ from jaxsonar.reports.text import plural
 
 LOG_HELP = "scan log (CSV, Parquet), raw record (MCAP, extra live), ROS bag (extra ros), or what --from names"
 
+_TABLE_OPTIONS = {"ranges": "range_columns", "time": "time_column", "pose": "pose_columns"}
+"""Options of fields of ``TableFormat`` that have another name."""
+
 
 def add_log_arguments(
     parser: argparse.ArgumentParser,
@@ -55,11 +58,46 @@ def add_reading_options(parser: argparse.ArgumentParser, metavar: str = "LOG") -
         "--no-echo",
         action="append",
         default=[],
-        type=finite(0),
+        type=finite(-1e9),
         metavar="METRES",
-        help="a range that means no echo; can be repeated",
+        help="a range that means no echo, in metres or in the unit of a table; can be repeated",
     )
     reading.add_argument("--strict", action="store_true", help="a warning about the input is an error (exit code 2)")
+    _add_table_options(parser)
+
+
+def _add_table_options(parser: argparse.ArgumentParser) -> None:
+    """Add the fields of ``TableFormat`` as options."""
+    from jaxsonar.recordings.input_options import ANGLE_UNITS, LENGTH_UNITS, RANGE_UNITS, TIME_UNITS
+
+    table = parser.add_argument_group(
+        "a table (--from table)",
+        "One row for each scan. Columns are named by their headers or numbers, from 1: a,b,7 or 3-18 or sonar_*.",
+    )
+    columns = {
+        "--range-columns": ("COLUMNS", "ranges of the sensors 0, 1, 2, ..."),
+        "--time-column": ("COLUMN", "time (default: unknown)"),
+        "--pose-columns": ("COLUMNS", "x, y and heading of the robot (default: unknown)"),
+        "--delimiter": ("CHARACTER", "between columns (default: by content)"),
+    }
+    units = {
+        "--unit": (RANGE_UNITS, "m", "of the ranges; us: time of flight, out and back"),
+        "--pose-unit": (tuple(LENGTH_UNITS), "m", "of x and y"),
+        "--angle-unit": (ANGLE_UNITS, "rad", "of the heading"),
+        "--time-unit": (tuple(TIME_UNITS), "s", "of the time"),
+    }
+    flags = {
+        "--round-trip": "ranges are lengths out and back",
+        "--clockwise": "the heading grows from x away from y",
+        "--compass": "the heading grows from y (north) towards x (east)",
+        "--y-right": "y grows to the right of x",
+    }
+    for option, (metavar, text) in columns.items():
+        table.add_argument(option, metavar=metavar, help=text)
+    for option, (choices, default, text) in units.items():
+        table.add_argument(option, choices=choices, help=f"{text} (default: {default})")
+    for option, text in flags.items():
+        table.add_argument(option, action="store_true", default=None, help=text)
 
 
 def sensor_name(text: str) -> tuple[str, int]:
@@ -74,16 +112,29 @@ def input_options(options: argparse.Namespace) -> "InputOptions":
     """How a log is read, from the options of a command.
 
     Raises:
-        SonarError: two indices for one name.
+        SonarError: two indices for one name, or options of a table for something else.
     """
-    from jaxsonar.recordings.input_options import InputOptions
+    from dataclasses import fields
 
+    from jaxsonar.recordings.input_options import InputOptions, TableFormat
+
+    table = {}
+    for one in fields(TableFormat):
+        option = _TABLE_OPTIONS.get(one.name, one.name)
+        if (value := getattr(options, option)) is not None:
+            table[one.name] = value
+            if options.from_ != "table":
+                raise SonarError(f"--{option.replace('_', '-')} came without --from table; allowed is it with a table")
     sensors: dict[str, int] = {}
     for name, index in options.sensor:
         if sensors.setdefault(name, index) != index:
             raise SonarError(f"--sensor {name}={index}: {name}={sensors[name]} came, too; allowed is one index a name")
     return InputOptions(
-        format=options.from_, sensors=sensors, odometry=options.odometry_topic, no_echo=tuple(options.no_echo)
+        format=options.from_,
+        sensors=sensors,
+        odometry=options.odometry_topic,
+        no_echo=tuple(options.no_echo),
+        table=TableFormat(**table),
     )
 
 

@@ -95,11 +95,11 @@ def as_json(result: Slam, errors: Errors | None) -> dict[str, Any]:
             for closure in result.closures
         ],
     }
+    table |= {"explained": result.explained.measured, "explained_required": result.explained.required}
     smoothed = result.smoothed
     if smoothed is not None:
         table |= {
             "sigma": smoothed.sigma,
-            "explained": smoothed.used,
             "speed_of_sound": float(smoothed.ring.speed_of_sound),
             # A parameter that was not estimated has no standard deviation; 0 would mean that it is exact.
             "speed_of_sound_sd": smoothed.speed_of_sound_sd or None,
@@ -125,8 +125,10 @@ def summary_lines(result: Slam, errors: Errors | None) -> list[str]:
         f"{plural(states[ACCEPTED], 'loop closure')}, {states[WITHDRAWN]} withdrawn"
     ]
     smoothed = result.smoothed
-    if smoothed is not None:
-        line = f"range noise {1e3 * smoothed.sigma:.2f} mm, {100 * smoothed.used:.0f} % of the echoes explained"
+    if smoothed is None:
+        lines.append(str(result.explained))
+    else:
+        line = f"range noise {1e3 * smoothed.sigma:.2f} mm; {result.explained}"
         if smoothed.speed_of_sound_sd:
             line += f"; speed of sound {smoothed.ring.speed_of_sound:.2f} +- {smoothed.speed_of_sound_sd:.2f} m/s"
         if any(smoothed.scale_sd):

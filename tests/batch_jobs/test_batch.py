@@ -14,7 +14,7 @@ import pytest
 from support.batches import JOB, RING, office_scans, one_shard
 from support.commands import HEADER
 
-from jaxsonar import Log, SonarError, batch, local_models, save_log
+from jaxsonar import Log, SonarError, batch, load_log, local_models, save_log
 from jaxsonar.batch_jobs import process_pool, worker_environment
 from jaxsonar.batch_jobs.inputs import find_inputs
 from jaxsonar.batch_jobs.manifest import open_manifest
@@ -267,10 +267,10 @@ BAD_ROWS = {
 @pytest.mark.parametrize(("bad", "why"), BAD_ROWS.items())
 @pytest.mark.parametrize("scans", [100, 3])
 def test_a_bad_row_sets_its_scan_aside_and_nothing_else(tmp_path, bad, why, scans):
-    good = [f"{k},0.0,0,0,0,{k},{k},1.0\n" for k in range(8) if k != 5]
+    good = [f"{k},0.0,0,0,0,3,3,1.0\n" for k in range(8) if k != 5]
     path = tmp_path / "log.csv"
     path.write_text(HEADER + "".join(good[:4]) + bad + "".join(good[4:]))
-    came = [run_shard(JOB, one) for one in split_input(*find_inputs([path]), staging=tmp_path, sensors=24, scans=scans)]
+    came = [run_shard(JOB, one) for one in split_input(*find_inputs([path]), staging=tmp_path, ring=RING, scans=scans)]
     assert [one.failure for one in came] == [""] * len(came)
     assert sum(one.bad_scans for one in came) == 1
     ((reason,),) = [one.reasons for one in came if one.bad_scans]
@@ -294,6 +294,7 @@ def test_rows_without_a_scan_number_set_the_adjacent_scans_aside(tmp_path):
 def test_bad_scans_of_parquet_are_set_aside(tmp_path):
     log = office_scans(12)
     save_log(log, tmp_path / "log.parquet")
+    whole = load_log(tmp_path / "log.parquet")
     rows = pq.read_table(tmp_path / "log.parquet").to_pylist()
     rows[2]["echoes"][5]["range"] = -1.0
     rows[6]["scan"] = 1
@@ -303,7 +304,7 @@ def test_bad_scans_of_parquet_are_set_aside(tmp_path):
     pq.write_table(pa.Table.from_pylist(rows, schema=schema), tmp_path / "log.parquet", row_group_size=5)
     came = [
         run_shard(JOB, one)
-        for one in split_input(*find_inputs([tmp_path / "log.parquet"]), staging=tmp_path, sensors=24, scans=4)
+        for one in split_input(*find_inputs([tmp_path / "log.parquet"]), staging=tmp_path, ring=RING, scans=4)
     ]
     assert [one.bad_scans for one in came] == [1, 1, 2]
     assert came[0].reasons[0].startswith("log.parquet: row 3, column echoes[5].range: -1.0 came")
@@ -313,7 +314,7 @@ def test_bad_scans_of_parquet_are_set_aside(tmp_path):
     good = [k for k in range(12) if k not in (2, 6, 9, 11)]
     lines = [row for one in came for row in pq.read_table(pa.BufferReader(one.tables["lines"])).to_pylist()]
     alone = as_rows(
-        "lines", found(Log.from_scans([log[k] for k in good]), method="hough", rows=np.array(good))["lines"]
+        "lines", found(Log.from_scans([whole[k] for k in good]), method="hough", rows=np.array(good))["lines"]
     )
     assert [row | {"source": ""} for row in lines] == [row | {"source": ""} for row in alone]
 

@@ -4,7 +4,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from support.batches import JOB, office_scans, one_shard
+from support.batches import JOB, RING, office_scans, one_shard
 
 from jaxsonar import Log, load_log, save_log
 from jaxsonar.batch_jobs.inputs import Input, find_inputs
@@ -57,7 +57,7 @@ def test_scans_may_come_in_any_order(tmp_path):
 def test_a_log_without_scans_has_no_shards(tmp_path):
     for name in ("log.csv", "log.parquet"):
         save_log(Log.from_scans([]), tmp_path / name)
-    assert [split_input(one, staging=tmp_path, sensors=24) for one in find_inputs([tmp_path])] == [[], []]
+    assert [split_input(one, staging=tmp_path, ring=RING) for one in find_inputs([tmp_path])] == [[], []]
 
 
 @pytest.mark.slow
@@ -87,7 +87,7 @@ def test_planning_takes_bounded_memory(tmp_path, suffix, monkeypatch):
 def test_large_row_groups_are_staged(tmp_path, monkeypatch):
     monkeypatch.setattr("jaxsonar.batch_jobs.shards.MAX_ROW_GROUP", 8)
     save_log(office_scans(20), tmp_path / "log.parquet")
-    parts = split_input(*find_inputs([tmp_path / "log.parquet"]), staging=tmp_path / "copies", sensors=24, scans=4)
+    parts = split_input(*find_inputs([tmp_path / "log.parquet"]), staging=tmp_path / "copies", ring=RING, scans=4)
     assert parts[0].filename == str(tmp_path / "copies" / "log.parquet.parquet")
     assert pq.ParquetFile(parts[0].filename).metadata.num_row_groups == 5
     assert load_log(parts[0].filename) == load_log(tmp_path / "log.parquet")

@@ -19,7 +19,7 @@ from jaxsonar.simulation.device_messages import log_messages
 pq = pytest.importorskip("pyarrow.parquet")
 
 RING = load_ring("faw")
-GOOD = "scan,stamp,x,y,theta,tx,rx,range\n" + "".join(f"{k},{k}.0,0,0,0,{k},{k},1.0\n" for k in range(20))
+GOOD = "scan,stamp,x,y,theta,tx,rx,range\n" + "".join(f"{k},{k}.0,0,0,0,3,3,1.0\n" for k in range(20))
 
 
 def call(*arguments):

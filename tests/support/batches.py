@@ -25,9 +25,8 @@ def office_scans(scans, *, first=0):
     log = jaxsonar.simulate(RING, room, poses, sigma=0.003, seed=first, stamps=stamps).as_log(RING, poses)
     rows = [log[k % len(log)] for k in range(scans)]
     rows = [replace(scan, scan=first + k, stamp=0.5 * k) for k, scan in enumerate(rows)]
-    rows[3] = replace(
-        rows[3], **{name: rows[3].tx[:0] for name in ("tx", "rx")}, range=np.zeros(0), amplitude=np.zeros(0)
-    )
+    none = {name: np.zeros(0) for name in ("range", "amplitude", "t", "age")}
+    rows[3] = replace(rows[3], tx=rows[3].tx[:0], rx=rows[3].rx[:0], **none)
     rows[4] = replace(rows[4], pose=np.full(3, np.nan), stamp=np.nan)
     return Log.from_scans(rows)
 
@@ -35,4 +34,4 @@ def office_scans(scans, *, first=0):
 def one_shard(file, *, scans=100, part=0):
     """One shard of a log file."""
     (log,) = find_inputs([file])
-    return split_input(log, staging=Path(file).parent / "copies", sensors=RING.count, scans=scans)[part]
+    return split_input(log, staging=Path(file).parent / "copies", ring=RING, scans=scans)[part]
