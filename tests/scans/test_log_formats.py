@@ -1,6 +1,7 @@
 """Scan logs as CSV and in memory: lossless round trips, and errors that name file, row and column."""
 
 import csv
+import itertools
 import math
 import subprocess
 import sys
@@ -16,14 +17,15 @@ from support.logs import HEADER, SMALL, SMALL_CSV, any_scans, log_of, read, refu
 
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans import csv_log as logs_csv
+from jaxsonar.scans.asked_pairs import AskedPairs
 from jaxsonar.scans.convert import convert
-from jaxsonar.scans.log_file import load_log, save_log
+from jaxsonar.scans.log_file import load_scan_log, save_log
 from jaxsonar.scans.scan_log import Log
 
 
 def test_every_column_is_read_into_its_own_field(small_csv):
     assert small_csv.read_text() == SMALL_CSV
-    assert load_log(small_csv) == SMALL
+    assert load_scan_log(small_csv) == SMALL
 
 
 def test_one_scan():
@@ -51,7 +53,9 @@ def test_a_slice_of_a_log_contains_the_scans_of_the_slice(scans, part):
     log = log_of(scans)
     cut = log[part]
     assert cut.scan.tolist() == log.scan[part].tolist()
-    assert [s.range.tolist() for s in cut] == [s.range.tolist() for s in list(log)[part]]
+    assert [s.range.tobytes() for s in cut] == [s.range.tobytes() for s in list(log)[part]]
+    assert [s.age.tobytes() for s in cut] == [s.age.tobytes() for s in list(log)[part]]
+    assert np.array_equal(cut.asked, log.asked)  # what a scan measured does not depend on the part
     assert [s.tx.tolist() for s in cut] == [s.tx.tolist() for s in list(log)[part]]
 
 
@@ -66,6 +70,8 @@ def test_echo_scan_is_the_scan_of_every_echo(scans):
         log.rx,
         log.range,
         amplitude=log.amplitude,
+        t=log.t,
+        age=log.age,
         stamp=log.stamp,
         pose=log.pose,
         scan=log.scan,
@@ -85,7 +91,13 @@ def test_logs_are_immutable():
     ("change", "message"),
     [
         ({"range": [1.0, -2.0]}, r"scans\[1\], echoes\[1\], range: -2.0 came; allowed is a finite number of metres"),
-        ({"range": [math.nan, 2.0]}, r"scans\[0\], echoes\[0\], range: nan"),
+        ({"range": [math.inf, 2.0]}, r"scans\[0\], echoes\[0\], range: inf"),
+        (
+            {"range": [1.0, math.nan]},
+            r"scans\[1\], echoes\[1\], amplitude: 2.0 came; .* nothing if the path heard nothing",
+        ),
+        ({"t": [0.0, -1.0]}, r"scans\[1\], echoes\[1\], t: -1.0 came; allowed is seconds, 0 or more"),
+        ({"age": [math.nan, 0.0]}, r"scans\[0\], echoes\[0\], age: nan came"),
         ({"tx": [0, -1]}, r"scans\[1\], echoes\[1\], tx: -1 came"),
         ({"rx": [2**31, 0]}, r"scans\[0\], echoes\[0\], rx: 2147483648 came"),
         ({"amplitude": [1.0, math.inf]}, "amplitude: inf came"),
@@ -125,7 +137,7 @@ def test_csv_round_trip(scans):
     log = log_of(scans)
     with tempfile.TemporaryDirectory() as folder:
         save_log(log, f"{folder}/a.csv")
-        again = load_log(f"{folder}/a.csv")
+        again = load_scan_log(f"{folder}/a.csv")
         assert again == log
         assert again.range.tobytes() == log.range.tobytes()
         assert np.signbit(again.pose).tolist() == np.signbit(log.pose).tolist()  # -0.0 is not 0.0
@@ -158,7 +170,7 @@ def test_csv_agrees_with_the_standard_library(scans):
         if not len(scan.range):
             expected.append([*head, "", "", ""])
         for t, r, m in zip(scan.tx.tolist(), scan.rx.tolist(), scan.range.tolist(), strict=True):
-            expected.append([*head, str(t), str(r), m])
+            expected.append([*head, str(t), str(r), "" if math.isnan(m) else m])
     floats = ("stamp", "x", "y", "theta", "range")
     found = [[float(row[c]) if c in floats and row[c] else row[c] for c in HEADER.split(",")] for row in rows]
     assert found == expected
@@ -174,7 +186,7 @@ def test_parsing_does_not_depend_on_the_block_size(scans, block):
         patch.setattr(logs_csv, "BLOCK", block)
         patch.setattr(logs_csv, "SCANS_PER_WRITE", 2)
         save_log(log, f"{folder}/b.csv")
-        assert load_log(f"{folder}/b.csv") == log
+        assert load_scan_log(f"{folder}/b.csv") == log
         assert Path(f"{folder}/a.csv").read_bytes() == Path(f"{folder}/b.csv").read_bytes()
 
 
@@ -216,9 +228,10 @@ BAD_ROWS = [
     ("0,0.5,1,2,3,4,5,0x10", "range", "'0x10'", "above 0"),
     ("0,0.5,1,2,3,4,5,1\r5", "range", r"'1\r5'", "above 0"),
     ("0,0.5,1,2,3,4,5,1." + "3" * 70, "range", "'1.3333", "at most 64 characters"),
-    ("0,0.5,1,2,3,4,5,", "range", "nothing", "tx, rx and range, all three or none"),
-    ("0,0.5,1,2,3,,5,1.5", "tx", "nothing", "tx, rx and range, all three or none"),
-    ("0,0.5,1,2,3,4,,1.5", "rx", "nothing", "tx, rx and range, all three or none"),
+    ("0,0.5,1,2,3,,5,1.5", "tx", "nothing", "tx and rx with or without a range, or none of them"),
+    ("0,0.5,1,2,3,4,,1.5", "rx", "nothing", "tx and rx with or without a range, or none of them"),
+    ("0,0.5,1,2,3,,,1.5", "tx", "nothing", "tx and rx with or without a range, or none of them"),
+    ("0,0.5,1,2,3,4,,", "rx", "nothing", "tx and rx with or without a range, or none of them"),
     ("0,0.5,1,2,3,-4,5,1.5", "tx", "'-4'", "a whole number from 0 to 2147483647"),
     ("0,0.5,1,2,3,4.5,5,1.5", "tx", "'4.5'", "a whole number from 0"),
     ("0,0.5,1,2,3,4,2147483648,1.5", "rx", "'2147483648'", "a whole number from 0"),
@@ -270,10 +283,105 @@ def test_inconsistent_rows_are_named(rows, place, allowed):
     assert allowed in message
 
 
+READINGS = """scan,stamp,x,y,theta,tx,rx,range,t,age,amplitude
+5,0.5,,,,4,5,1.5,0.25,,7
+5,0.5,,,,4,5,1.75,0.25,,
+5,0.5,,,,5,5,,,2.5,
+6,0.75,,,,,,,,,
+8,1.0,,,,1,2,2.5,0,0,8
+"""
+
+
+def test_silent_paths_ages_and_times_in_any_order_of_the_columns():
+    """A row without a range is a path that heard nothing; an empty age or t is 0."""
+    none = (math.nan,) * 3
+    expected = log_of(
+        [
+            (
+                5,
+                0.5,
+                none,
+                [(4, 5, 1.5, 7.0, 0.25, 0.0), (4, 5, 1.75, math.nan, 0.25, 0.0), (5, 5, *none[:2], 0.0, 2.5)],
+            ),
+            (6, 0.75, none, []),
+            (8, 1.0, none, [(1, 2, 2.5, 8.0, 0.0, 0.0)]),
+        ]
+    )
+    log = read(READINGS)
+    assert log == expected
+    assert (log.echo_count, len(log.asked)) == (3, 0)  # explicit: only what has a reading was measured
+    lines = [row.split(",") for row in READINGS.splitlines()]
+    swapped = "\n".join(",".join([*row[:8], row[10], row[8], row[9]]) for row in lines)
+    assert read(swapped) == expected
+    with tempfile.TemporaryDirectory() as folder:
+        save_log(log, f"{folder}/a.csv")
+        assert Path(f"{folder}/a.csv").read_text().splitlines()[:4] == [
+            f"{HEADER},amplitude,age,t",
+            "5,0.5,,,,4,5,1.5,7.0,,0.25",
+            "5,0.5,,,,4,5,1.75,,,0.25",
+            "5,0.5,,,,5,5,,,2.5,",
+        ]
+
+
+@pytest.mark.parametrize(("change", "columns"), [({}, ""), ({"t": [0.5]}, ",t"), ({"age": [0.5]}, ",age")])
+def test_optional_columns_are_written_only_if_needed(change, columns, tmp_path):
+    log = Log.from_echoes(
+        np.array([0]),
+        np.array([1]),
+        np.array([2]),
+        np.array([1.5]),
+        stamp=np.zeros(1),
+        pose=np.zeros((1, 3)),
+        **{name: np.array(value) for name, value in change.items()},
+    )
+    save_log(log, tmp_path / "a.csv")
+    assert (tmp_path / "a.csv").read_text().splitlines()[0] == HEADER + columns
+
+
+@given(any_scans)
+def test_the_measured_pairs_of_a_log_do_not_depend_on_how_it_is_added(scans):
+    """One by one, the scans give the pairs of the whole log; the definition is the oracle."""
+    log = log_of(scans)
+    pairs = AskedPairs()
+    for k in range(len(log)):
+        part = slice(log.start[k], log.start[k + 1])
+        pairs.add(log.echo_scan[part], log.tx[part], log.rx[part], np.isnan(log.range[part]))
+    assert np.array_equal(pairs.pairs(), log.asked)
+    transmitters = [set(scan.tx.tolist()) for scan in log if len(scan.tx)]
+    in_turn = max(map(len, transmitters), default=0) == 1 and (
+        sum(a != b for a, b in itertools.pairwise([None, *transmitters])) > 0.5 * len(transmitters)
+    )
+    in_turn = in_turn and len(set.union(*transmitters)) > 1
+    heard = sorted(set(zip(log.tx.tolist(), log.rx.tolist(), strict=True)))
+    assert log.asked.tolist() == ([] if in_turn or np.isnan(log.range).any() else [list(pair) for pair in heard])
+
+
+@pytest.mark.parametrize(
+    ("rows", "place", "allowed"),
+    [
+        (["0,,,,,1,1,1.5,,-1"], "row 2, column t: '-1'", "seconds, 0 or more, the same in all rows of a path"),
+        (["0,,,,,1,1,1.5,-1,"], "row 2, column age: '-1'", "seconds, 0 or more"),
+        (["0,,,,,1,1,1.5,,soon"], "row 2, column t: 'soon'", "seconds, 0 or more"),
+        (["0,,,,,1,1,1.5,,1", "0,,,,,1,1,1.75,,2"], "row 3, column t: '2'", "the same in all rows of a path in a scan"),
+        (["0,,,,,1,1,1.5,1,", "0,,,,,1,1,1.75,,"], "row 3, column age: nothing", "the same in all rows of a path"),
+        (["0,,,,,1,1,,,", "0,,,,,1,2,1,,", "0,,,,,1,1,1,,"], "row 4, column rx: '1'", "one row without a range"),
+        (["0,,,,,1,1,,,", "0,,,,,1,1,,,"], "row 3, column rx: '1'", "a path with one row without a range"),
+        (["0,,,,,,,,,1"], "row 2, column t: '1'", "nothing, in a row without a path"),
+        (["0,,,,,,,,1,"], "row 2, column age: '1'", "nothing, in a row without a path"),
+    ],
+)
+def test_invalid_ages_times_and_silent_rows_are_named(rows, place, allowed):
+    message = refused("\n".join([f"{HEADER},age,t", *rows, ""]))
+    assert place in message
+    assert allowed in message
+
+
 def test_amplitudes_are_checked():
     with_amplitude = f"{HEADER},amplitude\n"
     assert "row 2, column amplitude: 'loud'" in refused(f"{with_amplitude}0,,,,,1,1,1.5,loud\n")
     message = refused(f"{with_amplitude}0,,,,,,,,3\n")
+    assert "row 2, column amplitude: '3' came; allowed is nothing, in a row without an echo" in message
+    message = refused(f"{with_amplitude}0,,,,,1,1,,3\n")
     assert "row 2, column amplitude: '3' came; allowed is nothing, in a row without an echo" in message
 
 
@@ -286,6 +394,8 @@ def test_amplitudes_are_checked():
         (HEADER + ",", "unknown column ''"),
         (HEADER.replace("tx,", ""), "column 'tx' is missing"),
         (HEADER + ",range", "column 'range' came twice"),
+        (HEADER + ",t,age,t", "column 't' came twice"),
+        (HEADER.replace("range", "t,range"), "columns in the order scan,stamp,x,y,theta,tx,rx,t,range"),
         (HEADER.replace("tx,rx", "rx,tx"), "columns in the order scan,stamp,x,y,theta,rx,tx,range"),
         ("0,0.5,1,2,3,4,5,1.5", "unknown column '0'"),
         (HEADER.replace(",", ";"), f"unknown column '{HEADER.replace(',', ';')}'"),
@@ -293,7 +403,7 @@ def test_amplitudes_are_checked():
 )
 def test_an_invalid_header_is_named(header, came):
     message = refused(f"{header}\n{GOOD}\n")
-    assert f"row 1: {came}; allowed is {HEADER} and optionally ,amplitude" in message
+    assert f"row 1: {came}; allowed is {HEADER} and optionally amplitude, age, t" in message
 
 
 @pytest.mark.parametrize("garbage", [b"", b"\x89PNG\r\n\x1a\n\0\0", HEADER.encode("utf-16"), b"\xff" * 100, b"\n\n"])
@@ -321,30 +431,29 @@ def test_a_truncated_row_is_invalid_but_a_missing_last_line_end_is_not():
 
 
 def test_missing_files_raise_an_error(tmp_path):
-    for name, came in {"missing.csv": "No such file", "missing.parquet": "No such file", "": "no suffix"}.items():
-        with pytest.raises(SonarError, match=came):
-            load_log(f"{tmp_path}/{name}" if name else tmp_path / "folder")
+    for name in ("missing.csv", "missing.parquet"):
+        with pytest.raises(SonarError, match="No such file"):
+            load_scan_log(tmp_path / name)
     (tmp_path / "folder.csv").mkdir()
     with pytest.raises(SonarError, match=r"folder.csv: Is a directory; needed is a readable file with a scan log"):
-        load_log(tmp_path / "folder.csv")
+        load_scan_log(tmp_path / "folder.csv")
     for name in ("log.txt", "log.csv.gz", "log", ".csv"):
-        for call in (load_log, lambda path: save_log(SMALL, path)):
-            with pytest.raises(SonarError, match=r"allowed for a scan log is \.csv or \.parquet"):
-                call(tmp_path / name)
+        with pytest.raises(SonarError, match=r"allowed for a scan log is \.csv or \.parquet"):
+            save_log(SMALL, tmp_path / name)
     assert not (tmp_path / "log.txt").exists()
 
 
 def test_messages_have_one_line_for_any_filename(tmp_path):
     with pytest.raises(SonarError) as caught:
-        load_log(tmp_path / "two\nlines.csv")
+        load_scan_log(tmp_path / "two\nlines.csv")
     assert str(caught.value).isprintable()
 
 
 def test_reading_and_writing_logs_does_not_import_jax(tmp_path):
     code = (
-        "import sys; from jaxsonar.scans.log_file import load_log, save_log; "
-        "from jaxsonar.scans.convert import convert;"
-        "save_log(load_log(sys.argv[1]), sys.argv[1]); sys.exit('jax' in sys.modules or 'pyarrow.lib' in sys.modules)"
+        "import sys; from jaxsonar.scans.log_file import load_scan_log, save_log; "
+        "save_log(load_scan_log(sys.argv[1]), sys.argv[1]); "
+        "sys.exit('jax' in sys.modules or 'pyarrow.lib' in sys.modules)"
     )
     file = tmp_path / "log.csv"
     save_log(SMALL, file)

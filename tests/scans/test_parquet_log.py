@@ -6,12 +6,13 @@ import sys
 
 import numpy as np
 import pytest
-from support.logs import SMALL, SMALL_CSV, read, refused
+from support.logs import SMALL, log_of, read, refused
 
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.scans.log_file import load_log, save_log
+from jaxsonar.scans.log_file import load_scan_log, save_log
 
 STRUCT = {"tx": 4, "rx": 5, "range": 1.5, "amplitude": 2.5}
+SILENT = {"tx": 4, "rx": 5, "range": None, "amplitude": None, "age": None, "t": None}
 ROW = {"scan": 1, "stamp": 0.5, "x": 1.0, "y": 2.0, "theta": 3.0, "echoes": [STRUCT]}
 
 
@@ -57,6 +58,31 @@ def test_parquet_columns_are_the_documented_ones(pa, tmp_path):
     ]
 
 
+def test_silent_paths_have_a_null_range_and_optional_fields_are_written_only_if_needed(pa, tmp_path):
+    scan = [(0, 1, 1.5, 10.0, 0.25, 0.0), (2, 3, math.nan, math.nan, 0.0, 3.5)]
+    log = log_of([(7, 0.5, (1.25, -2.5, 0.75), scan)])
+    save_log(log, tmp_path / "log.parquet")
+    table = pa.parquet.read_table(tmp_path / "log.parquet")
+    struct = "struct<tx: int32 not null, rx: int32 not null, range: double, amplitude: double, age: double, t: double>"
+    assert str(table.schema.field("echoes").type) == f"list<element: {struct} not null>"
+    assert table["echoes"].to_pylist() == [
+        [
+            {"tx": 0, "rx": 1, "range": 1.5, "amplitude": 10.0, "age": 0.0, "t": 0.25},
+            {"tx": 2, "rx": 3, "range": None, "amplitude": None, "age": 3.5, "t": 0.0},
+        ]
+    ]
+    assert load_scan_log(tmp_path / "log.parquet") == log
+    save_log(log_of([(7, 0.5, (1.25, -2.5, 0.75), [one[:4] for one in scan])]), tmp_path / "log.parquet")
+    fields = pa.parquet.read_table(tmp_path / "log.parquet").schema.field("echoes").type.value_type
+    assert [field.name for field in fields] == ["tx", "rx", "range", "amplitude"]
+
+
+def test_missing_ages_and_times_are_zero(pa):
+    log = read(parquet([{**ROW, "echoes": [SILENT, {**STRUCT, "tx": 1, "t": math.nan, "age": 2.0}]}]), "log.parquet")
+    assert np.isnan(log.range).tolist() == [True, False]
+    assert (log.t.tolist(), log.age.tolist()) == ([0.0, 0.0], [0.0, 2.0])
+
+
 def test_parquet_files_of_other_programs(pa):
     nothing = dict.fromkeys(("stamp", "x", "y", "theta"))
     struct = {"range": 1.5, "rx": 5, "tx": 4}
@@ -80,7 +106,7 @@ def without(mapping, key):
         ([{**ROW, "stamp": "now"}], "column stamp: type string came; allowed is a floating or integer type"),
         (
             [{**ROW, "echoes": 3}],
-            "column echoes: type int64 came; allowed is a list of struct<tx, rx, range, amplitude>",
+            "column echoes: type int64 came; allowed is a list of struct<tx, rx, range, amplitude, age, t>",
         ),
         ([{**ROW, "echoes": [without(STRUCT, "rx")]}], "column echoes.rx is missing; allowed are tx, rx, range"),
         ([{**ROW, "echoes": [{**STRUCT, "w": 1}]}], "unknown column echoes.w; allowed are tx, rx, range"),
@@ -95,8 +121,15 @@ def without(mapping, key):
             [{**ROW, "scan": 0}, {**ROW, "echoes": [STRUCT, {**STRUCT, "range": -1.0}]}],
             "row 2, column echoes[1].range: -1.0 came; allowed is a finite number of metres above 0",
         ),
-        ([{**ROW, "echoes": [{**STRUCT, "range": None}, STRUCT]}], "row 1, column echoes[0].range: null came"),
-        ([{**ROW, "echoes": [{**STRUCT, "range": math.nan}]}], "row 1, column echoes[0].range: nan came"),
+        ([{**ROW, "echoes": [{**STRUCT, "range": math.inf}]}], "row 1, column echoes[0].range: inf came"),
+        ([{**ROW, "echoes": [{**SILENT, "amplitude": 2.5}]}], "row 1, column echoes[0].amplitude: 2.5 came"),
+        (
+            [{**ROW, "echoes": [STRUCT, {**STRUCT, "t": -1.0}]}],
+            "row 1, column echoes[1].t: -1.0 came; allowed is seconds",
+        ),
+        ([{**ROW, "echoes": [{**STRUCT, "age": math.inf}]}], "row 1, column echoes[0].age: inf came"),
+        ([{**ROW, "echoes": [{**STRUCT, "age": "old"}]}], "column echoes.age: type string came"),
+        ([{**ROW, "echoes": [STRUCT, SILENT]}], "row 1, column echoes[1].rx: 5 came; allowed is a path with one row"),
         ([{**ROW, "echoes": [{**STRUCT, "tx": -1}]}], "row 1, column echoes[0].tx: -1 came; allowed is a sensor index"),
         ([{**ROW, "echoes": [{**STRUCT, "rx": 2**31}]}], "row 1, column echoes[0].rx: 2147483648 came"),
     ],
@@ -108,23 +141,17 @@ def test_invalid_parquet_values_are_named(pa, rows, message):
 def test_invalid_parquet_files_raise_an_error(pa, tmp_path):
     save_log(SMALL, tmp_path / "small.parquet")
     whole = (tmp_path / "small.parquet").read_bytes()
-    for garbage in (
-        b"",
-        b"PAR1",
-        SMALL_CSV.encode(),
-        whole[:-1],
-        whole[: len(whole) // 2],
-        whole.replace(b"theta", b"th\xffta"),
-    ):
+    for garbage in (b"PAR1", whole[:-1], whole[: len(whole) // 2], whole.replace(b"theta", b"th\xffta")):
         assert "needed is a scan log as a whole Parquet file" in refused(garbage, "log.parquet")
 
 
 def test_a_missing_parquet_extra_is_explained(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     file = tmp_path / "log.parquet"
-    for call in (lambda: load_log(file), lambda: save_log(SMALL, file)):
+    file.write_bytes(b"PAR1")
+    for call in (lambda: load_scan_log(file), lambda: save_log(SMALL, file)):
         with pytest.raises(SonarError) as caught:
             call()
         expected = "Parquet needs the parquet extra: pip install 'jaxsonar[parquet]'"
         assert str(caught.value) == f"{file}: {expected}"
-    assert not list(tmp_path.iterdir())
+    assert file.read_bytes() == b"PAR1"
