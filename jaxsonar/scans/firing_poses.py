@@ -41,8 +41,8 @@ def reading_motion(log: Log) -> Float[np.ndarray, "readings 3"] | None:
     moves = np.isfinite(log.stamp) & np.isfinite(log.pose).all(axis=1)
     rows = np.flatnonzero(moves[scan] & ((log.t != 0) | (log.age != 0)))
     motion = np.zeros((len(scan), 3))
-    at_stamp = _pose_at(time, pose, log.stamp[scan[rows]])
-    motion[rows] = relative(at_stamp, _pose_at(time, pose, measurement_times(log)[rows]))
+    at_stamp = poses_at(time, pose, log.stamp[scan[rows]])
+    motion[rows] = relative(at_stamp, poses_at(time, pose, measurement_times(log)[rows]))
     return motion if motion.any() else None
 
 
@@ -138,7 +138,7 @@ def _known_poses(log: Log) -> tuple[Float[np.ndarray, " samples"], Float[np.ndar
     return time, pose[known][first]
 
 
-def _pose_at(
+def poses_at(
     time: Float[np.ndarray, " samples"], pose: Float[np.ndarray, "samples 3"], at: Float[np.ndarray, " times"]
 ) -> Float[np.ndarray, "times 3"]:
     """Poses at some times, interpolated; slightly beyond the first and the last one extrapolated."""
