@@ -67,7 +67,6 @@ from .hough_voting import accumulators as accumulators
 from .hough_voting import points_of_widest_arc as points_of_widest_arc
 from .hough_voting import ring_arcs as ring_arcs
 from .hough_voting import tangent_lines as tangent_lines
-from .hough_voting import transform_arcs as transform_arcs
 from .hough_voting import vote as vote
 from .hough_voting import vote_lines as vote_lines
 from .isorange_arcs import Arc as Arc

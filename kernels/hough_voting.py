@@ -14,7 +14,7 @@ from . import hough_accumulator
 from . import isorange_arcs as arcs
 from .hough_accumulator import HoughSettings
 from .measurement_model import corrected_range
-from .sensor_array import EchoPaths, SensorArray, echo_paths, transform_path
+from .sensor_array import EchoPaths, SensorArray, echo_paths
 
 if TYPE_CHECKING:
     AnyArray = Array  # inside the kernels
@@ -35,12 +35,18 @@ class PackedEchoes(NamedTuple):
     """model_from_robot for each echo, where model is the frame of the lines: x, y (metres), theta (radians). None: all
     are the identity."""
     scans_per_row: Float[AnyArray, "*scans"] | None = None
-    """Number of scans that are gathered in one row: a factor of the vote threshold. None: one."""
+    """Number of scans of all paths to which the measurements of a row amount: a factor of the vote threshold. None:
+    one."""
     piece: Int[AnyArray, "*scans pieces"] | None = None
     """Index of each piece of ``PIECE_POINTS`` points within its arc; -1 for unused rows. Pieces save memory and time
     where detection ranges differ in width. None: every echo has the points of the widest arc."""
     owner: Int[AnyArray, "*scans pieces"] | None = None
     """The echo that each piece belongs to; given together with ``piece``."""
+    measured: Bool[AnyArray, "*scans paths"] | None = None
+    """Paths that were measured, whether or not they received an echo; only these can miss an echo. None: all."""
+    path_pose: Float[AnyArray, "*scans paths 3"] | None = None
+    """model_from_robot when each path was measured: x, y (metres), theta (radians); ``pose`` has the same poses by
+    echo. None: all are the identity."""
 
 
 class RingArcs(eqx.Module):
@@ -82,22 +88,6 @@ def ring_arcs(sensors: SensorArray, *, settings: HoughSettings, points: int) -> 
         max_range=sensors.max_range,
         full_wall_paths=hough_accumulator.full_wall_paths(paths),
     )
-
-
-@partial(jax.jit, static_argnames="settings")
-def transform_arcs(ring: RingArcs, pose: Float[Array, "paths 3"], *, settings: HoughSettings) -> RingArcs:
-    """Arcs of a ring that moved between the firings of its groups.
-
-    Args:
-        ring: arcs of the ring at rest.
-        pose: model_from_robot when the transmitter of each path fired: x, y (metres), theta (radians).
-        settings: those of ``ring``.
-    """
-    paths = jax.vmap(transform_path)(ring.paths, pose)
-    points = ring.arcs.theta.shape[-1]
-    arcs_of_paths = jax.vmap(partial(arcs.arc, pitch=settings.point_pitch, points=points))(paths)
-    rows = hough_accumulator.theta_row(arcs_of_paths.theta, settings)
-    return eqx.tree_at(lambda r: (r.paths, r.arcs, r.theta_rows), ring, (paths, arcs_of_paths, rows))
 
 
 def points_of_widest_arc(beam: Float[np.ndarray, " sensors"], settings: HoughSettings) -> int:

@@ -37,7 +37,7 @@ from .ml_detection_settings import DetectionSettings
 from .ml_detection_state import Hypotheses, ScanData, SceneEstimate, Selection, count, determinant
 from .planar_geometry import fold_line, segment_endpoints, wrap_angle
 from .robust_fit import edge_from_midpoint, fit_reflector, paths_and_ranges, plane_from_both_sides, start_of_point
-from .sensor_array import EchoPaths
+from .sensor_array import EchoPaths, transform_path
 
 _IS_EDGE = (0.0, 1.0)  # corner, edge
 
@@ -104,7 +104,8 @@ def detect_in_scan(
     """Find the reflectors that explain ONE scan; arguments as ``detect_ml``."""
     # Candidates: maxima of the accumulator (paper, section 4).
     votes = hough.accumulate(tangent_lines(ring, packed, hough_settings).cell, hough_settings)
-    level = settings.peak_threshold * hough.votes_of_paths(ring.full_wall_paths, hough_settings)
+    full_wall_paths = ring.full_wall_paths * (1 if packed.scans_per_row is None else packed.scans_per_row)
+    level = settings.peak_threshold * hough.votes_of_paths(full_wall_paths, hough_settings)
     smooth = hough.lowpass(votes, hough_settings)
     rho, theta = hough.peaks(smooth, level, size=settings.candidates, settings=hough_settings)
 
@@ -115,8 +116,9 @@ def detect_in_scan(
     parameters, usable = fit_hypotheses(echo_paths, ranges, rho, theta, initial_sigma, settings)
 
     # Passes over the whole scan: evaluate all hypotheses, select the best ones, update the estimate of the scene.
-    paths, own_paths = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (ring.paths, echo_paths))
-    scan = ScanData(paths, own_paths, packed.path, ranges, ranges > 0, ring.max_range, ring.full_wall_paths)
+    paths = ring.paths if packed.path_pose is None else jax.vmap(transform_path)(ring.paths, packed.path_pose)
+    paths, own_paths = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (paths, echo_paths))
+    scan = ScanData(paths, own_paths, packed.path, ranges, ranges > 0, ring.max_range, full_wall_paths, packed.measured)
 
     def one_pass(state: tuple[SceneEstimate, Float[Array, "3 k 2"]], _: None):
         scene, parameters = state
@@ -318,6 +320,7 @@ def update_scene(
 
     each_path = jax.vmap(jax.vmap(is_certain, in_axes=(None, None, None, -1)), in_axes=(0, 0, 0, None))
     certain = each_path(selected.parameters, low, high, scan.paths) & wall[:, None]
+    certain = certain if scan.measured is None else certain & scan.measured[None]
     expected, received = count(certain), count(certain[:, scan.path_index] & involved)
     weight = settings.detection_weight
     detection = (weight * settings.detection_probability + received) / (weight + expected)

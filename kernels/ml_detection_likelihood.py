@@ -88,7 +88,7 @@ class MissedDetections(NamedTuple):
     footpoint: Float[Array, " paths"]
     """As ``PredictedEcho``."""
     visibility: Float[Array, " paths"]
-    """Weight by both cones; 0 beyond the maximum range."""
+    """Weight by both cones; 0 beyond the maximum range and for paths that were not measured."""
     off_axis: Float[Array, " paths"]
     """As ``off_axis_ratio``."""
     cost: Float[Array, " paths"]
@@ -119,6 +119,8 @@ def missed_detections(
 
     each_path = jax.vmap(predict, in_axes=-1, out_axes=-1)
     _, footpoint, visible, off_axis, cost = each_path(scan.paths)
+    if scan.measured is not None:
+        visible, cost = jnp.where(scan.measured, visible, 0), jnp.where(scan.measured, cost, 0)
     predicted, echo_footpoint, _, echo_off_axis, echo_cost = each_path(scan.echo_paths)
     behind, gate = scan.ranges - predicted, settings.excuse_gate * scene.sigma
     excused = scan.valid & (behind < gate) & (behind > -settings.blanking_distance - gate)

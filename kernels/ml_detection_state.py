@@ -32,7 +32,9 @@ class ScanData(NamedTuple):
     max_range: Float[Array, ""]
     """Metres."""
     full_wall_paths: Float[Array, ""]
-    """Number of paths that receive an echo of a wide wall."""
+    """Number of measured paths that receive an echo of a wide wall."""
+    measured: Bool[Array, " paths"] | None
+    """Which of the paths were measured; None: all. The others are evidence neither for nor against a reflector."""
 
 
 class SceneEstimate(NamedTuple):

@@ -35,7 +35,7 @@ WHOLE = "whole"
 def _batches(
     ring: Ring, echoes: FlatEchoes, settings: HoughSettings, policy: BatchPolicy = FAST_SCANS
 ) -> list[EchoBatch]:
-    return list(pack(echoes, settings.cells, pieces=arc_tables(ring, settings).pieces, policy=policy))
+    return list(pack(ring, echoes, settings.cells, pieces=arc_tables(ring, settings).pieces, policy=policy))
 
 
 def hough_stages(ring: Ring, ranges: np.ndarray, settings: HoughSettings | None = None) -> Stages:
@@ -90,12 +90,11 @@ def single_stages(ring: Ring, ranges: np.ndarray) -> Stages:
     settings = HoughSettings()
     logs = [scan.as_log() for scan in single_scans(ring, ranges)]
     scans = single_scans(ring, ranges)
-    tables = arc_tables(ring, settings)
     echoes = [FlatEchoes.from_log(ring, log)[0] for log in logs]
     return {
         WHOLE: lambda: [local_model(ring, scan, method="hough") for scan in scans],
         "convert": lambda: [FlatEchoes.from_log(ring, scan.as_log()) for scan in scans],
-        "extract": lambda: [list(hough_detections(ring, one, settings, tables)) for one in echoes],
+        "extract": lambda: [list(hough_detections(ring, one, settings)) for one in echoes],
         "extract and model": lambda: [
             list(hough_models(ring, log, Windows.of_scans(one), settings))
             for log, one in zip(logs, echoes, strict=True)

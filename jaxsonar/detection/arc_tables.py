@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -37,19 +36,9 @@ class ArcTables:
         normals = np.stack([np.cos(theta), np.sin(theta)])
         return NormalSums(*np.cumsum(np.pad(normals, ((0, 0), (0, 0), (1, 0))), axis=-1))
 
-    def moved(self, path_pose: Float[np.ndarray, "paths 3"], settings: kernels.HoughSettings) -> "ArcTables":
-        """The tables for a ring that moved during a scan.
-
-        Args:
-            path_pose: model_from_robot when the transmitter of each path fired: x, y (m), theta (rad).
-            settings: the settings of these tables.
-        """
-        pose = jnp.asarray(path_pose, jnp.float32)
-        return ArcTables(kernels.transform_arcs(self.arcs, pose, settings=settings), self.pieces)
-
 
 def arc_tables(ring: Ring, settings: kernels.HoughSettings) -> ArcTables:
-    """Tables of a ring at rest, stored in ``Ring.cache``."""
+    """Tables of a ring, stored in ``Ring.cache``."""
     key = ("arc_tables", settings)
     if key not in ring.cache:
         points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)

@@ -3,10 +3,9 @@
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.detection.hough_detector import hough_detections
 from jaxsonar.detection.local_model import Lines, LocalModel
 from jaxsonar.detection.local_model_builder import hough_models, ml_models
@@ -23,6 +22,7 @@ def extract_lines(
     ranges: Float[np.ndarray, "scans paths echoes"],
     *,
     method: str = "ml",
+    measured: Bool[np.ndarray, "scans paths"] | None = None,
     settings: kernels.HoughSettings | None = None,
     sigma: float | None = None,
 ) -> Lines:
@@ -31,6 +31,8 @@ def extract_lines(
     Args:
         ring: the sensors; ``Ring.paths`` defines the order of the second axis.
         ranges: (scans, paths, echoes) half path lengths as a log holds them, metres, NaN = no echo.
+        measured: (scans, paths) paths that were measured, whether or not they heard anything; all of them if omitted.
+            A path that was not measured is evidence neither for nor against a line.
         method: "ml", maximum likelihood over the ranges, or "hough", the method of the paper.
         settings: accumulator and low pass, for "hough" also threshold and smallest number of echoes; if omitted, the
             paper's values with an accumulator that is large enough for the ring.
@@ -40,11 +42,12 @@ def extract_lines(
         (scans, lines) arrays, padded with NaN, strongest first; at least one column.
 
     Raises:
-        SonarError: a wrong shape, a range that is not positive, an unknown method, or a sigma out of range.
+        SonarError: a wrong shape, a range that is not positive, an echo of a path that was not measured, an unknown
+            method, or a sigma out of range.
     """
     check_method(method)
     check_sigma(sigma)
-    echoes, settings = FlatEchoes.from_dense(ring, ranges), hough_settings(ring, settings)
+    echoes, settings = FlatEchoes.from_dense(ring, ranges, measured), hough_settings(ring, settings)
     if method == "hough":
         batches = hough_detections(ring, echoes, settings)
     else:
@@ -80,11 +83,10 @@ def local_model(
     check_method(method)
     check_sigma(sigma)
     log, settings = scan.as_log(), hough_settings(ring, settings)
-    tables = arc_tables(ring, settings).moved(path_pose, settings)
-    echoes, _ = FlatEchoes.from_log(ring, log)
+    echoes, _ = FlatEchoes.from_log(ring, log, path_pose=np.asarray(path_pose)[None])
     if method == "ml":
-        return next(ml_models(ring, log, echoes, settings, sigma, tables))
-    return next(hough_models(ring, log, Windows.of_scans(echoes), settings, tables))
+        return next(ml_models(ring, log, echoes, settings, sigma))
+    return next(hough_models(ring, log, Windows.of_scans(echoes), settings))
 
 
 def local_models(

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.arc_tables import ArcTables, arc_tables
+from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.detection.component_centroids import Centroids, component_centroids
 from jaxsonar.detection.connected_components import label_components
 from jaxsonar.detection.local_model import Lines
@@ -64,9 +64,7 @@ class HoughBatch:
         ]
 
 
-def hough_detections(
-    ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings, tables: ArcTables | None = None
-) -> Iterator[HoughBatch]:
+def hough_detections(ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings) -> Iterator[HoughBatch]:
     """Lines of every scan by the algorithm of the paper's section 4, batch by batch.
 
     Oracle: ``hough_lines`` of tests/support/oracles.py.
@@ -75,10 +73,9 @@ def hough_detections(
         ring: the sensors.
         echoes: echoes of scans or of windows.
         settings: accumulator, low pass, threshold and smallest number of echoes.
-        tables: arcs of a ring that moved during the scan; those of the ring at rest if omitted.
     """
-    tables = arc_tables(ring, settings) if tables is None else tables
-    for batch in pack(echoes, settings.cells, pieces=tables.pieces):
+    tables = arc_tables(ring, settings)
+    for batch in pack(ring, echoes, settings.cells, pieces=tables.pieces):
         # Represent each echo by equidistant points on its arc; Hough transform the tangent line of each point; count
         # the points in each cell; apply the low pass; compare with the occupancy threshold. One compiled call.
         voted = kernels.vote(tables.arcs, batch.packed, settings=settings)

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.arc_tables import ArcTables
 from jaxsonar.detection.hough_detector import HoughBatch, LineCandidate, hough_detections
 from jaxsonar.detection.local_model import KIND_NAMES, Line, LocalModel, Point, Undecided
 from jaxsonar.detection.ml_detector import DetectionBatch, ml_detections
@@ -20,9 +19,7 @@ from jaxsonar.scans.sliding_windows import Windows
 from jaxsonar.sensors.ring import Ring
 
 
-def hough_models(
-    ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSettings, tables: ArcTables | None = None
-) -> Iterator[LocalModel]:
+def hough_models(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSettings) -> Iterator[LocalModel]:
     """A local model of every window of a log, in order, by method "hough".
 
     Args:
@@ -31,11 +28,10 @@ def hough_models(
         windows: the windows; those of single scans (``Windows.of_scans``) give a model of every scan. Lines of longer
             windows must pass the test of plane against point.
         settings: accumulator, low pass, threshold and smallest number of echoes.
-        tables: arcs of a ring that moved during the scan; those of the ring at rest if omitted.
     """
 
     def models() -> Iterator[tuple[int, LocalModel]]:
-        for found in hough_detections(ring, windows.echoes, settings, tables):
+        for found in hough_detections(ring, windows.echoes, settings):
             walls = confirmed_walls(ring, found, settings, gap=windows.gap) if windows.gap else found.candidates
             for row, window in enumerate(found.batch.scans.tolist()):
                 yield window, _hough_model(ring, log, windows, found, row, walls[row], settings)
@@ -44,17 +40,12 @@ def hough_models(
 
 
 def ml_models(
-    ring: Ring,
-    log: Log,
-    echoes: FlatEchoes,
-    settings: kernels.HoughSettings,
-    sigma: float | None,
-    tables: ArcTables | None = None,
+    ring: Ring, log: Log, echoes: FlatEchoes, settings: kernels.HoughSettings, sigma: float | None
 ) -> Iterator[LocalModel]:
     """A local model of every scan of a log, in order, by method "ml"; arguments as ``ml_detections``."""
 
     def models() -> Iterator[tuple[int, LocalModel]]:
-        for found in ml_detections(ring, echoes, settings, sigma, tables):
+        for found in ml_detections(ring, echoes, settings, sigma):
             for row, scan in enumerate(found.batch.scans.tolist()):
                 yield scan, _ml_model(ring, found, row, int(log.scan[scan]), float(log.stamp[scan]))
 

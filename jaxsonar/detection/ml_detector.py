@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.arc_tables import ArcTables, arc_tables
+from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.detection.local_model import Lines
 from jaxsonar.detection.settings import SETTINGS
 from jaxsonar.scans.echo_batches import SLOW_SCANS, EchoBatch, pack
@@ -49,11 +49,7 @@ class DetectionBatch(NamedTuple):
 
 
 def ml_detections(
-    ring: Ring,
-    echoes: FlatEchoes,
-    settings: kernels.HoughSettings,
-    sigma: float | None,
-    tables: ArcTables | None = None,
+    ring: Ring, echoes: FlatEchoes, settings: kernels.HoughSettings, sigma: float | None
 ) -> Iterator[DetectionBatch]:
     """Reflectors of every scan by maximum likelihood over the ranges, batch by batch.
 
@@ -62,12 +58,11 @@ def ml_detections(
         echoes: echoes of single scans.
         settings: settings of the Hough step that gives the candidates.
         sigma: standard deviation of the ranges, metres; estimated for each scan if None.
-        tables: arcs of a ring that moved during the scan; those of the ring at rest if omitted.
     """
     ml_settings = kernels.DetectionSettings()
-    tables = arc_tables(ring, settings) if tables is None else tables
+    tables = arc_tables(ring, settings)
     noise = np.float32(np.nan if sigma is None else sigma)
-    for batch in pack(echoes, settings.cells, pieces=tables.pieces, policy=SLOW_SCANS):
+    for batch in pack(ring, echoes, settings.cells, pieces=tables.pieces, policy=SLOW_SCANS):
         # Candidates from the accumulator; fit each as plane, corner and edge; select by evidence. One compiled call.
         found = kernels.detect_ml(tables.arcs, batch.packed, noise, hough_settings=settings, settings=ml_settings)
         rows = slice(0, len(batch.scans))  # without padding

@@ -156,7 +156,7 @@ def accumulator_figure(
     """Draw the accumulator before and after the low pass, and its connected components (paper, section 4)."""
     settings = hough_settings(ring, settings)
     echoes, _ = FlatEchoes.from_log(ring, scan.as_log())
-    packed = next(pack(echoes, settings.cells)).packed
+    packed = next(pack(ring, echoes, settings.cells)).packed
     arcs = arc_tables(ring, settings).arcs
     votes, smooth = (np.asarray(image)[0] for image in kernels.accumulators(arcs, packed, settings=settings))
     level = float(arcs.vote_threshold)

@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.kernels.shape_buckets import bucket_size, next_power_of_two
 from jaxsonar.scans.flat_echoes import FlatEchoes
+from jaxsonar.scans.measured_paths import equivalent_scans
+from jaxsonar.sensors.ring import Ring
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class BatchPolicy:
     """Whether groups of at least ``min_group`` scans may have half the smallest number of columns."""
     min_group: int = 256
     """Smaller groups join the next larger number of columns. 0: the columns of a scan depend on that scan alone."""
+    all_paths: bool = False
+    """Whether the kernel predicts the echoes of all paths. Only then batches hold ``measured`` and ``path_pose``."""
     piece_slack: float = 1.1
     """Room for arc pieces per column, relative to the mean number of pieces of an echo: paths with wide detection
     ranges receive more echoes than those with narrow ones."""
@@ -41,7 +45,9 @@ class BatchPolicy:
 
 FAST_SCANS = BatchPolicy()
 """For kernels that take much less than a millisecond per scan and give integer sums, independent of the padding."""
-SLOW_SCANS = BatchPolicy(rows=(32,), block=512, bucket=next_power_of_two, halve_min_columns=False, min_group=0)
+SLOW_SCANS = BatchPolicy(
+    rows=(32,), block=512, bucket=next_power_of_two, halve_min_columns=False, min_group=0, all_paths=True
+)
 """For kernels that take milliseconds per scan and many seconds to compile. The number of columns of a scan depends on
 that scan alone, so that floating-point sums do not depend on the other scans of the batch."""
 
@@ -63,20 +69,25 @@ class EchoBatch(NamedTuple):
     pose: Float[np.ndarray, "rows columns 3"] | None
     """model_from_robot of each echo: x, y (m), theta (rad); None: the identity for all."""
     scans_per_row: Float[np.ndarray, " rows"] | None
-    """Effective number of scans that were gathered into each row; None: one."""
+    """Number of scans of all paths to which the measurements of each row amount; None: one."""
     piece: Int[np.ndarray, "rows pieces"] | None
     """Index of each arc piece within its arc (``kernels.PackedEchoes``); -1 is padding."""
     owner: Int[np.ndarray, "rows pieces"] | None
     """Column of the echo to which each arc piece belongs."""
+    measured: Bool[np.ndarray, "rows paths"] | None = None
+    """Paths that each scan measured; None: all."""
+    path_pose: Float[np.ndarray, "rows paths 3"] | None = None
+    """model_from_robot when each path was measured: x, y (m), theta (rad); None: the identity for all."""
 
     @property
     def packed(self) -> kernels.PackedEchoes:
         """The arrays as the argument of a kernel; they stay NumPy arrays until the compiled call transfers them."""
         arrays: Any = (self.path, self.reported, self.pose, self.scans_per_row, self.piece, self.owner)
-        return kernels.PackedEchoes(*arrays)
+        return kernels.PackedEchoes(*arrays, measured=self.measured, path_pose=self.path_pose)
 
 
 def pack(
+    ring: Ring,
     echoes: FlatEchoes,
     cells: int,
     *,
@@ -88,6 +99,7 @@ def pack(
     On a CPU the result of a scan depends neither on its padding nor on the other scans of its batch.
 
     Args:
+        ring: the sensors.
         echoes: the echoes of all scans.
         cells: number of cells of the accumulator.
         pieces: number of pieces of ``kernels.PIECE_POINTS`` points into which the arc of each path is cut. If omitted,
@@ -96,6 +108,7 @@ def pack(
     """
     if echoes.scan_count == 0:
         return
+    weights = _scans_per_row(ring, echoes)
     density = _piece_density(pieces, policy)
     needed = _needed_columns(echoes, pieces, density)
     for first in range(0, echoes.scan_count, policy.block):
@@ -105,8 +118,15 @@ def pack(
             done = 0
             while done < len(scans):
                 rows = _batch_rows(echoes, len(scans) - done, cells, policy)
-                yield _fill(echoes, scans[done : done + rows], rows, columns, pieces, density)
+                yield _fill(echoes, scans[done : done + rows], weights, rows, columns, pieces, density, policy)
                 done += rows
+
+
+def _scans_per_row(ring: Ring, echoes: FlatEchoes) -> Float[np.ndarray, " scans"] | None:
+    """Number of scans of all paths to which the measurements of each scan amount; None: one for all."""
+    if echoes.scans_per_window is not None or (echoes.measured is None and echoes.path_pose is None):
+        return echoes.scans_per_window
+    return np.ones(echoes.scan_count) if echoes.measured is None else equivalent_scans(ring, echoes.measured)
 
 
 def _batch_rows(echoes: FlatEchoes, remaining: int, cells: int, policy: BatchPolicy) -> int:
@@ -162,10 +182,12 @@ def _group_by_columns(
 def _fill(
     echoes: FlatEchoes,
     scans: Int[np.ndarray, " scans"],
+    weights: Float[np.ndarray, " scans"] | None,
     rows: int,
     columns: int,
     pieces: Int[np.ndarray, " paths"] | None,
     density: float,
+    policy: BatchPolicy,
 ) -> EchoBatch:
     """One batch: the echoes of these scans in padded arrays."""
     count = echoes.start[scans + 1] - echoes.start[scans]
@@ -177,13 +199,23 @@ def _fill(
     reported[row, column] = np.minimum(echoes.reported[index], _MAX_REPORTED)
     echo = np.zeros((rows, columns), np.int64)
     echo[row, column] = index
-    pose = scans_per_row = piece = owner = None
-    if echoes.pose is not None:
+    pose = scans_per_row = piece = owner = measured = path_pose = None
+    if echoes.echo_pose is not None:
         pose = np.zeros((rows, columns, 3), np.float32)
-        pose[row, column] = echoes.pose[index]
-    if echoes.scans_per_window is not None:
+        pose[row, column] = echoes.echo_pose[index]
+    if weights is not None:
         scans_per_row = np.ones(rows, np.float32)
-        scans_per_row[: len(scans)] = echoes.scans_per_window[scans]
+        scans_per_row[: len(scans)] = weights[scans]
+    masks = [mask for mask in (echoes.measured, echoes.path_pose) if mask is not None]
+    if policy.all_paths and masks:
+        # Both together, so that scans with missing measurements and scans with motion share one program.
+        paths = masks[0].shape[1]
+        measured, path_pose = np.ones((rows, paths), bool), np.zeros((rows, paths, 3), np.float32)
+        if echoes.measured is not None:
+            measured[: len(scans)] = echoes.measured[scans]
+        if echoes.path_pose is not None:
+            path_pose[: len(scans)] = echoes.path_pose[scans]
+        pose = np.zeros((rows, columns, 3), np.float32) if pose is None else pose
     if pieces is not None:
         echo_pieces = pieces[echoes.path[index]]
         slot = _ranks(np.bincount(row, echo_pieces, minlength=len(scans)).astype(np.int64))
@@ -191,7 +223,7 @@ def _fill(
         piece, owner = np.full((2, rows, int(np.ceil(columns * density))), -1, np.int32)
         piece[target], owner[target] = _ranks(echo_pieces), np.repeat(column, echo_pieces)
         owner = np.maximum(owner, 0)
-    return EchoBatch(scans, path, reported, echo, pose, scans_per_row, piece, owner)
+    return EchoBatch(scans, path, reported, echo, pose, scans_per_row, piece, owner, measured, path_pose)
 
 
 def _ranks(counts: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " all"]:

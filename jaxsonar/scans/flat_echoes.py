@@ -1,5 +1,7 @@
 """Echoes of scans as flat columns, addressed by the echo paths of a ring."""
 
+from functools import cached_property
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -34,7 +36,8 @@ class FlatEchoes:
             reported: ranges as a log holds them, metres.
             pose: model_from_robot when each echo was received: x, y (m), theta (rad). All echoes share one pose if
                 omitted.
-            scans_per_window: effective number of scans that were gathered into each of these scans; 1 if omitted.
+            scans_per_window: number of scans of all paths to which the measurements of each window amount; those of
+                single scans follow from ``measured`` if omitted.
             measured: paths that each scan measured, whether or not they heard anything; all of them if omitted.
             path_pose: scan_from_robot when each path was measured; all at the pose of the scan if omitted.
         """
@@ -43,12 +46,28 @@ class FlatEchoes:
         self.pose, self.scans_per_window = pose, scans_per_window
         self.start = np.searchsorted(scan, np.arange(scan_count + 1))
 
+    @cached_property
+    def echo_pose(self) -> Float[np.ndarray, "echoes 3"] | None:
+        """model_from_robot when each echo was received; None: the identity for all."""
+        return self.path_pose[self.scan, self.path] if self.path_pose is not None else self.pose
+
     @classmethod
-    def from_dense(cls, ring: Ring, ranges: Float[np.ndarray, "scans paths echoes"]) -> "FlatEchoes":
+    def from_dense(
+        cls,
+        ring: Ring,
+        ranges: Float[np.ndarray, "scans paths echoes"],
+        measured: Bool[np.ndarray, "scans paths"] | None = None,
+    ) -> "FlatEchoes":
         """Echoes of a dense array of ranges (metres), in which NaN means no echo.
 
+        Args:
+            ring: the sensors.
+            ranges: half path lengths as a log holds them.
+            measured: paths that were measured, whether or not they heard anything; all of them if omitted.
+
         Raises:
-            SonarError: the shape does not match the ring's paths, or a range is not positive.
+            SonarError: a shape does not match the ring's paths, a range is not positive, or a path with an echo was not
+                measured.
         """
         ranges = np.asarray(ranges)
         paths = len(ring.paths)
@@ -66,14 +85,36 @@ class FlatEchoes:
             raise SonarError(
                 f"ranges[{scan[k]}, {path[k]}, {echo[k]}] = {reported[k]:g}; allowed are metres above 0, NaN = no echo"
             )
-        return cls(len(ranges), scan, path, reported)
+        if measured is not None:
+            measured = np.asarray(measured)
+            if measured.shape != ranges.shape[:2] or measured.dtype != bool:
+                raise SonarError(
+                    f"measured: {measured.dtype} of shape {measured.shape} came; allowed is bool of shape "
+                    f"{ranges.shape[:2]}, the scans and paths of the ranges"
+                )
+            if not measured[scan, path].all():
+                k = int(np.argmin(measured[scan, path]))
+                raise SonarError(
+                    f"measured[{scan[k]}, {path[k]}] = False came with an echo at {reported[k]:g} m; allowed are "
+                    "echoes of measured paths"
+                )
+            measured = None if measured.all() else measured
+        return cls(len(ranges), scan, path, reported, measured=measured)
 
     @classmethod
-    def from_log(cls, ring: Ring, log: Log) -> tuple["FlatEchoes", int]:
+    def from_log(
+        cls, ring: Ring, log: Log, *, path_pose: Float[np.ndarray, "scans paths 3"] | None = None
+    ) -> tuple["FlatEchoes", int]:
         """Echoes of a log on the ring's paths, and the number of echoes on other (tx, rx) pairs, which are omitted.
 
         Repeated old readings (``is_repeated``) are omitted, too. ``measured`` is None if every scan measured all paths,
         ``path_pose`` is None if every reading belongs to the pose of its scan.
+
+        Args:
+            ring: the sensors.
+            log: the scans.
+            path_pose: scan_from_robot when each path was measured; interpolated (``firing_poses.path_poses``) if
+                omitted.
 
         Raises:
             SonarError: the log contains a sensor index that the ring does not have.
@@ -95,7 +136,7 @@ class FlatEchoes:
             path[used],
             log.range[used],
             measured=None if measured.all() else measured,
-            path_pose=path_poses(ring, log),
+            path_pose=path_poses(ring, log) if path_pose is None else path_pose,
         )
         return flat, int((heard & (path < 0)).sum())
 

@@ -6,7 +6,7 @@ Only a path that was measured can be silent. A path without a measurement is no 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -121,11 +121,35 @@ def full_wall_paths(
         counts: number of measurements of each path, in the scan or window of each row.
         directions: number of directions of the mean.
     """
-    geometry = ring.exact_paths
-    angle = (np.arange(directions) + 0.5) * (2 * np.pi / directions)
-    received = np.mod(angle[:, None] - geometry.start, 2 * np.pi) < geometry.width
-    covered = ((counts > 0).astype(np.float64) @ received.T > 0).mean(axis=1)
+    geometry, key = ring.exact_paths, ("full_wall_paths", directions)
+    if key not in ring.cache:
+        angle = (np.arange(directions) + 0.5) * (2 * np.pi / directions)
+        received = np.mod(angle - geometry.start[:, None], 2 * np.pi) < geometry.width[:, None]
+        ring.cache[key] = received.astype(np.float32)
+    covered = ((counts > 0).astype(np.float32) @ ring.cache[key] > 0).mean(axis=1)
     return counts @ geometry.width / (2 * np.pi * np.maximum(covered, 1 / directions))
+
+
+def equivalent_scans(
+    ring: Ring, counts: Num[np.ndarray, "rows paths"] | Bool[np.ndarray, "rows paths"]
+) -> Float[np.ndarray, " rows"]:
+    """Number of scans of all paths to which the measurements of each row amount.
+
+    It is the ratio of the numbers of measurements that receive a wide wall (``full_wall_paths``). Where anything was
+    measured, a wall is received by one measurement at least.
+
+    Args:
+        ring: the sensors.
+        counts: number of measurements of each path, in the scan or window of each row.
+    """
+    whole = full_wall_paths(ring, np.ones((1, len(ring.paths))))
+    if counts.dtype == bool and len(counts) > 1:  # few rows are distinct
+        packed = np.packbits(counts, axis=1)
+        _, first, row = np.unique(packed.view(f"V{packed.shape[1]}"), return_index=True, return_inverse=True)
+        counts = counts[first]
+    else:
+        row = np.arange(len(counts))
+    return (np.maximum(full_wall_paths(ring, counts.astype(np.float64)), 1) / whole)[row.ravel()]
 
 
 def _path_rows(

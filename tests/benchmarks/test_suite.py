@@ -57,7 +57,8 @@ SHAPE = (SETTINGS.theta_cells, SETTINGS.rho_cells)
 def product_votes(ring, ranges):
     """Votes and occupied cells by the kernels."""
     arcs, (votes, high) = arc_tables(ring, SETTINGS).arcs, np.zeros((2, len(ranges), *SHAPE), np.int64)
-    for step in pack(FlatEchoes.from_dense(ring, ranges), SETTINGS.cells, pieces=arc_tables(ring, SETTINGS).pieces):
+    echoes, pieces = FlatEchoes.from_dense(ring, ranges), arc_tables(ring, SETTINGS).pieces
+    for step in pack(ring, echoes, SETTINGS.cells, pieces=pieces):
         real = slice(0, len(step.scans))
         votes[step.scans] = np.asarray(kernels.accumulators(arcs, step.packed, settings=SETTINGS)[0])[real]
         high[step.scans] = np.asarray(kernels.vote(arcs, step.packed, settings=SETTINGS).occupied)[real]

@@ -19,6 +19,7 @@ from jaxsonar import (
     SonarError,
     extract_lines,
     kernels,
+    load_log,
     local_model,
     local_models,
     random_pose,
@@ -56,12 +57,13 @@ def some_scans(count, ring=RING):
 
 
 def log_of(*scans, ring=RING):
-    """A log of scans, each a list of (path, range)."""
+    """A log of scans that measured all paths, each a list of (path, range)."""
     index = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
     flat = [echo for scan in scans for echo in scan]
     tx, rx = ring.paths[[k for k, _ in flat]].T if flat else np.zeros((2, 0), int)
     stamp, pose = np.arange(len(scans)) * 0.5, np.full((len(scans), 3), np.nan)
-    return Log.from_echoes(index, tx, rx, np.array([r for _, r in flat], float), stamp=stamp, pose=pose)
+    ranges = np.array([r for _, r in flat], float)
+    return Log.from_echoes(index, tx, rx, ranges, stamp=stamp, pose=pose, asked=ring.paths)
 
 
 def dense_of(log, ring=RING, slots=4):
@@ -309,7 +311,7 @@ def test_the_command_and_the_library_agree(log, tmp_path, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 1
     came = [json.loads(line) for line in (tmp_path / "lines.jsonl").read_text().splitlines()]
     ring = load_ring("faw")
-    wanted = [written(model) for model in local_models(ring, log, sigma=0.003)]
+    wanted = [written(model) for model in local_models(ring, load_log(tmp_path / "log.csv"), sigma=0.003)]
     assert len(came) == len(wanted) == SCANS
     for one, other in zip(came, wanted, strict=True):
         assert one["sigma"] == pytest.approx(0.003)

@@ -2,7 +2,6 @@
 
 import time
 
-import jax
 import numpy as np
 import pytest
 from support.emulated_devices import office_log
@@ -14,9 +13,6 @@ from jaxsonar import (
     local_model,
     simulate,
 )
-from jaxsonar.detection.arc_tables import arc_tables
-from jaxsonar.detection.settings import hough_settings
-from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.hardware.messages import ECHO
 from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler
 from jaxsonar.live.live_map import LiveMap
@@ -84,26 +80,6 @@ def test_lines_of_a_moving_robot_are_as_accurate_as_at_rest():
     assert np.median(nees) < 4  # 1.4 for Gaussian errors of that covariance
 
 
-def test_moved_paths_match_moved_sensors():
-    """With one pose for all paths, the arcs are those of a ring mounted at this pose."""
-    pose = np.array([0.12, -0.07, 0.4])
-    settings = hough_settings(RING, None)
-    poses = np.broadcast_to(pose, (len(RING.paths), 3)).astype(np.float32)
-    moved = kernels.transform_arcs(arc_tables(RING, settings).arcs, jax.numpy.asarray(poses), settings=settings)
-    there = Ring(
-        transform_points(pose, np.asarray(RING.position)),
-        RING.heading + pose[2],
-        beam=RING.beam,
-        neighbors=3,
-        max_range=2.0,
-    )
-    other = arc_tables(there, settings).arcs
-    for one, two in zip(jax.tree.leaves(moved.paths), jax.tree.leaves(other.paths), strict=True):
-        np.testing.assert_allclose(one, two, atol=2e-6)
-    for name in ("midpoint_normal", "baseline_tangent_squared", "half_baseline_squared"):
-        np.testing.assert_allclose(getattr(moved.arcs, name), getattr(other.arcs, name), atol=2e-6)
-
-
 @pytest.mark.slow
 def test_a_robot_at_rest_needs_no_moved_paths(office, log):
     live = LiveMap(office.ring, method="hough", mapping=False)
@@ -119,7 +95,7 @@ def test_moved_scans_do_not_recompile():
     raws, _ = moving_scans(0.001, count=4)
     live = LiveMap(RING, method="hough", mapping=False)
     live.process(raws[:1])
-    programs = getattr(kernels.transform_arcs, "_cache_size")  # noqa: B009
+    programs = getattr(kernels.vote, "_cache_size")  # noqa: B009
     before = programs()
     live.process(raws)
     assert programs() == before

@@ -39,7 +39,7 @@ def test_batches_contain_every_echo_of_every_scan_once(seed, scans, policy, cut)
     flat = FlatEchoes(scans, scan, path, reported)
     pieces = arc_tables(RING, SETTINGS).pieces if cut else None
     seen, echoes = [], []
-    for batch in pack(flat, SETTINGS.cells, pieces=pieces, policy=policy):
+    for batch in pack(RING, flat, SETTINGS.cells, pieces=pieces, policy=policy):
         seen += batch.scans.tolist()
         real = np.isfinite(batch.reported)
         assert not real[len(batch.scans) :].any()
@@ -63,7 +63,7 @@ def test_batches_contain_every_echo_of_every_scan_once(seed, scans, policy, cut)
 @pytest.mark.slow
 def test_arc_pieces_give_the_same_votes_as_whole_arcs():
     arcs, flat = arc_tables(RING, SETTINGS).arcs, FlatEchoes.from_dense(RING, some_ranges(20))
-    for batch in pack(flat, SETTINGS.cells, pieces=arc_tables(RING, SETTINGS).pieces):
+    for batch in pack(RING, flat, SETTINGS.cells, pieces=arc_tables(RING, SETTINGS).pieces):
         whole = batch.packed._replace(piece=None, owner=None)
         cut, uncut = (kernels.accumulators(arcs, one, settings=SETTINGS) for one in (batch.packed, whole))
         jax.tree.map(np.testing.assert_array_equal, cut, uncut)
