@@ -1,7 +1,7 @@
-"""Readers of published sonar data sets, each in its own format. Result: flat arrays of echoes in SI units.
+"""Readers of published sonar data sets, each in its own format. Result: flat arrays of readings in SI units.
 
-Reported values are kept unchanged, including stale readings and constant offsets; calibration and mapping handle these.
-Row numbers in messages are line numbers of the file, from 1.
+All reported values are kept unchanged, including constant offsets; calibration and mapping handle these. A path that
+fired and heard nothing has a reading without a range. Row numbers in messages are line numbers of the file, from 1.
 """
 
 import os
@@ -19,22 +19,22 @@ from .errors import SonarError, reason, shown
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A recorded run. ``stamp`` and ``pose`` have one entry per scan, the other arrays one entry per echo."""
+    """A recorded run. ``stamp`` and ``pose`` have one entry per scan, the other arrays one entry per reading."""
 
     stamp: Float[np.ndarray, " scans"]
     """Seconds."""
     pose: Float[np.ndarray, "scans 3"]
     """world_from_robot: x, y (m), theta (rad, [-pi, pi)) from odometry; NaN if unknown."""
-    scan_index: Int[np.ndarray, " echoes"]
-    """Scan of each echo, 0 to scans - 1, non-decreasing. A scan that does not occur has no echo."""
-    tx: Int[np.ndarray, " echoes"]
-    """Transmitter of each echo."""
-    rx: Int[np.ndarray, " echoes"]
-    """Receiver of each echo."""
-    range: Float[np.ndarray, " echoes"]
-    """Half the echo path length as reported, metres."""
-    amplitude: Float[np.ndarray, " echoes"]
-    """NaN: none of these devices reports amplitudes."""
+    scan_index: Int[np.ndarray, " readings"]
+    """Scan of each reading, 0 to scans - 1, non-decreasing."""
+    tx: Int[np.ndarray, " readings"]
+    """Transmitter of each reading."""
+    rx: Int[np.ndarray, " readings"]
+    """Receiver of each reading."""
+    range: Float[np.ndarray, " readings"]
+    """Half the echo path length as reported, metres; NaN: the path fired and heard nothing."""
+    age: Float[np.ndarray, " readings"]
+    """Time since the reading was renewed, seconds."""
 
 
 def read_corridor8(filename: str | os.PathLike[str]) -> Recording:
@@ -42,6 +42,9 @@ def read_corridor8(filename: str | os.PathLike[str]) -> Recording:
 
     ``measurement.txt`` and ``poses.txt`` have one line per scan and no header. Sensor k is column k + 2 of
     ``measurement.txt``, starting at the right side. Direct echoes only; 5110 mm means no echo.
+
+    The device renews a sensor in about every second row. A reading that equals that of the row before therefore counts
+    as renewed in every second row; in the others, it has an age.
 
     Args:
         filename: the folder with both files, or its ``measurement.txt``.
@@ -55,7 +58,8 @@ def read_corridor8(filename: str | os.PathLike[str]) -> Recording:
     reported = sonar.number[:, 1:]
     sonar.refuse((reported <= 0) | (reported > 5110), sensors, "a range above 0 and up to 5110 mm, which is no echo")
     stamp, pose = corridor8_poses(sonar)
-    return _direct(stamp, pose, np.where(reported == 5110, np.nan, reported / 1000))
+    ranges = np.where(reported == 5110, np.nan, reported / 1000)
+    return _direct(stamp, pose, ranges, _ages(stamp, reported))
 
 
 def corridor8_poses(table: "NumericTable") -> tuple[Float[np.ndarray, " scans"], Float[np.ndarray, "scans 3"]]:
@@ -128,15 +132,18 @@ def read_sew_amr(filename: str | os.PathLike[str]) -> Recording:
             raise SonarError(f"{shown(filename)}: no dist.csv in this folder; needed is at least one")
     messages = np.concatenate([_sew_messages(file) for file in files])
     starts = messages[:, :, 0::2, :].swapaxes(2, 3)  # (messages, tx, rx, objects)
-    scan_index, tx, rx, echo = np.nonzero(starts != 65535)
+    heard = starts != 65535
+    heard[..., 0] |= ~heard.any(axis=-1)  # one reading without a range for a path that heard nothing
+    scan_index, tx, rx, echo = np.nonzero(heard)
+    reported = starts[scan_index, tx, rx, echo]
     return Recording(
         stamp=np.arange(len(messages)) * 0.1,
         pose=np.full((len(messages), 3), np.nan),
         scan_index=scan_index,
         tx=tx,
         rx=rx,
-        range=starts[scan_index, tx, rx, echo] / 1000,
-        amplitude=np.full(len(tx), np.nan),
+        range=np.where(reported == 65535, np.nan, reported / 1000),
+        age=np.zeros(len(tx)),
     )
 
 
@@ -161,19 +168,34 @@ def _sew_messages(file: Path) -> Float[np.ndarray, "messages 4 12 4"]:
 
 
 def _direct(
-    stamp: Float[np.ndarray, " scans"], pose: Float[np.ndarray, "scans 3"], ranges: Float[np.ndarray, "scans sensors"]
+    stamp: Float[np.ndarray, " scans"],
+    pose: Float[np.ndarray, "scans 3"],
+    ranges: Float[np.ndarray, "scans sensors"],
+    age: Float[np.ndarray, "scans sensors"] | None = None,
 ) -> Recording:
-    """A recording of direct echoes: one range per scan and sensor, metres, NaN without an echo."""
-    scan_index, sensor = np.nonzero(~np.isnan(ranges))
+    """A recording of direct echoes: one range per scan and sensor, metres, NaN where the sensor heard nothing."""
+    scans, sensors = ranges.shape
+    sensor = np.tile(np.arange(sensors), scans)
     return Recording(
         stamp=stamp,
         pose=pose,
-        scan_index=scan_index,
+        scan_index=np.repeat(np.arange(scans), sensors),
         tx=sensor,
         rx=sensor.copy(),
-        range=ranges[scan_index, sensor],
-        amplitude=np.full(len(sensor), np.nan),
+        range=ranges.ravel(),
+        age=np.zeros(ranges.size) if age is None else age.ravel(),
     )
+
+
+def _ages(
+    stamp: Float[np.ndarray, " scans"], reported: Float[np.ndarray, "scans sensors"], *, period: int = 2
+) -> Float[np.ndarray, "scans sensors"]:
+    """Ages of readings, seconds: of equal readings in consecutive rows, those with this period are renewed ones."""
+    row = np.arange(len(reported))[:, None]
+    changed = np.ones(reported.shape, bool)
+    changed[1:] = reported[1:] != reported[:-1]
+    first = np.maximum.accumulate(np.where(changed, row, 0), axis=0)  # first row with the same reading
+    return stamp[:, None] - stamp[row - (row - first) % period]
 
 
 class NumericTable:

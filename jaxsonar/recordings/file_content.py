@@ -2,6 +2,7 @@
 
 import os
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 from jaxsonar.fileio.atomic_files import reason, shown
@@ -24,7 +25,9 @@ DESCRIPTIONS = {
     "corridor8": "a recording like corridor8",
     "scitos24": "a recording like scitos24",
 }
-"""What ``file_content`` returns, in words."""
+"""Formats in words."""
+
+TEXT_FORMATS = ("csv", "beesoft", "player", "table", "scitos24")
 
 SUFFIXES = {
     ".csv": ("csv", "table", "scitos24"),
@@ -33,7 +36,7 @@ SUFFIXES = {
     ".bag": ("bag",),
     ".db3": ("bag",),
 }
-"""Contents that fit each suffix; any content fits another suffix."""
+"""Formats that fit each suffix; any format fits another suffix."""
 
 _BINARY = {
     b"\x89PNG": "a picture (PNG)",
@@ -52,12 +55,31 @@ _BINARY = {
 }
 """First bytes of files that are no recordings."""
 
+_TEXTS = {
+    r"\{|\[\{": "a JSON file",
+    "<": "an XML or HTML file",
+    r"\[\[?\w+\]\]?$|\w+ *= *\S": "a TOML file (a ring or settings)",
+}
+"""First lines of text files that are no recordings."""
 
-def file_content(filename: str | os.PathLike[str]) -> str:
-    """What a file or folder holds: a key of ``DESCRIPTIONS``.
+
+@dataclass(frozen=True)
+class FileContent:
+    """What a file or folder holds."""
+
+    format: str | None
+    """The format in which it can be read; None if there is none."""
+    description: str
+    """The content in words, with an article."""
+    is_text: bool = False
+    """Whether it is text of any kind."""
+
+
+def file_content(filename: str | os.PathLike[str]) -> FileContent:
+    """What a file or folder holds.
 
     Raises:
-        SonarError: the file cannot be read, or it is no recording; the message names what it is.
+        SonarError: it cannot be read, or a folder is no recording.
     """
     try:
         is_folder = os.path.isdir(filename)
@@ -66,27 +88,29 @@ def file_content(filename: str | os.PathLike[str]) -> str:
     except (OSError, ValueError) as failure:  # ValueError: a NUL in the filename
         raise SonarError(f"{shown(filename)}: {reason(failure)}; needed is a readable file with a recording") from None
     if is_folder:
-        return _folder_content(filename, entries)
+        return _known(_folder_format(filename, entries))
     if head.startswith(b"PAR1"):
-        return "parquet"
-    if head.startswith(b"#ROSBAG V") or head.startswith(b"SQLite format 3\0"):
-        return "bag"
+        return _known("parquet")
+    if head.startswith((b"#ROSBAG V", b"SQLite format 3\0")):
+        return _known("bag")
     if head.startswith(MCAP_MAGIC):
         # magic, opcode 1, length of the record (8 bytes), length of the profile (4 bytes), profile
         profile = PROFILE.encode()
-        return "record" if head[21 : 21 + len(profile)] == profile else "bag"
+        return _known("record" if head[21 : 21 + len(profile)] == profile else "bag")
     for magic, what in _BINARY.items():
         if head.startswith(magic):
-            raise _rejected(filename, what)
-    return _text_content(filename, head)
+            return FileContent(None, what)
+    return _text_content(head)
 
 
-def check_suffix(filename: str | os.PathLike[str], content: str) -> str | None:
+def check_suffix(filename: str | os.PathLike[str], content: FileContent) -> str | None:
     """A note if the suffix of a file promises something else than the file holds; None if both agree."""
     suffix = Path(filename).suffix.lower()
-    if suffix not in SUFFIXES or content in SUFFIXES[suffix]:
+    if suffix not in SUFFIXES or content.format in SUFFIXES[suffix]:
         return None
-    return f"{shown(filename)}: this is {DESCRIPTIONS[content]}, not what {suffix} promises; it is read as what it is"
+    return (
+        f"{shown(filename)}: this is {content.description}, not {DESCRIPTIONS[SUFFIXES[suffix][0]]}; it is read as such"
+    )
 
 
 def _head(filename: str | os.PathLike[str]) -> bytes:
@@ -94,8 +118,8 @@ def _head(filename: str | os.PathLike[str]) -> bytes:
         return file.read(HEAD)
 
 
-def _folder_content(folder: str | os.PathLike[str], entries: list[str]) -> str:
-    """Content of a folder with these entries."""
+def _folder_format(folder: str | os.PathLike[str], entries: list[str]) -> str:
+    """Format of a folder with these entries."""
     if "metadata.yaml" in entries:
         return "bag"
     if "measurement.txt" in entries and "poses.txt" in entries:
@@ -109,34 +133,35 @@ def _folder_content(folder: str | os.PathLike[str], entries: list[str]) -> str:
     raise SonarError(f"{shown(folder)}: a folder came; allowed is a file, or the folder of a ROS 2 bag (metadata.yaml)")
 
 
-def _text_content(filename: str | os.PathLike[str], head: bytes) -> str:
+def _known(format: str) -> FileContent:
+    return FileContent(format, DESCRIPTIONS[format], is_text=format in TEXT_FORMATS)
+
+
+def _text_content(head: bytes) -> FileContent:
     """Content of a file that has no magic number."""
     if not head:
-        raise _rejected(filename, "an empty file")
+        return FileContent(None, "an empty file", is_text=True)
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise SonarError(f"{shown(filename)}: text in UTF-16 came; allowed is UTF-8: save the file as CSV in UTF-8")
+        return FileContent(None, "text in UTF-16 (save it as UTF-8)")
     text = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace")
     if "\0" in text or text.count("\ufffd") > 0.01 * len(text) + 1:
-        raise _rejected(filename, "a binary file")
+        return FileContent(None, "a binary file")
     lines = [line.strip() for line in text.splitlines()]
     first = next((line for line in lines if line), "")
-    if _is_log_header(first):
-        return "csv"
-    if re.search(r"^#(ROBOT|SONAR\s+\d+\s*:)", text, re.MULTILINE):
-        return "beesoft"
+    if re.search(r"^(#(ROBOT|SONAR \d+:)|begin\(pattern)", text, re.MULTILINE):
+        return _known("beesoft")
     if re.search(r"^## *Player version", text, re.MULTILINE) or _is_player_line(lines):
-        return "player"
+        return _known("player")
     if re.match(r"S1,S2,.*,S24,OUTPUT$", first):
-        return "scitos24"
-    if first.startswith(("{", "[{")):
-        raise _rejected(filename, "a JSON file")
-    if first.startswith("<"):
-        raise _rejected(filename, "an XML or HTML file")
-    if re.match(r"\[\[?\w+\]\]?$|\w+ *= *\S", first):
-        raise _rejected(filename, "a TOML file (a ring or settings)")
+        return _known("scitos24")
+    if _is_log_header(first):
+        return _known("csv")
+    for pattern, what in _TEXTS.items():
+        if re.match(pattern, first):
+            return FileContent(None, what, is_text=True)
     if _is_number_table(lines):
-        return "table"
-    raise _rejected(filename, f"a text that begins with '{shown(first, 40)}'")
+        return _known("table")
+    return FileContent(None, f"a text that begins with '{shown(first, 40)}'", is_text=True)
 
 
 def _is_log_header(line: str) -> bool:
@@ -156,8 +181,3 @@ def _is_number_table(lines: list[str]) -> bool:
     rows = [line for line in lines[1:200] if line and not line.startswith("#")][:-1] or lines[:1]
     numbers = [sum(bool(re.fullmatch(r"[-+\d.,eE]+", field)) for field in re.split(r"[,;\s]+", row)) for row in rows]
     return bool(rows) and sum(count >= 2 for count in numbers) > 0.5 * len(rows)
-
-
-def _rejected(filename: str | os.PathLike[str], what: str) -> SonarError:
-    allowed = "a scan log (CSV, Parquet), a raw recording (MCAP), a ROS bag, or what --from names"
-    return SonarError(f"{shown(filename)}: this is {what}; allowed is {allowed}")

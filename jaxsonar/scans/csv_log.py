@@ -116,6 +116,12 @@ def csv_header(filename: str | os.PathLike[str], line: bytes) -> tuple[str, ...]
     if "\ufffd" in text or "\0" in text:
         raise SonarError(f"{shown(filename)}: row 1: this is no text; {wanted}")
     names = tuple(text.split(","))
+    if len(names) == 1 and (found := re.search("[;\t]", text)):
+        came = "tabs" if found[0] == "\t" else "semicolons"
+        raise SonarError(
+            f"{shown(filename)}: row 1: {came} between the columns came; allowed are commas between columns and points "
+            f"in numbers (save the table in an English format); {wanted}"
+        )
     for k, name in enumerate(names):
         if name not in COLUMNS + OPTIONAL:
             raise SonarError(f"{shown(filename)}: row 1: unknown column '{shown(name, 40)}'; {wanted}")

@@ -16,8 +16,9 @@ from jaxsonar.scans.scan_log import Log
 
 @dataclass(frozen=True)
 class NoEchoSettings:
-    """Constants of the search for ranges that mean no echo. Chosen by hand; no sound log of a simulation or of the
-    published data sets has such a value with them.
+    """Constants of the search for ranges that mean no echo.
+
+    Chosen by hand, such that no sound log of a simulation or of the published data sets has such a value.
     """
 
     noise: tuple[float, ...] = (1e-3, 3e-3, 0.01, 0.02, 0.05, 0.1)
