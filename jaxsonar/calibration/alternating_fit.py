@@ -17,6 +17,7 @@ from jaxsonar.estimation.adjustment_state import AdjustmentResult, AdjustmentSta
 from jaxsonar.estimation.alternation import SETTINGS as ALTERNATION
 from jaxsonar.estimation.alternation import alternate
 from jaxsonar.estimation.batch_data import BatchData
+from jaxsonar.estimation.explained_share import ExplainedShare
 from jaxsonar.estimation.landmark_map import landmark_map_of, map_with_tentative_points
 from jaxsonar.estimation.odometry_noise import ProportionalNoise
 from jaxsonar.estimation.robust_adjustment import gnc_adjust
@@ -203,7 +204,8 @@ class CalibrationProblem:
             maps = [map_with_tentative_points(current, log, window=self.window) for log in posed]
             if not any(len(one) for one in maps):
                 raise SonarError(
-                    "calibration: no wall found; allowed are scans of a place with straight walls within range"
+                    "calibration: no wall found; allowed are scans of a place with straight walls within range; "
+                    f"{ExplainedShare(0.0, settings.min_explained)}"
                 )
             return maps
 
@@ -215,7 +217,10 @@ class CalibrationProblem:
             progress=self.progress,
         )
         if found is None:
-            raise SonarError("calibration: no echo fits the walls; is it the right ring, are poses and units right?")
+            raise SonarError(
+                "calibration: no echo fits the walls; is it the right ring, are poses and units right? "
+                f"{ExplainedShare(0.0, settings.min_explained)}"
+            )
         return CalibrationFit(logs, data, found.maps, found.adjustment)
 
     def _is_better(self, fit: CalibrationFit, best: CalibrationFit) -> bool:

@@ -13,6 +13,8 @@ from jaxsonar.calibration.beam_headings import estimate_headings
 from jaxsonar.calibration.calibration_result import Calibration
 from jaxsonar.calibration.settings import SETTINGS
 from jaxsonar.detection.extract import check_sigma
+from jaxsonar.estimation.estimation_log import estimation_log
+from jaxsonar.estimation.explained_share import ExplainedShare
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import build_map
 from jaxsonar.scans.scan_log import Log
@@ -47,7 +49,8 @@ def calibrate(
 
     Args:
         ring: the nominal ring.
-        log: 17 or more scans from different poses. Each of several logs has a map of its own.
+        log: 17 or more scans from different poses. Each of several logs has a map of its own. Firings that are scans of
+            their own are merged first (``estimation_log``).
         free: estimated parameter groups, of "offset", "speed", "position", "radius", "heading"; the others are held.
         poses: "trust" takes the poses of the log as exact; "estimate" takes them as odometry, if there are any.
         odometry: standard deviation of odometry, as a fraction of the displacement and rotation between scans.
@@ -60,7 +63,7 @@ def calibrate(
         SonarError: an invalid choice, a speed of sound that air does not have, trusted logs without poses, too few
             walls or explained echoes, a result outside the plausible range.
     """
-    logs = [log] if isinstance(log, Log) else list(log)
+    logs = [estimation_log(one) for one in ([log] if isinstance(log, Log) else log)]
     progress = on_step or (lambda text: None)
     _check_arguments(ring, logs, free, poses, odometry, temperature, sigma, window)
     poses_free = poses == "estimate"
@@ -83,7 +86,8 @@ def calibrate(
     # 4. The mean range offset, if second-order echoes determine it.
     fit, mean_held = problem.fit_mean_offset(fit) if "offset" in free else (fit, "")
     covariance = problem.parameter_covariance(fit.adjustment)
-    _check_result(problem, fit)
+    explained = ExplainedShare(fit.explained_count / max(fit.data.echo_count, 1), SETTINGS.min_explained)
+    _check_result(problem, fit, explained)
     calibrated, heading_sd = problem.ring_at(fit.adjustment.state), np.zeros(ring.count)
     # 5. Headings, from the directions in which echoes are received at all; ranges do not depend on them.
     if "heading" in free:
@@ -105,6 +109,7 @@ def calibrate(
         residuals=found.residual[found.used],
         residuals_before=problem.nominal_residuals(fit)[found.used],
         echoes=fit.data.echo_count,
+        explained=explained,
         scans=fit.data.scan_count,
         poses=tuple(log.pose for log in final_logs),
         maps=tuple(build_map(calibrated, log, window=window) for log in final_logs),
@@ -160,14 +165,13 @@ def _check_arguments(
     check_speed_of_sound(ring)
 
 
-def _check_result(problem: CalibrationProblem, fit: CalibrationFit) -> None:
+def _check_result(problem: CalibrationProblem, fit: CalibrationFit, explained: ExplainedShare) -> None:
     """Raise a SonarError for a result outside the plausible range."""
     count = problem.ring.count
-    explained = fit.explained_count / max(fit.data.echo_count, 1)
-    if explained < SETTINGS.min_explained:
+    if not explained.suffices:
         raise SonarError(
-            f"calibration: walls and corners explain {100 * explained:.0f} % of the {fit.data.echo_count} echoes; "
-            f"needed are {100 * SETTINGS.min_explained:g} %: is it the right ring, are poses and units right?"
+            f"calibration: walls and corners do not fit the {fit.data.echo_count} echoes, {explained}: is it the right "
+            "ring, are poses and units right?"
         )
     change = problem.basis.columns @ fit.adjustment.state.coordinates
     offset, log_speed = change[:count], float(change[count])

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar import kernels
+from jaxsonar.estimation.explained_share import ExplainedShare
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.sensors.ring import Ring
@@ -37,6 +38,8 @@ class Calibration:
     free poses were adjusted to it, metres."""
     echoes: int
     """Number of all echoes."""
+    explained: ExplainedShare
+    """The share of the echoes that walls, corners and edges explain."""
     scans: int
     """Number of scans that were used."""
     poses: tuple[Float[np.ndarray, "_ 3"], ...]
@@ -130,9 +133,8 @@ class Calibration:
 
     def summary(self) -> tuple[str, ...]:
         """Summary of the result, line by line."""
-        explained = 100 * len(self.residuals) / max(self.echoes, 1)
         lines = [
-            f"{self.scans} scans, {len(self.residuals)} of {self.echoes} echoes explained ({explained:.0f} %); "
+            f"{self.scans} scans, {self.echoes} echoes; {self.explained}; "
             f"residual RMS {1e3 * self.rms_before:.2f} mm before, {1e3 * self.rms:.2f} mm after"
         ]
         if "offset" in self.free:

@@ -37,6 +37,8 @@ def as_table(calibration: Calibration) -> dict[str, Any]:
         "scans": calibration.scans,
         "echoes": calibration.echoes,
         "echoes_explained": len(calibration.residuals),
+        "explained": _short(calibration.explained.measured),
+        "explained_required": _short(calibration.explained.required),
         "sigma": _short(calibration.sigma),
         "residual_rms_before": _short(calibration.rms_before),
         "residual_rms_after": _short(calibration.rms),

@@ -200,7 +200,7 @@ def _is_new(log: Log, flat: FlatEchoes) -> Bool[np.ndarray, " echoes"]:
 
 def _by_path(
     scans: int,
-    begin: Int[np.ndarray, " logs+1"],
+    begin: Int[np.ndarray, " bounds"],
     used: Sequence[Int[np.ndarray, " _"]],
     values: Sequence[np.ndarray | None],
     default: np.ndarray,

@@ -16,10 +16,11 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar import kernels
 from jaxsonar.estimation.adjustment_state import AdjustmentResult, AdjustmentState
 from jaxsonar.estimation.batch_data import BatchData
+from jaxsonar.estimation.landmark_map import LandmarkMap
 from jaxsonar.estimation.landmark_selection import reclassify_points, remove_misfitting_points
 from jaxsonar.estimation.sparse_adjustment import AdjustmentSolution, solve_adjustment
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.sensors.ring_parameters import ParameterBasis
+from jaxsonar.sensors.ring_parameters import PRIOR, ParameterBasis, parameter_basis
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,23 @@ def anneal(
 ) -> AdjustmentState:
     """Only the annealing of ``gnc_adjust``, with free poses: better initial values."""
     return _GncJob(ring, data, basis, True, settings).anneal(state, initial_scale, sigma)[0]
+
+
+def explained_echoes(
+    ring: Ring, data: BatchData, landmark_map: LandmarkMap, *, gate: float, settings: GncSettings = SETTINGS
+) -> Bool[np.ndarray, "scans echoes"]:
+    """Which echoes landmarks explain without any adjustment. To be called with 64-bit floats enabled.
+
+    Args:
+        ring: the sensors.
+        data: the measurements, with poses.
+        landmark_map: the landmarks.
+        gate: largest residual of an explained echo, metres.
+        settings: constants of the algorithm.
+    """
+    basis = parameter_basis(ring, (), poses_free=False, speed_sd=PRIOR.speed_sd)
+    state = AdjustmentState(np.zeros(basis.columns.shape[1]), data.poses, landmark_map)
+    return _GncJob(ring, data, basis, False, settings)._associate(state, gate=gate, ambiguity=0.0).used
 
 
 def least_squares_problem(

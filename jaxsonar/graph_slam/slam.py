@@ -3,23 +3,31 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import check_sigma
+from jaxsonar.estimation.batch_data import BatchData
+from jaxsonar.estimation.estimation_log import estimation_log
+from jaxsonar.estimation.explained_share import ExplainedShare
+from jaxsonar.estimation.landmark_map import landmark_map_of
 from jaxsonar.estimation.odometry_noise import OdometryNoise
+from jaxsonar.estimation.robust_adjustment import explained_echoes
 from jaxsonar.estimation.trajectory import Trajectory, stamps_of
 from jaxsonar.graph_slam.initial_poses import InitialPoses, LoopClosure, detect, initial_poses
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_evidence import gather_evidence
+from jaxsonar.scans.measured_paths import measured_paths
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import check_window
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.smoothing.smooth_log import Smoothed
 from jaxsonar.smoothing.smooth_log import smooth as smooth_poses
+from jaxsonar.smoothing.smoother import NothingExplained
 
 
 @dataclass(frozen=True)
@@ -30,8 +38,12 @@ class SlamSettings:
     """Scans; longer logs are smoothed only on request. Smoothing takes about a minute for a thousand scans."""
     min_explained: float = 0.1
     """Least fraction of the echoes that poses and map must explain. Recordings of old narrow sonars reach it."""
+    unadjusted_gate: float = 0.04
+    """Metres; without smoothing, echoes nearer to the range of a wall, corner or edge are explained by it."""
+    judged_scans: int = 500
+    """Number of scans, evenly selected, of which that is determined."""
     sparse_echoes: float = 4.0
-    """Number of echoes that a long wall causes in one scan; with fewer, scans are gathered over windows."""
+    """Number of measured paths that receive a long wall in one scan; with fewer, scans are gathered over windows."""
     sparse_window: float = 1.5
     """Length of such a window, metres of trajectory."""
 
@@ -44,19 +56,22 @@ class Slam:
     """Poses and map of a log."""
 
     poses: Float[np.ndarray, "scans 3"]
-    """world_from_robot; NaN for scans without an estimate."""
+    """world_from_robot; NaN for scans without an estimate. Firings that are scans of their own are merged first
+    (``estimation_log``); one pose belongs to all of them."""
     covariance: Float[np.ndarray, "scans 3 3"]
     """With respect to the first scan that has a pose."""
     stamp: Float[np.ndarray, " scans"]
     """Time of every scan, as ``stamps_of`` gives it."""
     world: GlobalMap
     odometry: Float[np.ndarray, "scans 3"]
-    """The poses of the log."""
+    """The poses of the log's scans."""
     closures: tuple[LoopClosure, ...]
     step_ms: Float[np.ndarray, " steps"]
     """Milliseconds of each scan's step; empty where the log was not tracked."""
     smoothed: Smoothed | None
     """The result of smoothing; None without it."""
+    explained: ExplainedShare
+    """The share of the echoes that poses and map explain."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -86,6 +101,7 @@ def slam(
 ) -> Slam:
     """Estimate the poses of the scans of a log, and the map (paper, section 5, last paragraph).
 
+    Firings that are scans of their own are merged into full scans first (``estimation_log``).
     Logs with odometry are tracked scan by scan, loops are closed, and all poses and landmarks are smoothed together.
     Logs without odometry are registered by the ranges of their echoes, long ones by walls and corners. For sparse rings
     (``SlamSettings.sparse_echoes``) the odometry is smoothed directly, with maps of windows.
@@ -109,7 +125,8 @@ def slam(
     """
     report = progress or (lambda task, done, total: None)
     noise = odometry_noise or OdometryNoise()
-    if window is None and float(np.asarray(ring.echo_paths.width).sum() / (2 * np.pi)) < SETTINGS.sparse_echoes:
+    log = estimation_log(log)
+    if window is None and len(log) and _echoes_of_a_long_wall(ring, log) < SETTINGS.sparse_echoes:
         window = SETTINGS.sparse_window
     has_odometry = np.asarray(np.isfinite(log.pose).all(axis=1))
     _check(log, has_odometry, sigma=sigma, window=window, smooth=smooth, speed=speed, scale=scale)
@@ -121,29 +138,65 @@ def slam(
     # 3. Smooth: all poses and landmarks on the raw ranges.
     smoothed = None
     if smooth if smooth is not None else _is_smoothed_by_default(initial, has_odometry, speed):
-        smoothed = smooth_poses(
-            ring,
-            log,
-            _smoothing_start(initial, has_odometry),
-            odometry=initial.odometry if has_odometry.any() else None,
-            sigma=sigma,
-            window=window,
-            speed=speed,
-            scale=scale,
-            odometry_noise=noise,
-            models=initial.models,
-            traversals=initial.traversals,
-            progress=lambda task: report(task, 0, 0),
-        )
-        _check_explained(smoothed)
+        try:
+            smoothed = smooth_poses(
+                ring,
+                log,
+                _smoothing_start(initial, has_odometry),
+                odometry=initial.odometry if has_odometry.any() else None,
+                sigma=sigma,
+                window=window,
+                speed=speed,
+                scale=scale,
+                odometry_noise=noise,
+                models=initial.models,
+                traversals=initial.traversals,
+                progress=lambda task: report(task, 0, 0),
+            )
+        except NothingExplained as reason:
+            raise SonarError(f"slam: {reason}; {ExplainedShare(0.0, SETTINGS.min_explained)}") from None
     # 4. Map: that of the smoothed landmarks, or one from the initial poses.
     if smoothed is not None:
         poses, covariance, world = smoothed.poses, smoothed.pose_cov, smoothed.world
+        share = smoothed.used
     else:
         report("building the map", 0, 0)
         poses, covariance = initial.poses, initial.covariance
         world = _map_at(ring, replace(log, pose=poses), initial.models, window)
-    return Slam(poses, covariance, stamps_of(log), world, log.pose, initial.closures, initial.step_ms, smoothed)
+        share = _explained_share(ring, replace(log, pose=poses), world)
+    explained = ExplainedShare(share, SETTINGS.min_explained)
+    if not explained.suffices:
+        raise SonarError(
+            f"slam: poses and map do not fit, {explained}: is it the right ring, are ranges and odometry in metres and "
+            "radians?"
+        )
+    stamp, closures = stamps_of(log), initial.closures
+    return Slam(poses, covariance, stamp, world, log.pose, closures, initial.step_ms, smoothed, explained)
+
+
+def _echoes_of_a_long_wall(ring: Ring, log: Log) -> float:
+    """Number of paths that receive a long wall, of those that a scan measures (median)."""
+    width = np.asarray(ring.echo_paths.width)
+    measured = measured_paths(ring, log)
+    whole = measured[:1] if measured.all() else measured
+    return float(np.median([width[paths].sum() for paths in whole]) / (2 * np.pi))
+
+
+def _explained_share(ring: Ring, log: Log, world: GlobalMap) -> float:
+    """Fraction of the echoes of scans with a pose that a map explains without an adjustment."""
+    known = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
+    step = max(1, -(-len(known) // SETTINGS.judged_scans))
+    kept = np.zeros(len(log), dtype=bool)
+    kept[known[::step]] = True
+    log = replace(log, pose=np.where(kept[:, None], log.pose, np.nan))
+    no_odometry = np.full((len(log), 3), np.nan)
+    data = BatchData.from_logs(ring, [log], [no_odometry], OdometryNoise())
+    if not data.echo_count:
+        return 0.0
+    landmark_map = landmark_map_of([world], tie_corners=False)
+    with jax.enable_x64(True):
+        explained = explained_echoes(ring, data, landmark_map, gate=SETTINGS.unadjusted_gate)
+    return float(explained.sum() / data.echo_count)
 
 
 def _map_at(ring: Ring, log: Log, models: Sequence[LocalModel] | None, window: float | None) -> GlobalMap:
@@ -192,11 +245,3 @@ def _check(
         raise SonarError("slam: speed and scale are estimated by smoothing; allowed is to smooth, or neither of them")
     if window is not None and not count:
         raise SonarError(f"slam: a window of {window:g} m of trajectory needs poses; allowed is a log with odometry")
-
-
-def _check_explained(smoothed: Smoothed) -> None:
-    if smoothed.used < SETTINGS.min_explained:
-        raise SonarError(
-            f"slam: poses and map explain {smoothed.used:.0%} of the echoes; allowed are {SETTINGS.min_explained:.0%} "
-            "or more: is it the right ring, are ranges and odometry in metres and radians?"
-        )

@@ -15,6 +15,7 @@ from scipy.special import logsumexp
 from jaxsonar.detection.extract import local_models
 from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import check_sigma
+from jaxsonar.estimation.estimation_log import estimation_log
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.trajectory import Trajectory, stamps_of
 from jaxsonar.hardware.errors import SonarError
@@ -44,7 +45,8 @@ class Localized:
     """Poses in a known map."""
 
     poses: Float[np.ndarray, "scans 3"]
-    """world_from_robot, metres and radians; NaN for scans without a certain pose."""
+    """world_from_robot, metres and radians; NaN for scans without a certain pose. Firings that are scans of their own
+    are merged first (``estimation_log``); one pose belongs to all of them."""
     covariance: Float[np.ndarray, "scans 3 3"]
     """Covariances in the world frame; the uncertainty of the map is taken into account scan by scan."""
     stamp: Float[np.ndarray, " scans"]
@@ -90,6 +92,7 @@ def localize(
     """
     _check(world, log, start, sigma)
     progress = progress or (lambda stage, done, total: None)
+    log = estimation_log(log)
     # 1. Local models, and odometry between the scans.
     models = []
     for model in local_models(ring, log, sigma=sigma):

@@ -33,6 +33,10 @@ from jaxsonar.smoothing.settings import SETTINGS
 from jaxsonar.smoothing.wall_echo_mask import wall_explained_mask
 
 
+class NothingExplained(SonarError):
+    """No wall, or no echo that fits one."""
+
+
 class SmoothingFit(NamedTuple):
     """Poses and landmarks after the adjustment."""
 
@@ -112,7 +116,7 @@ class Smoother:
         outliers = OdometryOutliers(np.zeros(0, np.int64) if split is None else split, self._row_of_scan)
         found = self._alternate(data, log, outliers)
         if found is None:
-            raise SonarError("smooth: no echo fits the walls; is it the right ring, are poses and units right?")
+            raise NothingExplained("smooth: no echo fits the walls; is it the right ring, are poses and units right?")
         rows = data.scan_rows[0]
         explained, echoes = np.zeros((2, len(log)), dtype=np.int64)
         explained[rows] = found.adjustment.used.sum(axis=1)[: len(rows)]
@@ -178,7 +182,7 @@ class Smoother:
         placed = data.logs_with_poses([log], state.poses)[0]
         world = map_with_tentative_points(self.ring_of(state), placed, window=self.window, models=self.models)
         if not len(world):
-            raise SonarError("smooth: no wall found; allowed are scans of a place with straight walls in reach")
+            raise NothingExplained("smooth: no wall found; allowed are scans of a place with straight walls in reach")
         if self.traversals is not None:
             world = self.traversals.split_landmarks(world, self._row_of_scan)
         return outliers.split_landmarks(world) if len(outliers.steps) else world

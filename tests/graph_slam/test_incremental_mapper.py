@@ -130,7 +130,8 @@ def test_scans_without_a_pose_are_ignored_with_a_reason(office):
 def test_scans_without_echoes_or_with_echoes_everywhere_are_valid():
     """Missed detections are evidence of free space; a robot enclosed on all sides claims none."""
     mapper, none = Mapper(ring=RING), np.zeros(0, int)
-    no_echo = Log.from_echoes(none, none, none, np.zeros(0), stamp=np.zeros(1), pose=np.zeros((1, 3)))[0]
+    at_origin = {"stamp": np.zeros(1), "pose": np.zeros((1, 3)), "asked": RING.paths}
+    no_echo = Log.from_echoes(none, none, none, np.zeros(0), **at_origin)[0]
     tx = np.arange(24)
     enclosed = Log.from_echoes(tx * 0, tx, tx, np.full(24, 0.12), stamp=np.ones(1), pose=np.zeros((1, 3)))[0]
     state, info = mapper.step(mapper.start(), no_echo)
