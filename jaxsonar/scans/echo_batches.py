@@ -182,7 +182,7 @@ def _group_by_columns(
 def _fill(
     echoes: FlatEchoes,
     scans: Int[np.ndarray, " scans"],
-    weights: Float[np.ndarray, " scans"] | None,
+    weights: Float[np.ndarray, " all"] | None,
     rows: int,
     columns: int,
     pieces: Int[np.ndarray, " paths"] | None,
