@@ -21,7 +21,8 @@ from rich.table import Table
 from jaxsonar import LocalModel, Log, load_ring, local_models
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.reports import plot_scan, plot_style
-from jaxsonar.scans.convert import read_scans
+from jaxsonar.recordings.input_options import InputOptions
+from jaxsonar.recordings.load_log import load_log
 
 DIRECTIONS = {"front": (12, 0), "left": (18, 1), "right": (6, 2)}
 """Sensor of each direction, and column of the recorded minima."""
@@ -137,7 +138,7 @@ def main() -> None:
     options = options.parse_args()
     shipped = load_ring("scitos24")
     radius = float(np.linalg.norm(shipped.position[0]))
-    log = read_scans(options.folder, from_="scitos24")
+    log = load_log(options.folder, options=InputOptions(format="scitos24"))
     minima = np.genfromtxt(options.folder / "sensor_readings_4.csv", delimiter=",", usecols=range(3))
     ranges = dense_ranges(log, shipped.count)
     perpendicular = {

@@ -19,7 +19,8 @@ from rich.table import Table
 from jaxsonar import Log, Ring, build_map, evaluate, load_ring, slam
 from jaxsonar.evaluation.laser_reference_map import laser_points, reference_map
 from jaxsonar.hardware.laser_datasets import LaserRecording, read_corridor8_laser
-from jaxsonar.scans.convert import read_scans
+from jaxsonar.recordings.input_options import InputOptions
+from jaxsonar.recordings.load_log import load_log
 
 NEAR = 0.15
 """Maximum distance of a laser point from its line, metres."""
@@ -99,7 +100,7 @@ def main() -> None:
     options.add_argument("folder", type=Path, help="a recording in the format of corridor8")
     options.add_argument("--ring", default="corridor8", help="its ring (default: corridor8)")
     options = options.parse_args()
-    ring, log = load_ring(options.ring), read_scans(options.folder, from_="corridor8")
+    ring, log = load_ring(options.ring), load_log(options.folder, options=InputOptions(format="corridor8"))
     laser = read_corridor8_laser(options.folder)
     stderr = Console(stderr=True)
     stderr.print(f"{len(log)} scans; slam takes minutes", highlight=False)

@@ -13,7 +13,7 @@ from jaxsonar.hardware.messages import Message
 from jaxsonar.hardware.protocol import Decoder, encode
 from jaxsonar.hardware.recorder import open_recording, playback_speed
 from jaxsonar.hardware.transport_base import OnEvent, Source, Url
-from jaxsonar.scans.log_file import load_log
+from jaxsonar.scans.log_file import load_scan_log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.device_messages import log_messages
 
@@ -33,7 +33,7 @@ def messages_of(filename: str | os.PathLike[str], ring: Ring) -> Iterator[Messag
         first = next(messages, None)  # reports an unreadable file here
         return messages if first is None else chain([first], messages)
     try:
-        log = load_log(filename)
+        log = load_scan_log(filename)
         return log_messages(log, ring)
     except SonarError as error:
         text = str(error)

@@ -1,6 +1,6 @@
 """Scan logs: their file formats, sliding windows, and the packing of echoes into batches for kernels.
 
-Entry points: ``log_file.load_log``, ``log_file.save_log``, ``convert.convert``, ``scan_log.Log``,
+Entry points: ``log_file.load_scan_log``, ``log_file.save_log``, ``scan_log.Log``,
 ``flat_echoes.FlatEchoes``, ``echo_batches.pack``, ``sliding_windows.gather_windows``.
 
 Design decisions:

@@ -32,9 +32,6 @@ def load_scan_log(filename: str | os.PathLike[str]) -> Log:
     return read_csv(filename)
 
 
-load_log = load_scan_log  # until all callers use recordings.load_log
-
-
 def save_log(log: Log, filename: str | os.PathLike[str]) -> None:
     """Write a scan log as ``.csv`` or ``.parquet``; both formats are lossless.
 

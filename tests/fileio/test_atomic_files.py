@@ -18,7 +18,7 @@ from jaxsonar.fileio.atomic_files import (
 )
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans import csv_log as logs_csv
-from jaxsonar.scans.log_file import load_log, save_log
+from jaxsonar.scans.log_file import load_scan_log, save_log
 
 OLD, NEW = b"old content\n", b"new content\n"
 
@@ -101,7 +101,7 @@ def test_symbolic_links_are_kept(small_csv):
     link.symlink_to(small_csv.name)
     save_log(SMALL[:1], link)
     assert link.is_symlink()
-    assert load_log(small_csv) == SMALL[:1]
+    assert load_scan_log(small_csv) == SMALL[:1]
 
 
 def test_device_files_are_written_not_replaced():

@@ -7,14 +7,14 @@ import pytest
 from support.recordings import recorded, refused
 
 from jaxsonar.hardware.datasets import read_corridor8, read_scitos24, read_sew_amr
-from jaxsonar.scans.convert import convert
-from jaxsonar.scans.log_file import load_log
 from jaxsonar.sensors.ring_toml import load_ring
 
 
 def dense(recording, sensors):
-    """(scans, sensors) ranges in metres, NaN without an echo."""
-    table = np.full((len(recording.stamp), sensors), np.nan)
+    """(scans, sensors) ranges in metres, NaN without an echo. Every sensor has one reading a scan."""
+    assert len(recording.range) == len(recording.stamp) * sensors
+    np.testing.assert_array_equal(recording.tx, recording.rx)
+    table = np.zeros((len(recording.stamp), sensors))
     table[recording.scan_index, recording.tx] = recording.range
     return table
 
@@ -40,7 +40,18 @@ def test_corridor8_is_read_in_si_units(corridor8):
     np.testing.assert_array_equal(heard.tx, heard.rx)
     np.testing.assert_allclose(heard.stamp, [1.0, 1.25])
     np.testing.assert_allclose(heard.pose, [[1.5, -2.5, np.pi / 2], [1.6, -2.6, -np.pi / 2]])
-    assert np.isnan(heard.amplitude).all()
+    assert not heard.age.any()
+
+
+def test_corridor8_renews_a_reading_in_every_second_row(corridor8):
+    readings = {1000: 300, 1200: 300, 1450: 300, 1600: 300, 1900: 310, 2000: 300, 2500: 5110, 2700: 5110}
+    others = " ".join(str(100 * (k + 1)) for k in range(7))
+    rows = [f"{t} {value} {others}\n" for t, value in readings.items()]
+    (corridor8 / "measurement.txt").write_text("".join(rows))
+    (corridor8 / "poses.txt").write_text("".join(f"{t} 0 0 0\n" for t in readings))
+    age = read_corridor8(corridor8).age.reshape(-1, 8)
+    np.testing.assert_allclose(age[:, 0], [0, 0.2, 0, 0.15, 0, 0, 0, 0.2], atol=1e-12)
+    np.testing.assert_allclose(age[:, 1], [0, 0.2, 0, 0.15, 0, 0.1, 0, 0.2], atol=1e-12)
 
 
 @pytest.mark.parametrize(("tenths", "degrees"), [(0, 0), (1799, 179.9), (1800, -180), (1801, -179.9), (3600, 0)])
@@ -84,7 +95,8 @@ def test_the_published_corridor8_is_read():
     columns = np.loadtxt(folder / "measurement.txt")
     assert len(heard.stamp) == len(columns) == 413
     np.testing.assert_allclose(heard.stamp[[0, -1]], columns[[0, -1], 0] / 1000)
-    assert len(heard.range) == (columns[:, 1:] != 5110).sum()
+    assert np.isfinite(heard.range).sum() == (columns[:, 1:] != 5110).sum()
+    assert 0.4 < (heard.age > 0).mean() < 0.5
     assert heard.stamp[-1] - heard.stamp[0] == pytest.approx(93, abs=0.5)
     np.testing.assert_allclose(np.nan_to_num(dense(heard, 8), nan=5.11), columns[:, 1:] / 1000)
     steps = np.hypot(*np.diff(heard.pose[:, :2], axis=0).T)
@@ -132,6 +144,7 @@ def test_scitos24_in_metres_at_9_hz(scitos24):
     np.testing.assert_allclose(heard.stamp, [0, 1 / 9, 2 / 9])
     assert np.isnan(heard.pose).all()
     assert heard.pose.shape == (3, 3)
+    assert not heard.age.any()
 
 
 @pytest.mark.parametrize(
@@ -154,8 +167,8 @@ def test_the_published_scitos24_is_read():
     heard = read_scitos24(recorded("scitos24"))
     assert len(heard.stamp) == 5456
     assert heard.stamp[-1] == pytest.approx(5455 / 9)
-    assert 1 - len(heard.range) / (5456 * 24) == pytest.approx(0.138, abs=5e-4)  # no echo
-    assert heard.range.max() < 5.0
+    assert np.isnan(heard.range).mean() == pytest.approx(0.138, abs=5e-4)  # no echo
+    assert np.nanmax(heard.range) < 5.0
 
 
 def test_scitos24_front_left_and_right_are_where_the_ring_says():
@@ -197,9 +210,12 @@ MESSAGES = [
 
 
 def echoes(messages):
-    """The expected echoes, in order of scan, tx, rx, object."""
+    """The expected readings, in order of scan, tx, rx, object; None where a path heard nothing."""
     return [
-        (n, tx, rx, begin / 1000) for n, m in enumerate(messages) for (tx, rx), pairs in m.items() for begin, _ in pairs
+        (n, tx, rx, None if begin is None else begin / 1000)
+        for n, message in enumerate(messages)
+        for (tx, rx), pairs in message.items()
+        for begin, _ in pairs or [(None, None)]
     ]
 
 
@@ -207,7 +223,9 @@ def test_starts_of_sew_objects_are_the_echoes_of_each_path(tmp_path):
     (tmp_path / "dist.csv").write_text(sew_text(MESSAGES))
     heard = read_sew_amr(tmp_path / "dist.csv")
     columns = (heard.scan_index, heard.tx, heard.rx, heard.range)
-    assert list(zip(*(column.tolist() for column in columns), strict=True)) == echoes(MESSAGES)
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    assert [(n, tx, rx, None if math.isnan(metres) else metres) for n, tx, rx, metres in rows] == echoes(MESSAGES)
+    assert not heard.age.any()
     np.testing.assert_allclose(heard.stamp, 0.1 * np.arange(12))
     assert np.isnan(heard.pose).all()
 
@@ -224,13 +242,6 @@ def test_sew_folder_is_read_in_the_order_of_its_numbers(tmp_path):
     parts = read_sew_amr(tmp_path)
     for name in ("stamp", "scan_index", "tx", "rx", "range"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
-
-
-def test_a_sew_message_without_objects_is_a_scan_without_echoes(tmp_path):
-    (tmp_path / "dist.csv").write_text(sew_text([{}, {(3, 2): [(700, 800)]}]))
-    log = convert(tmp_path / "dist.csv", tmp_path / "log.csv", from_="sew-amr")
-    assert [len(scan.range) for scan in log] == [0, 1]
-    assert load_log(tmp_path / "log.csv") == log
 
 
 def test_the_sew_ring_corrects_the_range_offsets():
@@ -270,37 +281,3 @@ def test_a_missing_recording_is_named(reader, tmp_path):
     assert str(tmp_path) in refused(reader, tmp_path)
     (tmp_path / "picture").write_bytes(b"\x89PNG\xff\xfe")
     assert "this is no text" in refused(reader, tmp_path / "picture")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["corridor8", "scitos24"])
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_convert_keeps_every_echo_of_a_recording(name, suffix, tmp_path):
-    if suffix == ".parquet":
-        pytest.importorskip("pyarrow")
-    log = convert(recorded(name), tmp_path / f"log{suffix}", from_=name)
-    assert load_log(tmp_path / f"log{suffix}") == log
-    heard = {"corridor8": read_corridor8, "scitos24": read_scitos24}[name](recorded(name))
-    np.testing.assert_array_equal(log.echo_scan, heard.scan_index)
-    for column in ("stamp", "pose", "tx", "rx", "range", "amplitude"):
-        np.testing.assert_array_equal(getattr(log, column), getattr(heard, column))
-    ring = load_ring(name)
-    assert (ring.path_index[log.tx, log.rx] >= 0).all()  # the shipped ring has every path of the recording
-
-
-def test_convert_rejects_unknown_formats(corridor8, tmp_path):
-    known = "corridor8, scitos24, sew-amr, csv, parquet"
-    assert known in refused(convert, corridor8, tmp_path / "a.csv")
-    assert f"format 'corridor9' came; allowed are {known}" in refused(
-        convert, corridor8, tmp_path / "a.csv", from_="corridor9"
-    )
-    assert "allowed for a scan log is .csv or .parquet" in refused(
-        convert, corridor8, tmp_path / "a.txt", from_="corridor8"
-    )
-    assert not list(tmp_path.glob("a.*"))
-
-
-def test_the_named_format_wins_over_the_suffix(corridor8, tmp_path):
-    log = convert(corridor8, tmp_path / "log.csv", from_="corridor8")
-    (tmp_path / "log.csv").rename(tmp_path / "log.txt")
-    assert convert(tmp_path / "log.txt", tmp_path / "again.csv", from_="csv") == log
