@@ -20,9 +20,9 @@ from rich.table import Table
 
 from jaxsonar import LocalModel, Log, load_ring, local_models
 from jaxsonar.geometry.se2 import wrap_angle
-from jaxsonar.reports import plot_scan, plot_style
 from jaxsonar.recordings.input_options import InputOptions
 from jaxsonar.recordings.load_log import load_log
+from jaxsonar.reports import plot_scan, plot_style
 
 DIRECTIONS = {"front": (12, 0), "left": (18, 1), "right": (6, 2)}
 """Sensor of each direction, and column of the recorded minima."""
