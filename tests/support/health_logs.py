@@ -26,7 +26,7 @@ def log_of(seed, ring=RING, scans=24):
 
 def renumbered(log, place):
     """The log with other sensor numbers: sensor k becomes ``place[k]``."""
-    return dataclasses.replace(log, tx=place[log.tx], rx=place[log.rx])
+    return dataclasses.replace(log, tx=place[log.tx], rx=place[log.rx], asked=place[log.asked])
 
 
 def only(log, kept):
