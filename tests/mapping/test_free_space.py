@@ -11,7 +11,7 @@ from support import oracles
 from support.rings import bumper_ring
 
 from jaxsonar import Log, Ring, load_ring, local_models, random_pose, random_room, simulate
-from jaxsonar.geometry.se2 import transform_points
+from jaxsonar.geometry.se2 import compose, transform_points
 from jaxsonar.mapping.free_space import DirectionalFreeSpace, observe_free_space
 from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.mapping.settings import SETTINGS
@@ -131,23 +131,26 @@ def path_geometry(ring, path):
     return (ring.position[tx] + ring.position[rx]) / 2, ring.heading[tx] + first, last - first
 
 
-def free_cells_oracle(ring, pose, echoes, walls):
+def free_cells_oracle(ring, pose, echoes, walls, *, measured=None, motion=None):
     """Oracle: free cells of one scan (path, range), by loops over sensors, rays and distances, and shapely."""
+    measured = np.ones(len(ring.paths), bool) if measured is None else measured
+    at = [pose if motion is None else compose(pose, step) for step in (motion if motion is not None else ring.paths)]
     hides = []
     for start, end in walls:
         beyond = FREE.extension * (end - start) / np.linalg.norm(end - start)
         normal = math.atan2(beyond[0], -beyond[1])
         hides.append((normal, shapely.LineString([start, end]), shapely.LineString([start - beyond, end + beyond])))
-    votes = {}
+    votes, able = {}, {}
     for path, (tx, rx) in enumerate(ring.paths):
         if tx != rx:
             continue
         middle, first, width = path_geometry(ring, path)
-        sensor = transform_points(pose, middle)
+        sensor = transform_points(at[path], middle)
+        farthest = FREE.certain * ring.max_range + FREE.margin
         nearest = min([reach for k, reach in echoes if k == path], default=math.inf)
-        nearest = min(nearest, FREE.certain * ring.max_range + FREE.margin)
+        nearest = min(nearest, farthest) if measured[path] else -math.inf
         for k in range(RAYS):
-            theta = pose[2] + first + width * (0.5 + FREE.certain * (k / (RAYS - 1) - 0.5))
+            theta = at[path][2] + first + width * (0.5 + FREE.certain * (k / (RAYS - 1) - 0.5))
             ray = np.array([math.cos(theta), math.sin(theta)])
             sight = shapely.LineString([sensor, sensor + 100 * ray])
             # A wall may extend beyond its ends, except for rays that face it and would have heard it.
@@ -160,57 +163,113 @@ def free_cells_oracle(ring, pose, echoes, walls):
                 cell = place_of(sensor + distance * ray, theta)
                 middle = (np.array(cell[:2]) + 0.5) * FREE.cell
                 sector = 2 * math.pi / FREE.directions
-                faced = (cell[2] * sector - pose[2] - first) % (2 * math.pi) <= width - sector
-                if faced and max(distance, np.linalg.norm(middle - sensor)) < min(nearest, hidden) - FREE.margin:
-                    votes.setdefault(cell, set()).add(path)
+                faced = (cell[2] * sector - at[path][2] - first) % (2 * math.pi) <= width - sector
+                away = max(distance, np.linalg.norm(middle - sensor)) + FREE.margin
+                if faced and away < min(farthest, hidden):
+                    able.setdefault((cell[0] // 2, cell[1] // 2, cell[2]), set()).add(path)
+                    if away < nearest:
+                        votes.setdefault(cell, set()).add(path)
                 distance += FREE.cell * 0.7
     against = set()
     for path, reach in echoes:
         middle, first, width = path_geometry(ring, path)
-        sensor = transform_points(pose, middle)
+        sensor = transform_points(at[path], middle)
         for k in range(POINTS):
-            theta = pose[2] + first + width * k / (POINTS - 1)
+            theta = at[path][2] + first + width * k / (POINTS - 1)
             for distance in (reach - FREE.cell / 2, reach, reach + FREE.cell / 2):
                 point = sensor + distance * np.array([math.cos(theta), math.sin(theta)])
                 against.add(place_of(point, theta))
-    together = sum(path_geometry(ring, k)[2] for k, (tx, rx) in enumerate(ring.paths) if tx == rx) / (2 * math.pi)
+    twice = sum(path_geometry(ring, k)[2] for k, (tx, rx) in enumerate(ring.paths) if tx == rx) >= 4 * math.pi
     around = {}
     for (x, y, facing), sensors in votes.items():
         around.setdefault((x // 2, y // 2, facing), set()).update(sensors)
-    enough = 2 if together >= 2 else 1
-    return {(x, y, facing) for x, y, facing in votes if len(around[x // 2, y // 2, facing]) >= enough} - against
+
+    def agreed(block):
+        no_other = len(able[block]) > 1 and sum(measured[path] for path in able[block]) == 1
+        return not twice or len(around[block]) > 1 or no_other
+
+    return {(x, y, facing) for x, y, facing in votes if agreed((x // 2, y // 2, facing))} - against
 
 
-def free_cells(ring, poses, echoes, walls):
+def free_cells(ring, poses, echoes, walls, **measurements):
     """The free cells of several scans from the product, one set per scan."""
     scan = np.repeat(np.arange(len(poses)), [len(part) for part in echoes])
     flat = [echo for part in echoes for echo in part]
     path = np.array([k for k, _ in flat], np.int64)
     reach = np.array([r for _, r in flat], np.float64)
-    cells, who = observe_free_space(ring, np.asarray(poses, np.float64), scan, path, reach, walls)
+    cells, who = observe_free_space(ring, np.asarray(poses, np.float64), scan, path, reach, walls, **measurements)
     return [set(map(tuple, cells[who == k].tolist())) for k in range(len(poses))]
+
+
+def some_scans(ring, rng, *, share=1.0):
+    """Random poses, echoes and walls of five scans, and the paths that each measured."""
+    poses, echoes, walls = [], [], []
+    measured = rng.random((5, len(ring.paths))) < share
+    for k in range(5):
+        poses.append(np.append(rng.uniform(-3, 3, 2) * (100 if k == 4 else 1), rng.uniform(-4, 4)))
+        count = int(rng.integers(0, 12)) if k else 0
+        paths = rng.integers(0, len(ring.paths), count)
+        heard = [(int(p), float(r)) for p, r in zip(paths, rng.uniform(0.3, ring.max_range, count), strict=True)]
+        echoes.append([(p, r) for p, r in heard if measured[k, p]])
+        walls.append(poses[-1][:2] + rng.uniform(-2, 2, (int(rng.integers(0, 4)), 2, 2)))
+    return poses, echoes, walls, measured
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "ring", [Ring.circular(), Ring.circular(count=12, beam=0.9, neighbors=1), BUMPER, load_ring("corridor8")]
 )
-def test_free_space_equals_the_oracle(ring):
-    """Several scans at once against one at a time; random poses, echoes and walls."""
+@pytest.mark.parametrize("share", [1.0, 0.6, 0.15])
+def test_free_space_equals_the_oracle(ring, share):
+    """Several scans at once against one at a time; random poses, echoes, walls, measured paths and motion."""
     rng = np.random.default_rng(5)
-    poses, echoes, walls = [], [], []
-    for k in range(5):
-        poses.append(np.append(rng.uniform(-3, 3, 2) * (100 if k == 4 else 1), rng.uniform(-4, 4)))
-        count = int(rng.integers(0, 12)) if k else 0
-        paths = rng.integers(0, len(ring.paths), count)
-        echoes.append([(int(p), float(r)) for p, r in zip(paths, rng.uniform(0.3, ring.max_range, count), strict=True)])
-        walls.append(poses[-1][:2] + rng.uniform(-2, 2, (int(rng.integers(0, 4)), 2, 2)))
-    came = free_cells(ring, poses, echoes, walls)
-    for pose, heard, shown, cells in zip(poses, echoes, walls, came, strict=True):
-        wanted = free_cells_oracle(ring, pose, heard, shown)
-        assert len(wanted) > 10
+    poses, echoes, walls, measured = some_scans(ring, rng, share=share)
+    motion = rng.uniform(-0.2, 0.2, (5, len(ring.paths), 3)) if share < 1 else None
+    came = free_cells(ring, poses, echoes, walls, measured=measured if share < 1 else None, path_pose=motion)
+    found = 0
+    for k, (pose, heard, shown, cells) in enumerate(zip(poses, echoes, walls, came, strict=True)):
+        moved = None if motion is None else motion[k]
+        wanted = free_cells_oracle(ring, pose, heard, shown, measured=measured[k], motion=moved)
+        assert len(wanted) > 10 or share < 1
         # Intermediate values are in single precision: a point on a border may fall to either side.
         assert len(cells ^ wanted) <= 2
+        found += len(wanted)
+    assert found > 200
+
+
+@pytest.mark.parametrize("ring", [Ring.circular(count=16, beam=0.8, neighbors=1), load_ring("corridor8")])
+@pytest.mark.parametrize("share", [0.9, 0.4])
+def test_a_path_without_a_measurement_frees_nothing(ring, share):
+    """Unmeasured instead of silent, a path never adds a free cell; no measurement at all frees nothing."""
+    rng = np.random.default_rng(8)
+    poses, echoes, walls, silent = some_scans(ring, rng, share=share)
+    before = free_cells(ring, poses, echoes, walls)
+    for heard, row in zip(echoes, silent, strict=True):
+        row[[path for path, _ in heard]] = True
+    once = free_cells(ring, poses, echoes, walls, measured=silent)
+    less = silent & (rng.random(silent.shape) < 0.7)
+    for heard, row in zip(echoes, less, strict=True):
+        row[[path for path, _ in heard]] = True
+    twice = free_cells(ring, poses, echoes, walls, measured=less)
+    assert all(c <= b <= a for a, b, c in zip(before, once, twice, strict=True))
+    assert sum(map(len, twice)) < sum(map(len, once)) < sum(map(len, before))
+    nothing = [[] for _ in poses]
+    assert not any(free_cells(ring, poses, nothing, walls, measured=np.zeros_like(silent)))
+
+
+def test_one_sensor_is_enough_where_no_other_was_measured(faw_ring):
+    """A single measured sensor frees what it sees; as soon as its neighbor is measured, both must agree."""
+    at_rest, no_wall = [(0.0, 0.0, 0.0)], [np.zeros((0, 2, 2))]
+    only = np.zeros((1, len(faw_ring.paths)), bool)
+    direct = [faw_ring.path_index[k, k] for k in (3, 4)]
+    only[0, direct[0]] = True
+    (alone,) = free_cells(faw_ring, at_rest, [[]], no_wall, measured=only)
+    both = only.copy()
+    both[0, direct[1]] = True
+    (disputed,) = free_cells(faw_ring, at_rest, [[(direct[1], 0.1)]], no_wall, measured=both)
+    (agreed,) = free_cells(faw_ring, at_rest, [[]], no_wall, measured=both)
+    assert 30 < len(disputed) < len(alone) < len(agreed)
+    assert disputed < alone < agreed
 
 
 def test_without_echoes_the_cones_are_free(faw_ring):
