@@ -123,6 +123,8 @@ class Decoder:
         """The latest frame was an end frame. A later frame resets this."""
         self.version = (MAJOR, MINOR)
         """The newest version seen, (major, minor)."""
+        self.received_bytes = 0
+        """Number of bytes so far."""
         self._sensors = 1 << 16 if sensors is None else sensors
         self._buffer = bytearray()
         self._skipping = False
@@ -137,6 +139,7 @@ class Decoder:
             The messages that were completed, in order.
         """
         messages = []
+        self.received_bytes += len(data)
         *pieces, rest = data.split(b"\0")
         for piece in pieces:
             if self._buffer:

@@ -7,6 +7,9 @@ import threading
 import time
 from dataclasses import asdict, dataclass
 
+import numpy as np
+from jaxtyping import Int
+
 from .drop_oldest_queue import DropOldestQueue
 from .protocol import Decoder
 from .recorder_base import Recorder
@@ -40,6 +43,7 @@ class ReaderThread:
         queue: DropOldestQueue[RawScan],
         *,
         sensors: int | None = None,
+        group_paths: Int[np.ndarray, "paths 3"] | None = None,
         recorder: Recorder | None = None,
         scans: int | None = None,
         block_when_full: bool | None = False,
@@ -50,6 +54,7 @@ class ReaderThread:
             source: source of bytes. Its link events are to be passed to ``event``.
             queue: receives the scans; closed at the end.
             sensors: number of sensors of the ring; frames with other sensor numbers are rejected.
+            group_paths: as in ``ScanAssembler``.
             recorder: receives every message, scan and event, including scans that the queue drops.
             scans: stop after this many scans; None: when the source ends.
             block_when_full: backpressure. True: wait while the queue is full (files). False: drop the oldest scan
@@ -57,7 +62,7 @@ class ReaderThread:
                 because it is a replay and can wait (tcp, which buffers what is not read).
         """
         self.decoder = Decoder(sensors=sensors)
-        self.assembler = ScanAssembler(sensors=sensors)
+        self.assembler = ScanAssembler(sensors=sensors, group_paths=group_paths)
         self.last_event: LinkEvent | None = None
         """The latest link event."""
         self.gaps = 0
@@ -95,7 +100,7 @@ class ReaderThread:
         """Counters of decoder, assembler and queue, by name."""
         frames, groups = self.decoder.counts, self.assembler.counts
         both = {"impossible": frames.impossible + groups.impossible, "rejected": frames.rejected + groups.impossible}
-        own = {"dropped": self._queue.dropped, "gaps": self.gaps}
+        own = {"dropped": self._queue.dropped, "gaps": self.gaps, "bytes": self.decoder.received_bytes}
         return asdict(frames) | asdict(groups) | both | own
 
     def _run(self) -> None:

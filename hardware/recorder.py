@@ -15,7 +15,7 @@ from .recorder_base import Recorder, recording_marker
 from .scan_assembler import RawScan
 from .transport_base import OnEvent, Source, Url
 
-HEADER = "scan,stamp,x,y,theta,tx,rx,range,amplitude\n"
+HEADER = "scan,stamp,x,y,theta,tx,rx,range,amplitude,t\n"
 """Columns of a scan log."""
 
 
@@ -94,18 +94,20 @@ class CsvRecorder(Recorder):
 
 
 def csv_rows(scan: RawScan) -> str:
-    """The CSV rows of one scan, each with its line end."""
+    """The CSV rows of one scan, each with its line end: echoes, then paths that heard nothing."""
     has_pose = np.isfinite(scan.pose).all()
     pose = ",".join(map(repr, scan.pose.tolist())) if has_pose else ",,"
     head = f"{scan.scan},{scan.stamp!r},{pose},"
-    if not len(scan.echoes):
-        return f"{head},,,\n"
+    end = [f",{time!r}\n" if time else ",\n" for time in scan.group_time.tolist()]
     echoes = scan.echoes
-    columns = (echoes["tx"].tolist(), echoes["rx"].tolist(), scan.ranges.tolist(), echoes["amplitude"].tolist())
-    return "".join(
-        f"{head}{tx},{rx},{range_!r},{'' if amplitude != amplitude else repr(amplitude)}\n"  # NaN != NaN
-        for tx, rx, range_, amplitude in zip(*columns, strict=True)
-    )
+    columns = (echoes["tx"], echoes["rx"], scan.ranges, echoes["amplitude"], scan.group)
+    rows = [
+        f"{head}{tx},{rx},{range_!r},{'' if amplitude != amplitude else repr(amplitude)}{end[group]}"  # NaN != NaN
+        for tx, rx, range_, amplitude, group in zip(*(column.tolist() for column in columns), strict=True)
+    ]
+    silent = [] if scan.silent is None else scan.silent.tolist()
+    rows += [f"{head}{tx},{rx},,{end[group]}" for group, tx, rx in silent]
+    return "".join(rows) or f"{head},,,,\n"
 
 
 def open_recording(url: Url, *, on_event: OnEvent, reconnect: bool, silence: float) -> Source:

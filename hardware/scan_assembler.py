@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from .firing_plan import FiringPlan
 from .messages import ECHO, REFERENCE_SPEED_OF_SOUND, Group, Message, Pose
 
 
@@ -49,14 +50,19 @@ class RawScan:
     stamp: float
     """Device clock at the first firing, seconds; continued if the device restarts."""
     pose: Float[np.ndarray, " 3"]
-    """world_from_robot of the last group: x, y (m), theta (rad); NaN if not known for certain."""
+    """world_from_robot at the first firing: x, y (m), theta (rad); NaN if not known for certain."""
     group_pose: Float[np.ndarray, "groups 3"]
     """world_from_robot of each group; NaN if the group is missing or its pose is unknown."""
+    group_time: Float[np.ndarray, " groups"]
+    """When each group fired, seconds after ``stamp``; NaN if the group is missing."""
     echoes: Shaped[np.ndarray, " echoes"]
     """Dtype ``messages.ECHO``. In the order of the ring's paths, nearest first, if the number of sensors is known;
     otherwise group by group."""
     group: Int[np.ndarray, " echoes"]
-    """Firing group of each echo."""
+    """Firing group of each echo; that of its transmitter's last echo, if a transmitter fired several times."""
+    silent: Int[np.ndarray, "silent 3"] | None
+    """Firing group, transmitter and receiver of the paths that were measured and heard nothing; None if it is not known
+    which paths the device measures."""
     temperature: float
     """Air temperature, degrees Celsius: mean over the groups that report one; NaN if none does."""
     missing: int
@@ -68,6 +74,11 @@ class RawScan:
     def ranges(self) -> Float[np.ndarray, " echoes"]:
         """Half path lengths as in a log, metres. The only conversion of times of flight to ranges."""
         return self.echoes["time_us"].astype(np.float64) * (1e-6 * REFERENCE_SPEED_OF_SOUND / 2)
+
+    @property
+    def times(self) -> Float[np.ndarray, " echoes"]:
+        """When the transmitter of each echo fired, seconds after ``stamp``."""
+        return self.group_time[self.group]
 
 
 @dataclass
@@ -112,17 +123,26 @@ class _PartialScan:
 class ScanAssembler:
     """Assembles the messages of one device. Keeps at most three partial scans and a history of sequence numbers."""
 
-    def __init__(self, *, sensors: int | None = None, timeout: float = SETTINGS.incomplete_timeout):
+    def __init__(
+        self,
+        *,
+        sensors: int | None = None,
+        group_paths: Int[np.ndarray, "paths 3"] | None = None,
+        timeout: float = SETTINGS.incomplete_timeout,
+    ):
         """A new assembler.
 
         Args:
             sensors: number of sensors, to sort the echoes by path; None: order of arrival.
+            group_paths: firing group, transmitter and receiver of every path of the ring, to report the paths that
+                heard nothing (``FiringPlan``); needs ``sensors``.
             timeout: seconds without a group after which ``expire`` emits an incomplete scan.
         """
         self.counts = AssemblerCounts()
         self.unknown_messages = False
         """The device also sends messages that the decoder skips, so a gap in the sequence need not be a lost pose."""
         self._sensors, self._timeout = sensors, timeout
+        self._plan = None if group_paths is None or sensors is None else FiringPlan(group_paths, sensors)
         self._suspect: Message | None = None
         self._renumber = False
         self._scan_offset, self._clock_offset = 0, 0.0
@@ -285,11 +305,20 @@ class ScanAssembler:
         poses = np.full((scan.groups, 3), np.nan)
         for k in order:
             poses[k] = self._pose_before(scan.parts[k][0])
-        last = max(order, key=lambda k: (scan.parts[k][1].time_us, k))
-        stamp = min(part.time_us for part in groups) * 1e-6 + self._clock_offset
-        self._last_stamp = max(stamp, scan.parts[last][1].time_us * 1e-6 + self._clock_offset)
+        time_us = np.array([part.time_us for part in groups])
+        first = order[int(np.argmin(time_us))]
+        stamp, self._last_stamp = (
+            round(int(time) / 1e6 + self._clock_offset, 6) for time in (time_us.min(), time_us.max())
+        )
+        group_time = np.full(scan.groups, np.nan)
+        group_time[order] = (time_us - time_us.min()).astype(np.float64) / 1e6
         echoes = np.frombuffer(bytearray().join(part.echoes.tobytes() for part in groups), ECHO)
         group = np.repeat(np.array(order, dtype=np.int64), [len(part.echoes) for part in groups])
+        tx, rx = echoes["tx"].astype(np.int64), echoes["rx"].astype(np.int64)
+        group_of = np.zeros(int(tx.max(initial=0)) + 1, np.int64)
+        group_of[tx] = group
+        group = group_of[tx]
+        silent = None if self._plan is None else self._plan.silent_paths(np.isfinite(group_time), tx, rx, group)
         if self._sensors is not None:
             by_path = _path_order(echoes, self._sensors)
             echoes, group = echoes[by_path], group[by_path]
@@ -301,10 +330,12 @@ class ScanAssembler:
         return RawScan(
             scan=number,
             stamp=stamp,
-            pose=poses[last].copy(),
+            pose=poses[first].copy(),
             group_pose=poses,
+            group_time=group_time,
             echoes=echoes,
             group=group,
+            silent=silent,
             temperature=float(np.mean(measured)) if measured else float("nan"),
             missing=missing,
             received=scan.received,

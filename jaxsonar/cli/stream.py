@@ -70,10 +70,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> int:
     """Run ``jaxsonar stream``."""
     from jaxsonar.detection.settings_toml import load_settings
-    from jaxsonar.fileio.atomic_files import check_outputs
+    from jaxsonar.fileio.atomic_files import check_outputs, shown
     from jaxsonar.fileio.compilation_cache import use_compilation_cache
     from jaxsonar.hardware.transport_base import parse_url
     from jaxsonar.live.stream import stream as stream_scans
@@ -122,8 +122,11 @@ def run(options: argparse.Namespace) -> None:
         print_status("jaxsonar stream: interrupted")
         _exit_now(1)
     status_line.last(status)
+    if reason := status.why_nothing_is_used(ring):
+        print_status(f"nothing found: {shown(options.url)}: {reason}")
     if not status.warm:
-        _exit_now(0)
+        _exit_now(int(bool(reason)))
+    return int(bool(reason))
 
 
 class StatusLine:

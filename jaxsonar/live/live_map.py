@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxsonar import kernels
 from jaxsonar.detection.arc_tables import arc_tables
@@ -14,10 +14,11 @@ from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.trajectory import Trajectory
-from jaxsonar.geometry.se2 import relative
 from jaxsonar.graph_slam.incremental_mapper import Mapper
 from jaxsonar.hardware.scan_assembler import RawScan
 from jaxsonar.mapping.global_map import GlobalMap
+from jaxsonar.scans.firing_poses import path_poses_of_scan
+from jaxsonar.scans.flat_echoes import corrected_echoes
 from jaxsonar.scans.raw_scans import scan_from_raw
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring, speed_of_sound
@@ -51,7 +52,7 @@ class LiveScan:
     scan: Scan
     """The scan as in a log."""
     model: LocalModel
-    """Local model in the robot frame at the last firing group."""
+    """Local model in the robot frame at the first firing."""
 
 
 class LiveMap:
@@ -86,6 +87,8 @@ class LiveMap:
         self.ring = ring
         self.left_out = 0
         """Number of echoes left out: their sensor pairs are not echo paths of the ring."""
+        self.in_range = 0
+        """Number of echoes on paths of the ring within its maximum range."""
         self.without_pose = 0
         """Number of scans without a pose; they are not in the map."""
         self._options = {"method": method, "settings": hough_settings(ring, settings), "sigma": sigma}
@@ -97,10 +100,7 @@ class LiveMap:
         self._pending: list[LiveScan] = []
         self._stamps: list[float] = []
         self._temperature = float("nan")
-        self._paths, self._path_index = ring.paths, ring.path_index
-        self._group_of_sensor: Int[np.ndarray, " sensors"] = np.full(ring.count, -1)
-        for group, sensors in enumerate(ring.firing_groups):
-            self._group_of_sensor[sensors] = group
+        self._path_index = ring.path_index
 
     def warm_up(self) -> None:
         """Compile the programs that the first scans need, by processing synthetic scans."""
@@ -115,7 +115,7 @@ class LiveMap:
             path = paths[rng.integers(len(paths), size=echoes)]
             ranges = rng.uniform(0.3, 0.9, echoes) * self.ring.max_range
             pose, amplitude = np.zeros(3), np.full(echoes, np.nan)
-            scan = Scan(0, 0.0, pose, path[:, 0], path[:, 1], ranges, amplitude)
+            scan = Scan(0, 0.0, pose, path[:, 0], path[:, 1], ranges, amplitude, asked=self.ring.paths)
             scans = [replace(scan, scan=k) for k in range(max(_WARM_UP_BATCHES[method]))]
             for number in _WARM_UP_BATCHES[method]:
                 list(local_models(self.ring, Log.from_scans(scans[:number]), **self._options))
@@ -146,15 +146,19 @@ class LiveMap:
             SonarError: a sensor number that the ring does not have.
         """
         scans = [scan_from_raw(raw) for raw in raw_scans]
-        self.left_out += sum(int((self._path_index[scan.tx, scan.rx] < 0).sum()) for scan in scans)
-        poses = [self.path_poses(raw) for raw in raw_scans]
         self._follow_temperature(raw_scans)
+        for scan in scans:
+            self.left_out += int((self._path_index[scan.tx, scan.rx] < 0).sum())
+            self.in_range += len(corrected_echoes(self.ring, scan)[0])
+        poses = [self._path_pose(scan) for scan in scans]
         robot_stood = all(pose is None for pose in poses)
         if len(scans) >= SETTINGS.min_batch and self._options["method"] == "hough" and robot_stood:
-            models = list(local_models(self.ring, Log.from_scans(scans), **self._options))
+            models = list(local_models(self.ring, Log.from_scans([_at_rest(scan) for scan in scans]), **self._options))
         else:
-            pairs = zip(scans, poses, strict=True)
-            models = [local_model(self.ring, scan, path_pose=pose, **self._options) for scan, pose in pairs]
+            models = [
+                local_model(self.ring, scan if pose is not None else _at_rest(scan), path_pose=pose, **self._options)
+                for scan, pose in zip(scans, poses, strict=True)
+            ]
         if self.slam:
             return [self._tracked(*one) for one in zip(scans, models, poses, strict=True)]
         live_scans = [LiveScan(scan, model) for scan, model in zip(scans, models, strict=True)]
@@ -199,19 +203,11 @@ class LiveMap:
         poses, covariances = self._mapper.trajectory(self._state)
         return Trajectory(np.array(self._stamps), poses, covariances)
 
-    def path_poses(self, raw: RawScan) -> Float[np.ndarray, "paths 3"] | None:
-        """Pose of the robot when each path fired, relative to its pose at the end of the scan; None if it stood still.
-
-        A group without a pose counts as fired at the end.
-        """
-        moved = relative(np.broadcast_to(raw.pose, raw.group_pose.shape), raw.group_pose)
-        moved = np.where(np.isfinite(moved), moved, 0.0)
-        if np.abs(moved).max(initial=0.0) < SETTINGS.standing_threshold:
-            return None
-        # The group of a transmitter is the one of its latest echo; before the first one, the ring's firing order.
-        self._group_of_sensor[raw.echoes["tx"]] = raw.group
-        group = self._group_of_sensor[self._paths[:, 0]]
-        return np.where((group < len(moved))[:, None], moved[np.minimum(group, len(moved) - 1)], 0.0)
+    def _path_pose(self, scan: Scan) -> Float[np.ndarray, "paths 3"] | None:
+        """Pose of the robot when each path was measured, relative to its pose at the first firing; None if it stood."""
+        poses = path_poses_of_scan(self.ring, scan)
+        moved = poses is not None and np.abs(poses).max() >= SETTINGS.standing_threshold
+        return poses if moved else None
 
     def _follow_temperature(self, raw_scans: Sequence[RawScan]) -> None:
         measured = [raw.temperature for raw in raw_scans if not np.isnan(raw.temperature)]
@@ -221,3 +217,8 @@ class LiveMap:
         self.ring = replace(self.ring, speed_of_sound=speed_of_sound(self._temperature))
         if self._mapper is not None:
             self._mapper = replace(self._mapper, ring=self.ring)
+
+
+def _at_rest(scan: Scan) -> Scan:
+    """The scan as if all groups had fired at its pose."""
+    return replace(scan, t=None, odometry=None)

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Iterator
 from itertools import chain
-from pathlib import Path
 
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
@@ -13,7 +12,9 @@ from jaxsonar.hardware.messages import Message
 from jaxsonar.hardware.protocol import Decoder, encode
 from jaxsonar.hardware.recorder import open_recording, playback_speed
 from jaxsonar.hardware.transport_base import OnEvent, Source, Url
-from jaxsonar.scans.log_file import load_scan_log
+from jaxsonar.recordings.file_content import file_content
+from jaxsonar.recordings.load_log import load_log
+from jaxsonar.scans.firing_poses import group_firings
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.device_messages import log_messages
 
@@ -22,19 +23,18 @@ def messages_of(filename: str | os.PathLike[str], ring: Ring) -> Iterator[Messag
     """The messages of a device that would give this log or raw recording.
 
     Args:
-        filename: ``.csv``, ``.parquet`` or ``.mcap``.
+        filename: a raw recording, or another file that ``load_log`` reads.
         ring: the sensors; its firing groups split the scans of a log into messages.
 
     Raises:
         SonarError: the file cannot be read, or holds values that no device can report.
     """
-    if Path(filename).suffix.lower() == ".mcap":
+    if _is_raw_recording(filename):
         messages = _raw_messages(filename, ring)
         first = next(messages, None)  # reports an unreadable file here
         return messages if first is None else chain([first], messages)
     try:
-        log = load_scan_log(filename)
-        return log_messages(log, ring)
+        return log_messages(group_firings(load_log(filename, ring=ring)), ring)
     except SonarError as error:
         text = str(error)
         raise SonarError(text if text.startswith(shown(filename)) else f"{shown(filename)}: {text}") from None
@@ -59,11 +59,16 @@ def file_opener(ring: Ring):
     """
 
     def open_log(url: Url, *, on_event: OnEvent, reconnect: bool, silence: float) -> Source:
-        if Path(url.path).suffix.lower() == ".mcap":
+        if _is_raw_recording(url.path):
             return open_recording(url, on_event=on_event, reconnect=reconnect, silence=silence)
         return LogPlayer(url, ring)
 
     return open_log
+
+
+def _is_raw_recording(filename: str | os.PathLike[str]) -> bool:
+    """Whether a file holds raw messages (``stream --record x.mcap``)."""
+    return os.path.isfile(filename) and file_content(filename).format == "record"
 
 
 class LogPlayer(FramePlayer):

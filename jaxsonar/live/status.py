@@ -4,6 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jaxsonar.scans.unused_echoes import EchoCounts
+from jaxsonar.sensors.ring import Ring
+
 _REJECTED = ("oversized", "impossible", "out_of_ring", "unknown", "newer", "refused")
 """Counters of rejected frames that are named in the text."""
 _COUNTERS = {
@@ -25,6 +28,10 @@ class Status:
     """Number of processed scans."""
     echoes: int = 0
     """Number of echoes in those scans."""
+    left_out: int = 0
+    """Number of those echoes that are on no path of the ring."""
+    in_range: int = 0
+    """Number of echoes on paths of the ring within its maximum range."""
     lines: int = 0
     """Number of lines in those scans."""
     rate: float = 0.0
@@ -46,6 +53,22 @@ class Status:
     """Everything is compiled."""
     ending: bool = False
     """The stream was stopped during compilation; queued scans are still to be processed for the map."""
+
+    def why_nothing_is_used(self, ring: Ring) -> str:
+        """Why no echo of a finished stream could be used; empty if one was."""
+        counts = {"bytes": 0, "frames": 0, "scans": 0, "echoes": 0, **self.counts}
+        if not counts["bytes"]:
+            return "no data came: is the device on, and does it send?"
+        if not counts["frames"]:
+            rejected = f", {self.counts.get('rejected', 0)} damaged{self._rejected_text()}"
+            return (
+                f"no frame of the wire protocol in {counts['bytes']} bytes{rejected}: does the device use another one?"
+            )
+        if not counts["scans"]:
+            return f"no firing group in {counts['frames']} frames"
+        if not self.warm:  # the scans were only recorded
+            return "" if counts["echoes"] else f"no echo in {counts['scans']} scans"
+        return EchoCounts(self.scans, self.echoes, self.echoes - self.left_out, self.in_range).why_none_is_used(ring)
 
     def text(self) -> str:
         """One line for the user."""

@@ -17,6 +17,7 @@ from jaxsonar.live.live_map import LiveMap, LiveScan
 from jaxsonar.live.replay import file_opener
 from jaxsonar.live.status import Status
 from jaxsonar.live.stream_loop import SETTINGS, StreamLoop, Viewer
+from jaxsonar.scans.raw_scans import group_paths
 from jaxsonar.scans.recording_journal import open_log_recorder
 from jaxsonar.sensors.ring import Ring
 
@@ -137,7 +138,15 @@ def _open_reader(
         raise
     block_when_full = {"file": True, "udp": False}.get(parse_url(url).scheme)
     readers.append(
-        ReaderThread(source, queue, sensors=ring.count, recorder=recorder, scans=scans, block_when_full=block_when_full)
+        ReaderThread(
+            source,
+            queue,
+            sensors=ring.count,
+            group_paths=group_paths(ring),
+            recorder=recorder,
+            scans=scans,
+            block_when_full=block_when_full,
+        )
     )
     return readers[0]
 

@@ -157,7 +157,7 @@ class StreamLoop:
         status = self.status
         for raw, live in zip(raw_scans, live_scans, strict=True):
             status.scans += 1
-            status.echoes += len(live.scan.tx)
+            status.echoes += live.scan.echo_count
             status.lines += len(live.model.lines)
             if raw.received >= self._caught_up:
                 self._latencies[self._timed_scans % SETTINGS.latency_history] = now - raw.received
@@ -196,6 +196,7 @@ class StreamLoop:
         status, event = self.status, self._reader.last_event
         status.queued, status.counts = len(self._queue), self._reader.counts
         status.without_pose = self._live.without_pose
+        status.left_out, status.in_range = self._live.left_out, self._live.in_range
         status.event = shown(event.text) if event is not None and event.kind != "back" else ""
         if self._timed_scans:
             latencies = self._latencies[: self._timed_scans]

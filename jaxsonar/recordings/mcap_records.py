@@ -8,7 +8,7 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.mcap_recorder import MESSAGES, read_mcap
 from jaxsonar.hardware.protocol import Decoder
 from jaxsonar.hardware.scan_assembler import ScanAssembler
-from jaxsonar.scans.raw_scans import scan_from_raw
+from jaxsonar.scans.raw_scans import group_paths, scan_from_raw
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -16,11 +16,12 @@ from jaxsonar.sensors.ring import Ring
 def recorded_scans(
     filename: str | os.PathLike[str], *, ring: Ring | None = None, name: str | None = None
 ) -> Iterator[Scan]:
-    """The scans of a raw recording, each at the pose of its last firing group.
+    """The scans of a raw recording, each at the pose of its first firing.
 
     Args:
         filename: the MCAP file.
-        ring: the sensors, which order the echoes; None: any sensor is allowed, in order of arrival.
+        ring: the sensors, which order the echoes and know which paths a firing group measures; None: any sensor is
+            allowed, in order of arrival, and only paths with an echo count as measured.
         name: name of the file in error messages; the filename if omitted.
 
     Raises:
@@ -29,7 +30,8 @@ def recorded_scans(
     """
     name = os.fspath(filename) if name is None else name
     sensors = None if ring is None else ring.count
-    decoder, assembler = Decoder(sensors=sensors), ScanAssembler(sensors=sensors)
+    paths = None if ring is None else group_paths(ring)
+    decoder, assembler = Decoder(sensors=sensors), ScanAssembler(sensors=sensors, group_paths=paths)
     frames = 0
     for topic, received, frame in read_mcap(filename):
         if topic == MESSAGES:

@@ -292,13 +292,12 @@ class Log:
 
     @classmethod
     def from_scans(cls, scans: Sequence[Scan]) -> "Log":
-        """A log of these scans, in this order."""
+        """A log of these scans, in this order, with all of their odometry."""
         columns = {
             name: np.concatenate([np.zeros(0), *(_column(scan, name) for scan in scans)])
             for name in ("tx", "rx", "range", "amplitude", "t", "age")
         }
         asked = [scan.asked for scan in scans if scan.asked is not None]
-        odometry = [scan.odometry for scan in scans if scan.odometry is not None]
         return cls.from_echoes(
             np.repeat(np.arange(len(scans)), [len(scan.tx) for scan in scans]),
             columns["tx"].astype(np.int64),
@@ -311,7 +310,7 @@ class Log:
             pose=np.array([scan.pose for scan in scans], dtype=np.float64).reshape(-1, 3),
             scan=np.array([scan.scan for scan in scans], dtype=np.int64),
             asked=_same_or_union(asked) if scans and len(asked) == len(scans) else None,
-            odometry=odometry[0] if odometry and all(one is odometry[0] for one in odometry) else None,
+            odometry=_all_odometry(scans),
         )
 
     @property
@@ -401,6 +400,15 @@ class Log:
 def _column(scan: Scan, name: str) -> np.ndarray:
     column = getattr(scan, name)
     return np.zeros(len(scan.tx)) if column is None else column
+
+
+def _all_odometry(scans: Sequence[Scan]) -> Float[np.ndarray, "samples 4"] | None:
+    """The odometry of scans: the shared array of one log, or all samples in order of time."""
+    parts = list({id(scan.odometry): scan.odometry for scan in scans if scan.odometry is not None}.values())
+    if len(parts) < 2:
+        return parts[0] if parts else None
+    samples = np.concatenate(parts)
+    return samples[np.unique(samples[:, 0], return_index=True)[1]]
 
 
 def _same_or_union(asked: Sequence[Int[np.ndarray, "_ 2"]]) -> Int[np.ndarray, "pairs 2"]:
