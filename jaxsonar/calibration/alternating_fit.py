@@ -205,7 +205,7 @@ class CalibrationProblem:
             if not any(len(one) for one in maps):
                 raise SonarError(
                     "calibration: no wall found; allowed are scans of a place with straight walls within range; "
-                    f"{ExplainedShare(0.0, settings.min_explained)}"
+                    f"walls {ExplainedShare(0.0, settings.min_explained).shortfall}"
                 )
             return maps
 
@@ -218,8 +218,8 @@ class CalibrationProblem:
         )
         if found is None:
             raise SonarError(
-                "calibration: no echo fits the walls; is it the right ring, are poses and units right? "
-                f"{ExplainedShare(0.0, settings.min_explained)}"
+                f"calibration: walls {ExplainedShare(0.0, settings.min_explained).shortfall}; "
+                "is it the right ring, are poses and units right?"
             )
         return CalibrationFit(logs, data, found.maps, found.adjustment)
 

@@ -170,8 +170,7 @@ def _check_result(problem: CalibrationProblem, fit: CalibrationFit, explained: E
     count = problem.ring.count
     if not explained.suffices:
         raise SonarError(
-            f"calibration: walls and corners do not fit the {fit.data.echo_count} echoes, {explained}: is it the right "
-            "ring, are poses and units right?"
+            f"calibration: walls and corners {explained.shortfall}: is it the right ring, are poses and units right?"
         )
     change = problem.basis.columns @ fit.adjustment.state.coordinates
     offset, log_speed = change[:count], float(change[count])

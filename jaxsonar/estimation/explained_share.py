@@ -15,6 +15,11 @@ class ExplainedShare(NamedTuple):
         """Whether enough echoes are explained."""
         return self.measured >= self.required
 
+    @property
+    def shortfall(self) -> str:
+        """The predicate of a refusal."""
+        return f"explain {_percent(self.measured)} of the echoes; needed are {_percent(self.required)} or more"
+
     def __str__(self) -> str:
         return f"{_percent(self.measured)} of the echoes explained, required: {_percent(self.required)}"
 

@@ -154,7 +154,7 @@ def slam(
                 progress=lambda task: report(task, 0, 0),
             )
         except NothingExplained as reason:
-            raise SonarError(f"slam: {reason}; {ExplainedShare(0.0, SETTINGS.min_explained)}") from None
+            raise SonarError(f"{reason}; walls {ExplainedShare(0.0, SETTINGS.min_explained).shortfall}") from None
     # 4. Map: that of the smoothed landmarks, or one from the initial poses.
     if smoothed is not None:
         poses, covariance, world = smoothed.poses, smoothed.pose_cov, smoothed.world
@@ -167,7 +167,7 @@ def slam(
     explained = ExplainedShare(share, SETTINGS.min_explained)
     if not explained.suffices:
         raise SonarError(
-            f"slam: poses and map do not fit, {explained}: is it the right ring, are ranges and odometry in metres and "
+            f"slam: poses and map {explained.shortfall}: is it the right ring, are ranges and odometry in metres and "
             "radians?"
         )
     stamp, closures = stamps_of(log), initial.closures
