@@ -30,17 +30,25 @@ class NoEchoSettings:
     towards a wall does not read one value in many of them."""
     min_cell: float = 0.1
     """Smallest side of such a square, metres."""
+    largest_noise: float = 0.04
+    """Largest standard deviation of a noisy value, relative to the value."""
     contrast: float = 4.0
     """A noisy value has this many times as many readings as a window of equal width on either side, and an exact value
     this many times as many as any other value near it."""
-    neighbors: float = 0.05
-    """Values within this distance are near an exact value, metres."""
-    paths: float = 0.6
-    """Share of the paths that read a value. In a corridor, at most half of the sensors face its walls."""
-    min_paths: int = 3
-    """Smallest number of these paths."""
-    path_share: float = 0.2
-    """Share of the places at which each of these paths reads a noisy value."""
+    neighbors: float = 0.12
+    """Values within this distance are near an exact value, metres; more than two steps of a resolution of 5 cm."""
+    paths: float = 0.8
+    """Share of the paths that read a value. In a corridor, only the sensors that face its walls read their distance."""
+    repeated: float = 0.05
+    """Share of the other echoes that have a value in common, from which on ranges have a coarse resolution."""
+    paths_of_fine_ranges: float = 0.3
+    """Share of the paths that read an exact value, if the resolution is so fine that no other value is repeated."""
+    min_paths: int = 4
+    """Smallest number of paths that read a noisy value, ..."""
+    min_paths_exact: int = 2
+    """... and an exact one."""
+    path_share: float = 0.15
+    """Share of the places at which each of these paths reads a noisy value, or an exact one of a coarse resolution."""
     places: int = 3
     """Number of different places at which each of these paths reads an exact value."""
     path_readings: int = 8
@@ -51,12 +59,12 @@ class NoEchoSettings:
     """Share of the echoes that have a noisy value, at least."""
     exact_readings: float = 0.01
     """Share of the echoes that have an exact value, at least."""
-    most_readings: float = 0.97
+    most_readings: float = 0.95
     """Largest share of the echoes: where hardly any other value is read, this one does not replace silence."""
     beyond_exact: float = 0.005
     """Largest share of the echoes that are beyond an exact value: it is the smallest or the largest range."""
-    beyond_noisy: float = 0.1
-    """The same for a noisy value."""
+    beyond_noisy: float = 0.02
+    """Largest share of the echoes that are above a noisy value: it is about the largest range."""
     equal: float = 1e-6
     """Ranges that differ by less, relative to their value, are equal; larger than the rounding of 32-bit floats."""
     refinements: int = 10
@@ -99,9 +107,10 @@ def find_no_echo_values(log: Log) -> tuple[NoEchoValue, ...]:
     - An exact value is repeated by most paths at different places, far more often than the values near it.
     - A noisy value is a mode of the histogram of most paths, at many places of the robot, in a log that has an echo for
       nearly every measurement.
-    - Hardly any reading is beyond the value: it is the smallest or the largest range that the device reports.
+    - Hardly any reading is beyond the value: it is the smallest or the largest range that the device reports, and the
+      largest one if it is noisy.
 
-    Without poses, only exact maxima are found. A robot at rest shows nothing.
+    Without poses, only exact maxima are found. The readings of a robot at rest do not tell.
 
     Returns:
         The values, the most frequent one first; empty for a sound log.
@@ -230,7 +239,8 @@ def _found(sample: _Sample) -> Iterator[NoEchoValue]:
     # A device that sends a noisy value instead of nothing reports every measurement.
     if sample.has_poses and len(sample.range) >= SETTINGS.coverage * sample.measured.sum():
         for sigma in SETTINGS.noise:
-            if (mark := _noisy(sample, _mode(sample.range, sigma), sigma)) is not None:
+            value = _mode(sample.range, sigma)
+            if sigma <= SETTINGS.largest_noise * value and (mark := _noisy(sample, value, sigma)) is not None:
                 yield mark
 
 
@@ -248,13 +258,20 @@ def _exact(sample: _Sample, value: float) -> NoEchoValue | None:
     near = ~has_it & (np.abs(sample.range - value) <= SETTINGS.neighbors)
     if SETTINGS.contrast * max(np.unique(sample.range[near], return_counts=True)[1], default=0) > has_it.sum():
         return None
-    if sample.has_poses:
-        places = sample.place_counts(has_it, sample.visited(SETTINGS.min_cell)[0])
-    else:
-        places = sample.run_counts(has_it)
+    _, which, count = np.unique(sample.range[~has_it], return_inverse=True, return_counts=True)
+    is_fine = len(which) == 0 or float(np.mean(count[which] > 1)) < SETTINGS.repeated
+    if not sample.has_poses and near.any() and not is_fine:
+        return None
     counted = sample.echo_counts >= SETTINGS.path_readings
-    shared = counted & (places >= SETTINGS.places)
-    enough = shared.sum() >= max(SETTINGS.min_paths, SETTINGS.paths * counted.sum())
+    if sample.has_poses:
+        place, visited = sample.visited(SETTINGS.min_cell)
+        places = sample.place_counts(has_it, place)
+        least = SETTINGS.places if is_fine else np.maximum(SETTINGS.path_share * visited, SETTINGS.places)
+        shared = counted & (places >= least)
+    else:
+        shared = counted & (sample.run_counts(has_it) >= SETTINGS.places)
+    paths = SETTINGS.paths_of_fine_ranges if is_fine else SETTINGS.paths
+    enough = shared.sum() >= max(SETTINGS.min_paths_exact, paths * counted.sum())
     return NoEchoValue(float(value), 0.0, int(has_it.sum()), share) if enough else None
 
 
@@ -264,7 +281,7 @@ def _noisy(sample: _Sample, value: float, sigma: float) -> NoEchoValue | None:
     deviation = sample.range - value
     has_it = np.abs(deviation) <= width
     share = float(has_it.mean())
-    beyond = min(np.mean(deviation < -width), np.mean(deviation > width))
+    beyond = np.mean(deviation > width)
     if not SETTINGS.noisy_readings <= share <= SETTINGS.most_readings or beyond > SETTINGS.beyond_noisy:
         return None
     below = np.sum((deviation < -width) & (deviation >= -3 * width)) / 2
@@ -275,7 +292,7 @@ def _noisy(sample: _Sample, value: float, sigma: float) -> NoEchoValue | None:
     read = sample.place_counts(has_it, place)
     counted = (sample.echo_counts >= SETTINGS.path_readings) & (visited >= 2 * SETTINGS.places)
     shared = counted & (read >= np.maximum(SETTINGS.places, SETTINGS.path_share * visited))
-    if shared.sum() < max(SETTINGS.min_paths + 1, SETTINGS.paths * counted.sum()):
+    if shared.sum() < max(SETTINGS.min_paths, SETTINGS.paths * counted.sum()):
         return None
     center, spread = _center_and_spread(sample.range, value, sigma)
     return NoEchoValue(center, 0.0 if spread <= SETTINGS.equal * center else spread, int(has_it.sum()), share)
