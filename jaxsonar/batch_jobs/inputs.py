@@ -11,6 +11,7 @@ from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.recorder_base import recording_marker
 from jaxsonar.recordings.file_content import SUFFIXES, file_content
+from jaxsonar.recordings.load_log import check_content
 
 UNREADABLE = "unreadable"
 """Format of a file in a folder that is no recording although its suffix is that of one."""
@@ -37,8 +38,12 @@ class Input:
         return plain if plain == self.source[:100] else f"{plain[:100]}-{digest[:8]}"
 
 
-def find_inputs(filenames: Iterable[str | os.PathLike[str]]) -> list[Input]:
+def find_inputs(filenames: Iterable[str | os.PathLike[str]], *, format: str | None = None) -> list[Input]:
     """Find the input logs, sorted by name. A folder stands for the logs in it.
+
+    Args:
+        filenames: logs, and folders of logs.
+        format: format of all logs (``InputOptions.format``); None: the content of each decides.
 
     Raises:
         SonarError: a missing file, a file that is no recording, a folder without logs, or two logs of one name.
@@ -46,7 +51,7 @@ def find_inputs(filenames: Iterable[str | os.PathLike[str]]) -> list[Input]:
     found: dict[str, Input] = {}
     for name in {os.fspath(name): None for name in filenames}:
         is_folder = "\0" not in name and os.path.isdir(name) and not _is_recording(name)
-        inputs = _folder_inputs(name) if is_folder else [_input(name, Path(name).name)]
+        inputs = _folder_inputs(name) if is_folder else [_input(name, Path(name).name, format)]
         for one in inputs:
             other = found.setdefault(one.source, one)
             if os.path.realpath(other.filename) != os.path.realpath(one.filename):
@@ -80,7 +85,7 @@ def _folder_inputs(folder: str) -> Sequence[Input]:
     except OSError as failure:
         raise SonarError(f"{shown(folder)}: {reason(failure)}; needed is a readable folder of logs") from None
     logs = [
-        _input(os.fspath(path), path.name, format_=None if _is_recording(path) else UNREADABLE)
+        _input(os.fspath(path), path.name, _folder_entry_format(path))
         for path in entries
         if not path.name.startswith(".")
         and not path.name.endswith(".recording.csv")  # the journal of a Parquet recording
@@ -91,7 +96,15 @@ def _folder_inputs(folder: str) -> Sequence[Input]:
     return logs
 
 
-def _input(filename: str, name: str, *, format_: str | None = None) -> Input:
+def _folder_entry_format(filename: Path) -> str:
+    """Format of a file in a folder; a bad file must not keep the others from being processed."""
+    try:
+        return file_content(filename).format or UNREADABLE
+    except SonarError:
+        return UNREADABLE
+
+
+def _input(filename: str, name: str, format: str | None) -> Input:
     if "\0" in filename or not os.path.exists(filename):
         raise SonarError(f"{shown(filename)}: no such file or folder; needed is a log, or a folder of logs")
     if not name:  # "." and "/"
@@ -99,19 +112,16 @@ def _input(filename: str, name: str, *, format_: str | None = None) -> Input:
     if not os.path.isfile(filename) and not os.path.isdir(filename):
         raise SonarError(f"{shown(filename)}: not a regular file, but a log is read more than once; needed is a log")
     is_recording = recording_marker(filename).exists()
-    if format_ is None:
-        format_ = "csv" if is_recording else file_content(filename)
+    if format is None and not is_recording:
+        check_content(filename, content := file_content(filename))
+        format = content.format
     name = name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
-    return Input(name, filename, format_, recording=is_recording)
+    return Input(name, filename, format or "csv", recording=is_recording)
 
 
 def _is_recording(filename: str | os.PathLike[str]) -> bool:
     """Whether a file or folder is one that ``load_log`` reads."""
-    try:
-        file_content(filename)
-    except SonarError:
-        return recording_marker(filename).exists()
-    return True
+    return recording_marker(filename).exists() or _folder_entry_format(Path(filename)) != UNREADABLE
 
 
 def _sha256(filename: str | os.PathLike[str]) -> str:

@@ -114,7 +114,7 @@ def batch(
     settings = hough_settings(ring, settings)
     # 2. Find the logs.
     inputs = list(inputs)
-    logs = find_inputs(inputs)
+    logs = find_inputs(inputs, format=options.format)
     _check_output(output, [*inputs, *(log.filename for log in logs)])
     check_extras(logs)
     job = job_spec(ring, method=method, settings=settings, sigma=sigma)

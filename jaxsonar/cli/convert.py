@@ -1,7 +1,6 @@
 """``jaxsonar convert``: recordings of any kind to scan logs."""
 
 import argparse
-from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -65,10 +64,10 @@ def _ring_of_bag(options: argparse.Namespace, messages: InputMessages) -> "Ring"
     """
     from jaxsonar.hardware.errors import SonarError
     from jaxsonar.recordings.file_content import file_content
+    from jaxsonar.recordings.rosbag_log import ring_from_bag
 
     if options.ring is not None:
         raise SonarError(f"--ring {options.ring}: --ring-out came, too; allowed is one of them")
-    if file_content(options.source) != "bag":
+    if file_content(options.source).format != "bag":
         raise SonarError(f"--ring-out {options.ring_out}: IN is no ROS bag; allowed is --ring-out with a ROS bag")
-    ring_from_bag = import_module("jaxsonar.recordings.rosbag_log").ring_from_bag
     return ring_from_bag(options.source, options=input_options(options), on_note=messages.note)

@@ -110,7 +110,7 @@ def _log_messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Messag
     from jaxsonar.recordings.file_content import file_content
     from jaxsonar.simulation.device_messages import log_messages
 
-    if options.from_ in (None, "record") and file_content(options.log) == "record":
+    if options.from_ in (None, "record") and file_content(options.log).format == "record":
         return messages_of(options.log, ring)
     messages = InputMessages(strict=options.strict)
     log = read_log(options.log, options, messages, ring=ring)

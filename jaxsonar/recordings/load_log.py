@@ -52,7 +52,7 @@ def load_log(
     if options.format is not None:
         _check_named_format(filename, options.format, content)
     else:
-        _check_content(filename, content)
+        check_content(filename, content)
         if (text := check_suffix(filename, content)) is not None:
             note(text)
     log = _read(filename, options.format or str(content.format), ring, options, note)
@@ -109,7 +109,7 @@ def _check_named_format(filename: str | os.PathLike[str], named: str, content: F
         raise SonarError(f"{shown(filename)}: this is {content.description}, not {wanted} as --from {named} says")
 
 
-def _check_content(filename: str | os.PathLike[str], content: FileContent) -> None:
+def check_content(filename: str | os.PathLike[str], content: FileContent) -> None:
     """Raise an error if a file is no recording, or one whose format must be named."""
     if content.format is None:
         allowed = "a scan log (CSV, Parquet), a raw recording (MCAP), a ROS bag, or what --from names"

@@ -13,8 +13,8 @@ from jaxsonar.sensors.ring import Ring
 class UnheardPathSettings:
     """When a kind of paths counts as never heard. Chosen by hand."""
 
-    min_expected: float = 20.0
-    """Least number of echoes of a kind that the echoes of the other kinds let expect."""
+    min_expected: float = 50.0
+    """Least number of echoes of some unheard kind that the echoes of the other kinds let expect."""
 
 
 SETTINGS = UnheardPathSettings()
@@ -30,7 +30,7 @@ def neighbor_offsets(ring: Ring) -> Int[np.ndarray, " paths"]:
 def unheard_offsets(ring: Ring, log: Log) -> list[int]:
     """Neighbor offsets (0: direct echoes) of which the log holds no echo, although the ring lists such paths.
 
-    A kind of paths counts only if the echoes of the other kinds let expect at least ``SETTINGS.min_expected`` of it,
+    They count only if the echoes of the other kinds let expect ``SETTINGS.min_expected`` echoes or more of one of them,
     where the number of echoes is proportional to the width of the directions in which paths detect a wall.
     """
     known = (log.tx < ring.count) & (log.rx < ring.count) & np.isfinite(log.range)
@@ -42,7 +42,7 @@ def unheard_offsets(ring: Ring, log: Log) -> list[int]:
     if not is_heard.any() or width[is_heard].sum() == 0:
         return []
     expected = heard.sum() * width / width[is_heard].sum()
-    return np.flatnonzero(~is_heard & (expected >= SETTINGS.min_expected)).tolist()
+    return np.flatnonzero(~is_heard).tolist() if (expected[~is_heard] >= SETTINGS.min_expected).any() else []
 
 
 def unheard_warning(ring: Ring, log: Log) -> str | None:

@@ -1,19 +1,18 @@
 """``jaxsonar batch``: exit codes, one line per error, bags and raw recordings."""
 
 import json
-import math
 import os
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from support.input_files import spinning_bag
 
-from jaxsonar import Log, load_log, load_ring
+from jaxsonar import Log, batch, load_log, load_ring
 from jaxsonar.batch_jobs.inputs import find_inputs
 from jaxsonar.batch_jobs.shards import split_input
 from jaxsonar.cli import app as cli
-from jaxsonar.scans.rosbag_log import read_bag_scans
 from jaxsonar.simulation.device_messages import log_messages
 
 pq = pytest.importorskip("pyarrow.parquet")
@@ -47,7 +46,8 @@ WRONG = {
     "--ring faw -o out": "the following arguments are required: IN",
     "log.csv --ring nosuch -o out": "nosuch",
     "nosuch.csv --ring faw -o out": "nosuch.csv: no such file or folder; needed is a log, or a folder of logs",
-    "notes.txt --ring faw -o out": "notes.txt: suffix '.txt' came; allowed for a log is .csv, .parquet, .mcap",
+    "notes.txt --ring faw -o out": "notes.txt: this is a text that begins with 'no log'; allowed is a scan log (CSV",
+    ". --ring faw -o .": "-o .: this is an input; allowed is another folder",
     "empty --ring faw -o out": "empty: no log in this folder; allowed are .csv, .parquet, .mcap, .bag, .db3",
     "log.csv --ring faw -o -": "-o - came; allowed is a folder",
     "pipe.csv --ring faw -o out": "pipe.csv: not a regular file, but a log is read more than once; needed is a log",
@@ -114,7 +114,7 @@ sys.exit(main({arguments}))
 
 
 def parts_of(path, tmp_path):
-    shards = split_input(*find_inputs([path]), staging=tmp_path / "copies", sensors=RING.count, scans=4)
+    shards = split_input(*find_inputs([path]), staging=tmp_path / "copies", ring=RING, scans=4)
     assert {one.format for one in shards} == {"parquet"}
     assert sum(one.chunk.scans for one in shards) == len(load_log(shards[0].filename))
     return load_log(shards[0].filename)
@@ -146,68 +146,33 @@ def test_a_raw_recording_gives_the_sent_log(tmp_path):
     np.testing.assert_allclose(read.pose, log.pose)
 
 
-@pytest.fixture(params=["ros1", "ros2"])
-def bag(request, tmp_path):
-    """Two scans of three sensors at two poses; one measurement has no echo."""
-    pytest.importorskip("rosbags")
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import Writer as Writer2
-    from rosbags.typesys import Stores, get_typestore
-
-    one = request.param == "ros1"
-    store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
-    types = store.types
-
-    def header(seconds, frame):
-        stamp = types["builtin_interfaces/msg/Time"](seconds, 500_000_000)
-        values = {"stamp": stamp, "frame_id": frame} | ({"seq": 0} if one else {})
-        return types["std_msgs/msg/Header"](**values)
-
-    def odometry(seconds, x, theta):
-        point = types["geometry_msgs/msg/Point"](x, 0.0, 0.0)
-        turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2))
-        pose = types["geometry_msgs/msg/PoseWithCovariance"](types["geometry_msgs/msg/Pose"](point, turn), np.zeros(36))
-        zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-        twist = types["geometry_msgs/msg/TwistWithCovariance"](
-            types["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36)
-        )
-        return types["nav_msgs/msg/Odometry"](header(seconds, "odom"), "base", pose, twist)
-
-    def heard(seconds, sensor, value):
-        return types["sensor_msgs/msg/Range"](header(seconds, f"sonar_{sensor}"), 0, 0.5, 0.1, 4.0, value)
-
-    messages = [("/odom", odometry(0, 1.0, 0.5))]
-    messages += [("/sonar", heard(1, sensor, 1.0 + 0.25 * sensor)) for sensor in (0, 1, 2)]
-    messages += [("/odom", odometry(2, 2.0, -0.5)), ("/sonar", heard(3, 2, 4.0)), ("/sonar", heard(3, 0, 0.5))]
-    path = tmp_path / ("log.bag" if one else "log")
-    with Writer1(path) if one else Writer2(path, version=9) as writer:
-        known = {}
-        for k, (topic, message) in enumerate(messages):
-            name = type(message).__msgtype__
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, name, typestore=store)
-            data = store.serialize_ros1(message, name) if one else store.serialize_cdr(message, name)
-            writer.write(known[topic], k * 1_000_000_000, data)
-    return path
-
-
 @pytest.mark.slow
-def test_a_bag_gives_scans_of_direct_echoes(bag, tmp_path):
-    log = parts_of(bag, tmp_path)
-    assert log.tx.tolist() == log.rx.tolist() == [0, 1, 2, 0]
-    assert log.start.tolist() == [0, 3, 4]
-    assert log.range.tolist() == [1.0, 1.25, 1.5, 0.5]
-    assert log.stamp.tolist() == [1.5, 3.5]
-    np.testing.assert_allclose(log.pose, [[1.0, 0.0, 0.5], [2.0, 0.0, -0.5]])
-    alone = Log.from_scans(list(read_bag_scans(next(bag.glob("*.db3")) if bag.is_dir() else bag, name="log")))
-    assert alone == log
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+def test_a_bag_gives_the_lines_of_the_lines_command(tmp_path, kind, capsys):
+    """The robot turns while its sensors fire one after another; the shards begin and end anywhere."""
+    pytest.importorskip("rosbags")
+    bag, ring_file = spinning_bag(tmp_path / "run", kind)
+    assert call("lines", bag, "--ring", ring_file, "-o", tmp_path / "lines.jsonl") == 0
+    models = [json.loads(line) for line in (tmp_path / "lines.jsonl").read_text().splitlines()]
+    options = {"workers": 1, "shard_scans": 7}
+    report = batch([bag], load_ring(ring_file), tmp_path / "out", **options)
+    assert report.scans == len(models) > 14
+    found = pq.read_table(tmp_path / "out" / "lines").to_pylist()
+    wanted = [(model["scan"], *(line[key] for key in ("rho", "theta"))) for model in models for line in model["lines"]]
+    assert len(wanted) > len(models)
+    assert [row["scan"] for row in found] == [scan for scan, _, _ in wanted]
+    np.testing.assert_allclose([(row["rho"], row["theta"]) for row in found], [one[1:] for one in wanted], atol=1e-4)
+    capsys.readouterr()
+    arguments = ["--ring", ring_file, "-o", tmp_path / "cli", "--workers", 1, "--method", "hough"]
+    assert call("batch", bag, *arguments) == 0
+    assert f"{bag.name}: odometry: /odom" in capsys.readouterr().err
 
 
 def test_an_invalid_bag_is_answered_in_one_line(tmp_path):
     pytest.importorskip("rosbags")
     for name in ("x.bag", "x.db3", "x.mcap"):
         (tmp_path / name).write_bytes(b"#ROSBAG V2.0\nrubbish")
-        with pytest.raises(ValueError, match=rf"^{name}: [^\n]+; needed is a whole bag$"):
+        with pytest.raises(ValueError, match=rf"{name}: [^\n]+; (needed|allowed) is "):
             parts_of(tmp_path / name, tmp_path)
 
 
