@@ -86,27 +86,34 @@ def unique_readings(log: Log) -> Log:
     The paths of removed readings count as not measured. Therefore the result is explicit: it holds a row without a
     range for every other path that a scan measured and that heard nothing.
     """
-    repeated = is_repeated(log)
-    if not repeated.any():
+    if not is_repeated(log).any():
         return log
-    scan, tx, rx = log.echo_scan, log.tx, log.rx
-    columns = {name: getattr(log, name)[~repeated] for name in ("tx", "rx", "range", "amplitude", "t", "age")}
-    rows = scan[~repeated]
-    if len(log.asked):
-        # Of the pairs that every scan measured, those without any reading were silent.
-        code = _pair_codes(scan, tx, rx)
-        asked_scan = np.repeat(np.arange(len(log)), len(log.asked))
-        asked_tx, asked_rx = np.tile(log.asked, (len(log), 1)).T
-        silent = ~np.isin(_pair_codes(asked_scan, asked_tx, asked_rx), code)
-        nothing = np.full(int(silent.sum()), np.nan)
-        added = {"tx": asked_tx[silent], "rx": asked_rx[silent], "range": nothing, "amplitude": nothing}
-        added |= {"t": np.zeros(len(nothing)), "age": np.zeros(len(nothing))}
-        columns = {name: np.concatenate([column, added[name]]) for name, column in columns.items()}
-        rows = np.concatenate([rows, asked_scan[silent]])
-        order = np.argsort(rows, kind="stable")
-        rows, columns = rows[order], {name: column[order] for name, column in columns.items()}
-    start = np.searchsorted(rows, np.arange(len(log) + 1))
+    log = explicit_log(log)
+    return without_readings(log, is_repeated(log))
+
+
+def explicit_log(log: Log) -> Log:
+    """The log with a silent reading for each path that a scan measured (``Log.asked``) and has no reading of."""
+    if not len(log.asked):
+        return log
+    scan = np.repeat(np.arange(len(log)), len(log.asked))
+    tx, rx = np.tile(log.asked, (len(log), 1)).T
+    sensors = int(max(log.tx.max(initial=0), log.rx.max(initial=0), log.asked.max())) + 1
+    silent = ~np.isin(_pair_codes(scan, tx, rx, sensors), _pair_codes(log.echo_scan, log.tx, log.rx, sensors))
+    nothing, zero = np.full(int(silent.sum()), np.nan), np.zeros(int(silent.sum()))
+    added = {"tx": tx[silent], "rx": rx[silent], "range": nothing, "amplitude": nothing, "t": zero, "age": zero}
+    rows = np.concatenate([log.echo_scan, scan[silent]])
+    order = np.argsort(rows, kind="stable")
+    columns = {name: np.concatenate([getattr(log, name), column])[order] for name, column in added.items()}
+    start = np.searchsorted(rows[order], np.arange(len(log) + 1))
     return replace(log, start=start, **columns, asked=np.zeros((0, 2), np.int64))
+
+
+def without_readings(log: Log, removed: Bool[np.ndarray, " readings"]) -> Log:
+    """The log without some readings; what its scans measured stays as it is (``Log.asked``)."""
+    start = np.searchsorted(log.echo_scan[~removed], np.arange(len(log) + 1))
+    columns = {name: getattr(log, name)[~removed] for name in ("tx", "rx", "range", "amplitude", "t", "age")}
+    return replace(log, start=start, **columns)
 
 
 def full_wall_paths(
@@ -142,7 +149,7 @@ def equivalent_scans(
         ring: the sensors.
         counts: number of measurements of each path, in the scan or window of each row.
     """
-    whole = full_wall_paths(ring, np.ones((1, len(ring.paths))))
+    whole = np.maximum(full_wall_paths(ring, np.ones((1, len(ring.paths)))), 1)
     if counts.dtype == bool and len(counts) > 1:  # few rows are distinct
         packed = np.packbits(counts, axis=1)
         _, first, row = np.unique(packed.view(f"V{packed.shape[1]}"), return_index=True, return_inverse=True)
@@ -163,8 +170,7 @@ def _path_rows(
 
 
 def _pair_codes(
-    scan: Int[np.ndarray, " rows"], tx: Int[np.ndarray, " rows"], rx: Int[np.ndarray, " rows"]
+    scan: Int[np.ndarray, " rows"], tx: Int[np.ndarray, " rows"], rx: Int[np.ndarray, " rows"], sensors: int
 ) -> Int[np.ndarray, " rows"]:
     """One number for each scan and pair of sensors."""
-    sensors = int(max(tx.max(initial=0), rx.max(initial=0))) + 1
     return (scan * sensors + tx) * sensors + rx

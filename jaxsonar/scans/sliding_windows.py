@@ -1,17 +1,22 @@
 """Sliding windows along the trajectory: the echoes of several scans in one frame, for rings with few sensors."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.geometry.se2 import relative, wrap_angle
+from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.flat_echoes import FlatEchoes
+from jaxsonar.scans.measured_paths import SETTINGS as AGES
+from jaxsonar.scans.measured_paths import equivalent_scans, measurement_times
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
+Pair = tuple[int, int]
+"""Transmitter and receiver."""
 Reading = tuple[int, int, float]
 """Transmitter, receiver and reported range (metres) of an echo."""
 
@@ -37,6 +42,8 @@ class WindowSettings:
 
 
 SETTINGS = WindowSettings()
+_NOTHING = -1.0
+"""Stands for the range of a path that heard nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +68,9 @@ class Windows:
 def gather_windows(ring: Ring, log: Log, *, length: float) -> tuple[Windows, int]:
     """Gather the echoes of a log over windows of its trajectory, each echo with the pose at which it was received.
 
-    Three things are omitted: readings that were not renewed (``is_fresh_reading``), because they belong to an earlier
-    pose; scans of a robot at rest (``has_moved``); and scans without a pose. Windows end at scans without a pose.
+    Three things are omitted: readings that were not renewed, because they belong to an earlier pose; measurements of a
+    path that the robot has measured before at the same place (``has_moved``); and scans without a pose. Windows end at
+    scans without a pose.
 
     Args:
         ring: the sensors.
@@ -77,31 +85,63 @@ def gather_windows(ring: Ring, log: Log, *, length: float) -> tuple[Windows, int
     """
     check_window(length)
     flat, left_out = FlatEchoes.from_log(ring, log)
-    used = is_fresh_reading(flat) & has_moved(log.pose)[flat.scan]
-    return _build_windows(flat, log.pose, used, *_window_bounds(log.pose, length), length=length), left_out
+    if _lists_measurements(log):
+        new = _first_at_place(_measured(ring, flat), log.pose)
+        used = new[flat.scan, flat.path]
+    else:
+        new = None
+        used = is_fresh_reading(flat) & has_moved(log.pose)[flat.scan]
+    ever = _measured(ring, flat).any(axis=0)
+    begin, last = _window_bounds(log.pose, length)
+    return _build_windows(ring, flat, log.pose, used, new, ever, begin, last, length=length), left_out
+
+
+class Measurement(NamedTuple):
+    """The latest measurement of a pair of sensors."""
+
+    time: float
+    """Seconds."""
+    ranges: frozenset[float]
+    """Reported ranges, metres; ``_NOTHING`` if nothing was heard."""
+    place: int
+    """Number of the place of the robot (``has_moved``); -1 before a scan without a pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class WindowBuffer:
-    """The scans of the last window length, for building windows scan by scan. The result equals ``gather_windows``."""
+    """The scans of the last window length, for building windows scan by scan.
+
+    The result equals ``gather_windows``. Only the poses of readings with times or ages of their own are extrapolated
+    at the ends of a window, unless the scans have ``Scan.odometry``.
+    """
 
     scans: tuple[Scan, ...] = ()
     """Scans with poses, one window length of them."""
     travelled: tuple[float, ...] = ()
     """Length of the trajectory up to each of them, metres."""
     fresh: tuple[frozenset[Reading], ...] = ()
-    """The fresh readings of each scan."""
+    """The readings of each scan that count, if the log does not list its measurements (``_lists_measurements``)."""
+    new: tuple[frozenset[Pair], ...] = ()
+    """The pairs of each scan whose measurement counts, if the log lists its measurements."""
     runs: Mapping[Reading, int] = field(default_factory=dict)
     """Number of earlier consecutive scans that contain each reading of the latest scan."""
     place: float = 0.0
     """Cumulative motion in units of one place (``has_moved``)."""
+    latest: Mapping[Pair, Measurement] = field(default_factory=dict)
+    """The latest measurement of each pair, if the log lists its measurements."""
+    has_ages: bool = False
+    """Whether any reading so far had an age."""
 
     def add(self, scan: Scan, *, length: float) -> tuple["WindowBuffer", bool]:
         """The buffer with one more scan, and whether a window ends there. A scan without a pose empties the buffer."""
-        readings = [*zip(scan.tx.tolist(), scan.rx.tolist(), scan.range.tolist(), strict=True)]
+        log = scan.as_log()
+        has_ages = self.has_ages or bool(log.age.any())
+        heard = np.isfinite(log.range)
+        readings = [*zip(*(column[heard].tolist() for column in (log.tx, log.rx, log.range)), strict=True)]
         runs = {reading: self.runs.get(reading, -1) + 1 for reading in readings}
         if not np.isfinite(scan.pose).all():
-            return WindowBuffer(runs=runs, place=self.place), False
+            latest = {pair: one._replace(place=-1) for pair, one in self.latest.items()}
+            return WindowBuffer(runs=runs, place=self.place, latest=latest, has_ages=has_ages), False
         travelled, place, at_rest = 0.0, self.place, False
         if self.scans:
             step = scan.pose - self.scans[-1].pose
@@ -109,54 +149,160 @@ class WindowBuffer:
             travelled = self.travelled[-1] + distance
             place += distance / SETTINGS.place_distance + abs(float(wrap_angle(step[2]))) / SETTINGS.place_rotation
             at_rest = np.floor(place) == np.floor(self.place)
-        fresh = (
-            frozenset() if at_rest else frozenset(r for r, run in runs.items() if run % SETTINGS.renewal_period == 0)
-        )
+        fresh, new, latest = frozenset(), frozenset(), self.latest
+        if has_ages or not len(log.asked):
+            new, latest = _new_measurements(log, self.latest, int(np.floor(place)))
+        elif not at_rest:
+            fresh = frozenset(r for r, run in runs.items() if run % SETTINGS.renewal_period == 0)
         begin = int(np.searchsorted([*self.travelled, travelled], travelled - length))
         spacing = length / SETTINGS.overlap
         ends = bool(self.scans) and travelled // spacing > self.travelled[-1] // spacing
-        buffer = WindowBuffer(
-            (*self.scans, scan)[begin:], (*self.travelled, travelled)[begin:], (*self.fresh, fresh)[begin:], runs, place
-        )
-        return buffer, ends
+        kept = [
+            (*before, one)[begin:]
+            for before, one in (
+                (self.scans, scan),
+                (self.travelled, travelled),
+                (self.fresh, fresh),
+                (self.new, new),
+            )
+        ]
+        return WindowBuffer(*kept, runs, place, latest, has_ages), ends
 
     def window(self, ring: Ring, *, length: float) -> tuple[Log, Windows]:
         """The window that ends at the latest scan, and the log to which its rows refer."""
         log = Log.from_scans(self.scans)
         flat, _ = FlatEchoes.from_log(ring, log)
-        is_path = ring.path_index[log.tx, log.rx] >= 0
-        columns = (log.echo_scan[is_path], log.tx[is_path], log.rx[is_path], log.range[is_path])
-        rows = zip(*(column.tolist() for column in columns), strict=True)
-        used = np.array([(tx, rx, distance) in self.fresh[scan] for scan, tx, rx, distance in rows], dtype=bool)
+        ever = _measured(ring, flat).any(axis=0)
+        new = None
+        if self.has_ages or not len(log.asked):
+            new = np.zeros((len(log), len(ring.paths)), bool)
+            for row, pairs in enumerate(self.new):
+                new[row, _rows_of_paths(ring, pairs)] = True
+            used = new[flat.scan, flat.path]
+            ever[_rows_of_paths(ring, self.latest)] = True
+        else:
+            columns = (flat.scan, *ring.paths[flat.path].T, flat.reported)
+            rows = zip(*(column.tolist() for column in columns), strict=True)
+            used = np.array([(tx, rx, distance) in self.fresh[scan] for scan, tx, rx, distance in rows], dtype=bool)
         begin, last = np.zeros(1, np.int64), np.array([len(log) - 1])
-        return log, _build_windows(flat, log.pose, used, begin, last, length=length)
+        return log, _build_windows(ring, flat, log.pose, used, new, ever, begin, last, length=length)
 
 
 def _build_windows(
+    ring: Ring,
     flat: FlatEchoes,
     pose: Float[np.ndarray, "scans 3"],
     used: Bool[np.ndarray, " echoes"],
+    new: Bool[np.ndarray, "scans paths"] | None,
+    ever: Bool[np.ndarray, " paths"],
     begin: Int[np.ndarray, " windows"],
     last: Int[np.ndarray, " windows"],
     *,
     length: float,
 ) -> Windows:
-    """The used echoes of the scans from ``begin`` to ``last`` of each window, in the frame of its last scan."""
+    """The used echoes of the scans from ``begin`` to ``last`` of each window, in the frame of its last scan.
+
+    Args:
+        ring: the sensors.
+        flat: the echoes of the scans.
+        pose: world_from_robot of the scans.
+        used: the echoes that count.
+        new: the measurements that count; if None, a scan counts by its fraction of used echoes.
+        ever: the paths that were measured in any scan of the log.
+        begin: first scan of each window.
+        last: last scan of each window.
+        length: length of the windows, metres.
+    """
     first_echo = flat.start[begin]
     counts = flat.start[last + 1] - first_echo
     echo = np.repeat(first_echo - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
     window = np.repeat(np.arange(len(last)), counts)
     kept = used[echo]
     echo, window = echo[kept], window[kept]
-    poses = relative(pose[last][window], pose[flat.scan[echo]])
-    # The occupancy threshold scales with the number of scans; a scan counts by its fraction of used readings.
-    fraction = np.bincount(flat.scan[used], minlength=len(pose)) / np.maximum(np.diff(flat.start), 1)
-    total = np.append(0, np.cumsum(fraction))
-    scans_per_window = np.maximum(total[last + 1] - total[begin], 1)
+    received_at = pose[flat.scan[echo]]
+    if flat.echo_pose is not None:
+        received_at = compose(received_at, flat.echo_pose[echo])
+    # The occupancy threshold scales with the measurements of a window, at least with those of one scan.
+    one_scan = equivalent_scans(ring, ever[None])
+    if new is None:
+        fraction = np.bincount(flat.scan[used], minlength=len(pose)) / np.maximum(np.diff(flat.start), 1)
+        total = np.append(0, np.cumsum(fraction))
+        scans_per_window = np.maximum(total[last + 1] - total[begin], 1) * one_scan
+    else:
+        measurements = np.zeros((len(last), len(ever)))
+        total = np.pad(np.cumsum(new[:, ever], axis=0, dtype=np.int32), ((1, 0), (0, 0)))
+        measurements[:, ever] = total[last + 1] - total[begin]
+        scans_per_window = np.maximum(equivalent_scans(ring, measurements), one_scan)
     echoes = FlatEchoes(
-        len(last), window, flat.path[echo], flat.reported[echo], pose=poses, scans_per_window=scans_per_window
+        len(last),
+        window,
+        flat.path[echo],
+        flat.reported[echo],
+        pose=relative(pose[last][window], received_at),
+        scans_per_window=scans_per_window,
     )
     return Windows(last, echoes, flat.scan[echo], gap=max(SETTINGS.min_gap, length / 4))
+
+
+def _lists_measurements(log: Log) -> bool:
+    """Whether a log tells which readings are measurements.
+
+    It does if it holds a reading of all that was measured (``Log.asked`` is empty), or if its readings have ages. In
+    other logs, readings that were not renewed can only be guessed (``is_fresh_reading``).
+    """
+    return not len(log.asked) or bool(log.age.any())
+
+
+def _measured(ring: Ring, flat: FlatEchoes) -> Bool[np.ndarray, "scans paths"]:
+    if flat.measured is not None:
+        return flat.measured
+    return np.broadcast_to(np.ones(len(ring.paths), bool), (flat.scan_count, len(ring.paths)))
+
+
+def _first_at_place(
+    measured: Bool[np.ndarray, "scans paths"], pose: Float[np.ndarray, "scans 3"]
+) -> Bool[np.ndarray, "scans paths"]:
+    """The measurements of paths that were not measured before at the same place; none of scans without a pose."""
+    new = measured & np.isfinite(pose).all(axis=1)[:, None]
+    ever = np.flatnonzero(new.any(axis=0))
+    here = new[:, ever]
+    times = np.cumsum(here, axis=0, dtype=np.int32)
+    arrival = np.maximum.accumulate(np.where(has_moved(pose), np.arange(len(pose)), 0))
+    new[:, ever] &= times - (times - here)[arrival] == 1
+    return new
+
+
+def _new_measurements(
+    log: Log, latest: Mapping[Pair, Measurement], place: int
+) -> tuple[frozenset[Pair], dict[Pair, Measurement]]:
+    """The pairs of a log of one scan whose measurement counts, and the latest measurements with those of this scan.
+
+    Args:
+        log: the scan.
+        latest: the latest measurement of each pair before it.
+        place: the place of the robot.
+    """
+    columns = (log.tx, log.rx, log.range, measurement_times(log), log.age)
+    measured: dict[Pair, tuple[float, set[float]]] = {}
+    read: set[Pair] = set()
+    for tx, rx, reported, time, age in zip(*(column.tolist() for column in columns), strict=True):
+        before, heard = latest.get((tx, rx)), reported if np.isfinite(reported) else _NOTHING
+        read.add((tx, rx))
+        repeated = before is not None and age > 0 and heard in before.ranges
+        if not (repeated and abs(time - before.time) < AGES.same_measurement):
+            measured.setdefault((tx, rx), (time, set()))[1].add(heard)
+    silent = {(tx, rx) for tx, rx in log.asked.tolist()} - read
+    measured |= {pair: (float(log.stamp[0]), {_NOTHING}) for pair in silent}
+    new = frozenset(pair for pair in measured if pair not in latest or latest[pair].place != place)
+    now = {pair: Measurement(time, frozenset(ranges), place) for pair, (time, ranges) in measured.items()}
+    return new, {**latest, **now}
+
+
+def _rows_of_paths(ring: Ring, pairs: Iterable[Pair]) -> Int[np.ndarray, " rows"]:
+    """Rows of ``Ring.paths``; other pairs are omitted."""
+    tx, rx = np.array([*pairs], np.int64).reshape(-1, 2).T
+    rows = ring.path_index[tx, rx]
+    return rows[rows >= 0]
 
 
 def check_window(length: float | None) -> None:
