@@ -109,7 +109,7 @@ class Odometry:
     @classmethod
     def of(
         cls, time: Float[np.ndarray, " messages"], pose: Float[np.ndarray, "messages 3"], note: Callable[[str], None]
-    ):
+    ) -> "Odometry":
         """Odometry from messages in any order. Those without a finite pose are left out.
 
         Args:

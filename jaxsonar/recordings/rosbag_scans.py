@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.recordings.rosbag_odometry import Odometry
-from jaxsonar.scans.firing_poses import SETTINGS
 from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.single_firings import SETTINGS
 
 
 def log_from_readings(
@@ -18,7 +18,7 @@ def log_from_readings(
 ) -> Log:
     """An explicit log of direct readings.
 
-    A scan ends before the second reading of a sensor, after ``FiringSettings.max_scan_duration``, and where the
+    A scan ends before the second reading of a sensor, after ``SingleFiringSettings.max_scan_duration``, and where the
     odometry has a gap or jumps. Its stamp is the time of its first reading, and its pose is interpolated there.
 
     Args:

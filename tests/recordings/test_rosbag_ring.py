@@ -1,0 +1,80 @@
+"""Rings from the transforms and messages of a bag."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from support.bags import KINDS, BagMessages
+from support.rings import bumper_ring
+
+from jaxsonar.geometry.se2 import compose, inverse
+from jaxsonar.hardware.errors import SonarError
+from jaxsonar.recordings.input_options import InputOptions
+from jaxsonar.recordings.rosbag_log import read_bag, ring_from_bag
+
+pytest.importorskip("rosbags")
+
+RING = dataclasses.replace(bumper_ring(calibrated=False), neighbors=0)
+NAMES = [f"us_{chr(ord('a') + k)}" for k in range(RING.count)]
+
+
+def described(kind="sqlite", names=NAMES, *, quaternion=None, view=None):
+    """A bag that describes a ring: sensors on a mount that is turned and moved against the robot."""
+    bag = BagMessages(kind)
+    mount = np.array([0.2, 0.1, 0.7])
+    bag.transform(0.0, "base_link", "mount", mount)
+    for k, name in enumerate(names):
+        pose = np.array([*RING.position[k], RING.heading[k]])
+        bag.transform(0.0, "mount", name, compose(inverse(mount), pose), quaternion=quaternion)
+        beam = float(RING.beam[k]) if view is None else view
+        bag.range(0.1 * k, 1.0 + 0.25 * k, frame=name, view=beam, limits=(0.02, RING.max_range))
+    bag.odometry(0.0, (0.0, 0.0, 0.0))
+    return bag
+
+
+def assert_same_ring(ring, order=slice(None)):
+    np.testing.assert_allclose(ring.position, np.asarray(RING.position)[order], atol=2e-6)
+    np.testing.assert_allclose(np.exp(1j * ring.heading), np.exp(1j * np.asarray(RING.heading)[order]), atol=1e-8)
+    np.testing.assert_allclose(ring.beam, np.asarray(RING.beam)[order], atol=1e-6)
+    assert ring.max_range == RING.max_range
+    assert ring.neighbors == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_transforms_and_fields_of_view_give_the_ring(tmp_path, kind):
+    names = [f"us_{k + 1}" for k in range(RING.count)]
+    path = described(kind, names).write(tmp_path / "run")
+    ring = ring_from_bag(path)
+    assert_same_ring(ring)
+    assert ring.names == tuple(names)
+    log = read_bag(path, ring=ring)  # numbers from 1 are no question with this ring
+    assert log.tx.tolist() == list(range(RING.count))
+    np.testing.assert_allclose(log.range, 1.0 + 0.25 * np.arange(RING.count))
+
+
+def test_sensors_without_numbers_are_sorted_by_heading_or_by_option(tmp_path):
+    path = described().write(tmp_path / "run")
+    order = np.argsort(np.mod(np.asarray(RING.heading) + 1e-6, 2 * np.pi))
+    ring = ring_from_bag(path)
+    assert_same_ring(ring, order)
+    assert ring.names == tuple(np.array(NAMES)[order])
+    given = {name: k for k, name in enumerate(NAMES[::-1])}
+    assert_same_ring(ring_from_bag(path, options=InputOptions(sensors=given)), slice(None, None, -1))
+
+
+def test_what_a_ring_needs(tmp_path):
+    path = described(view=0.0).write(tmp_path / "view")
+    with pytest.raises(SonarError, match="field_of_view is 0; needed for a ring are radians above 0"):
+        ring_from_bag(path)
+    up = (0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5))
+    with pytest.raises(SonarError, match="the x axis of frame 'us_a' points up or down"):
+        ring_from_bag(described(quaternion=up).write(tmp_path / "up"))
+    bag = BagMessages()
+    bag.range(0.0, 1.0, frame="us_0")
+    with pytest.raises(SonarError, match="no robot frame base_link came; no transforms came"):
+        ring_from_bag(bag.write(tmp_path / "none"))
+    bag.transform(0.0, "base_link", "laser", (0, 0, 0))
+    with pytest.raises(
+        SonarError, match=r"frame 'us_0' of /us_0 is not connected to 'base_link'.* base_link, laser came"
+    ):
+        ring_from_bag(bag.write(tmp_path / "other"))
