@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxsonar.scans.measured_paths import explicit_log, without_readings
 from jaxsonar.scans.scan_log import Log
 
 
@@ -141,30 +142,15 @@ def without_no_echo_values(log: Log, values: Sequence[NoEchoValue | float]) -> L
         marked |= _has_value(log.range, mark)
     if not marked.any():
         return log
-    scan = log.echo_scan
-    code = _codes(scan, log.tx, log.rx)
     # A path with another reading in the scan did hear something; of several marked readings, one stays as silence.
-    first = np.zeros(len(marked), bool)
-    first[np.flatnonzero(marked)[np.unique(code[marked], return_index=True)[1]]] = True
-    kept = ~marked | (first & ~np.isin(code, code[~marked]))
-    columns = {name: getattr(log, name)[kept].copy() for name in ("tx", "rx", "range", "amplitude", "t", "age")}
-    silent = marked[kept]
-    columns["range"][silent] = columns["amplitude"][silent] = np.nan
-    rows = scan[kept]
-    if len(log.asked):
-        asked_scan = np.repeat(np.arange(len(log)), len(log.asked))
-        asked_tx, asked_rx = np.tile(log.asked, (len(log), 1)).T
-        sensors = int(max(log.tx.max(initial=0), log.rx.max(initial=0), log.asked.max(initial=0))) + 1
-        absent = ~np.isin(_codes(asked_scan, asked_tx, asked_rx, sensors), _codes(scan, log.tx, log.rx, sensors))
-        nothing, zero = np.full(int(absent.sum()), np.nan), np.zeros(int(absent.sum()))
-        added = {"tx": asked_tx[absent], "rx": asked_rx[absent], "range": nothing, "amplitude": nothing}
-        added |= {"t": zero, "age": zero}
-        columns = {name: np.concatenate([column, added[name]]) for name, column in columns.items()}
-        rows = np.concatenate([rows, asked_scan[absent]])
-        order = np.argsort(rows, kind="stable")
-        rows, columns = rows[order], {name: column[order] for name, column in columns.items()}
-    start = np.searchsorted(rows, np.arange(len(log) + 1))
-    return replace(log, start=start, **columns, asked=np.zeros((0, 2), np.int64))
+    sensors = int(max(log.tx.max(), log.rx.max())) + 1
+    path = (log.echo_scan * sensors + log.tx) * sensors + log.rx
+    stays = np.zeros(len(marked), bool)
+    stays[np.flatnonzero(marked)[np.unique(path[marked], return_index=True)[1]]] = True
+    stays &= ~np.isin(path, path[~marked])
+    log, marked = without_readings(log, marked & ~stays), stays[~marked | stays]
+    silent = {name: np.where(marked, np.nan, getattr(log, name)) for name in ("range", "amplitude")}
+    return explicit_log(replace(log, **silent))
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,14 +312,3 @@ def _mode(reported: Float[np.ndarray, " echoes"], sigma: float) -> float:
 
 def _has_value(reported: Float[np.ndarray, " readings"], value: NoEchoValue) -> Bool[np.ndarray, " readings"]:
     return np.abs(reported - value.value) <= value.half_width  # False for NaN
-
-
-def _codes(
-    scan: Int[np.ndarray, " rows"],
-    tx: Int[np.ndarray, " rows"],
-    rx: Int[np.ndarray, " rows"],
-    sensors: int | None = None,
-) -> Int[np.ndarray, " rows"]:
-    """One number for each scan and pair of sensors."""
-    sensors = int(max(tx.max(initial=0), rx.max(initial=0))) + 1 if sensors is None else sensors
-    return (scan * sensors + tx) * sensors + rx
