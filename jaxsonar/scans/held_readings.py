@@ -43,7 +43,7 @@ class HeldReadingSettings:
     """Different runs of equal readings that they come from."""
     contrast: float = 8.0
     """A fresh reading equals an old one by chance as often as it differs by one step of the resolution. There must be
-    this many times as many equal readings."""
+    this many times as many runs of equal readings."""
     most_of_one_value: float = 0.3
     """Largest share of the runs that have the same range; more of them are a mark for no echo, or the robot itself."""
     renewal_quantile: float = 0.1
@@ -78,11 +78,11 @@ class HeldReadings:
 
     def describe(self) -> str:
         """The finding in one sentence."""
-        named = ", ".join(map(str, self.sensors))
+        count = len(self.sensors)
+        who = f"{count} sensors" if count > 4 else f"sensor{'s' * (count > 1)} {', '.join(map(str, self.sensors))}"
         return (
             f"the driver repeats the last range of a sensor that hears nothing: {len(self.reading)} readings "
-            f"({self.share:.0%}) of sensor{'s' * (len(self.sensors) > 1)} {named} stay equal to the last digit while "
-            "the robot moves"
+            f"({self.share:.0%}) of {who} stay equal to the last digit while the robot moves"
         )
 
 
@@ -109,34 +109,36 @@ def find_held_readings(ring: Ring, log: Log) -> HeldReadings:
     path, scan, reported = ring.path_index[log.tx[row], log.rx[row]], log.echo_scan[row], log.range[row]
     follows = np.append(False, (np.diff(path) == 0) & (np.diff(scan) == 1))
     equal = follows & np.append(False, np.diff(reported) == 0)
-    # The first reading of the run of equal readings of each reading, and of the run that ends just before it.
-    first = np.maximum.accumulate(np.where(equal, 0, np.arange(len(row))))
-    before = np.append(0, first[:-1])
+    # Runs of equal readings: the first and the last reading of the run of each one, and the first of the run before it.
+    number, starts = np.cumsum(~equal) - 1, np.flatnonzero(~equal)
+    first, length = starts[number], np.diff(np.append(starts, len(row)))
+    last, before = first + length[number] - 1, np.append(0, first[:-1])
     resolution = _resolution(reported)
     near = follows & ~equal & (np.abs(reported - reported[before]) <= SETTINGS.steps * resolution)
-    # Compare equal and nearly equal readings with the motion of the robot.
+    # Did the robot move too far for an equal reading, or for the end of a run that is nearly equal to the run before?
     changes = np.bincount(scan[follows & ~equal], minlength=len(log))
     moving = changes >= SETTINGS.min_changed * np.maximum(np.bincount(scan[follows], minlength=len(log)), 1)
     compared = np.flatnonzero((equal | near) & moving[scan])
     margin = SETTINGS.min_change + SETTINGS.steps * resolution
     pose, moved = reading_poses(log)[row], np.zeros(len(row), bool)
     for begin in range(0, len(compared), SETTINGS.block):
-        late = compared[begin : begin + SETTINGS.block]
-        moved[late] = ~_may_stay(ring, path[late], reported[late], pose[before[late]], pose[late], margin)
-    # A slow sensor is read several times; only longer runs are held.
-    starts = np.flatnonzero(~equal)
-    period = int(np.quantile(np.diff(np.append(starts, len(row))), SETTINGS.renewal_quantile))
+        one = compared[begin : begin + SETTINGS.block]
+        early, late = np.where(equal[one], first[one], before[one]), np.where(equal[one], one, last[one])
+        moved[one] = ~_may_stay(ring, path[one], reported[early], pose[early], pose[late], margin)
+    # A slow sensor is read several times; only longer runs are held. Runs are counted, whatever their length.
+    period = int(np.quantile(length, SETTINGS.renewal_quantile))
     proven = equal & moved & (np.arange(len(row)) - first > period)
-    chance, runs = (near & moved).sum() / (2 * SETTINGS.steps), np.unique(first[proven])
+    runs = np.unique(first[proven])
     most_of_one_value = np.unique(reported[runs], return_counts=True)[1].max(initial=0)
+    by_chance = SETTINGS.contrast / (2 * SETTINGS.steps)
     if (
-        proven.sum() < max(SETTINGS.min_held, SETTINGS.contrast * chance)
-        or len(runs) < SETTINGS.min_runs
+        proven.sum() < SETTINGS.min_held
+        or len(runs) < max(SETTINGS.min_runs, by_chance * (near & moved).sum())
         or most_of_one_value > SETTINGS.most_of_one_value * len(runs)
     ):
         return none
     # With a fine resolution, no fresh reading is equal to an old one. Otherwise only the motion distinguishes them.
-    is_fine = SETTINGS.contrast * near.sum() / (2 * SETTINGS.steps) < equal.sum()
+    is_fine = by_chance * near.sum() < (length > period).sum()
     held = equal if is_fine else equal & _since_first(equal & moved, first)
     sensors = np.unique(log.rx[row[held]])
     return HeldReadings(row[held], row[first[held]], tuple(sensors.tolist()), float(held.sum() / len(log.range)))
