@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-from jaxsonar.scans.firing_poses import group_firings
 from jaxsonar.scans.measured_paths import unique_readings
 from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.single_firings import group_firings
 
 
 def estimation_log(log: Log) -> Log:

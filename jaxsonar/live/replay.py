@@ -14,7 +14,7 @@ from jaxsonar.hardware.recorder import open_recording, playback_speed
 from jaxsonar.hardware.transport_base import OnEvent, Source, Url
 from jaxsonar.recordings.file_content import file_content
 from jaxsonar.recordings.load_log import load_log
-from jaxsonar.scans.firing_poses import group_firings
+from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.device_messages import log_messages
 

@@ -19,8 +19,8 @@ from jaxsonar.mapping.segment_fusion import estimate_systematic_error, fuse_segm
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_endpoints import blocks_gap, detached_points, snap_endpoints, spurious_walls
 from jaxsonar.mapping.wall_segments import WallSegments
-from jaxsonar.scans.firing_poses import group_firings
 from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.sensors.ring import Ring
 
 MERGING_METHODS = ("fused", "paper")

@@ -16,8 +16,8 @@ from jaxsonar.occupancy.inverse_sensor_model import (
 )
 from jaxsonar.occupancy.settings import SETTINGS
 from jaxsonar.occupancy.wall_visibility import WallMap
-from jaxsonar.scans.firing_poses import group_firings
 from jaxsonar.scans.scan_log import Log, Scan
+from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.sensors.ring import Ring
 
 OCCUPIED, UNKNOWN, FREE = 0, 205, 254

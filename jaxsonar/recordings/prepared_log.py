@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-from jaxsonar.scans.firing_poses import group_firings
 from jaxsonar.scans.held_readings import find_held_readings, with_ages
 from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
 from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.scans.unheard_paths import unheard_warning
 from jaxsonar.sensors.ring import Ring
 

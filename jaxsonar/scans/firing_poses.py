@@ -1,9 +1,9 @@
-"""Poses of the robot at the time of each reading, and the grouping of single firings into scans."""
+"""Poses of the robot at the time of each reading."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxsonar.geometry.se2 import compose, interpolate, relative
 from jaxsonar.scans.measured_paths import measurement_times
@@ -17,8 +17,6 @@ class FiringSettings:
 
     max_extrapolation: float = 1.0
     """Largest extrapolation of the motion beyond the first and the last known pose, in intervals between poses."""
-    max_scan_duration: float = 2.0
-    """Longest time between the first and the last firing of a scan that is grouped from single firings, seconds."""
 
 
 SETTINGS = FiringSettings()
@@ -76,55 +74,6 @@ def path_poses_of_scan(ring: Ring, scan: Scan) -> Float[np.ndarray, "paths 3"] |
         return None
     poses = path_poses(ring, scan.as_log())
     return None if poses is None else poses[0]
-
-
-def group_firings(log: Log) -> Log:
-    """Merge firings that are scans of their own into scans in which every transmitter fires once.
-
-    A log whose scans hold several transmitters is returned unchanged. A new scan begins with the second firing of a
-    transmitter, where stamps or poses are missing, and after ``FiringSettings.max_scan_duration``. A scan has the
-    number, stamp and pose of its first firing; ``t`` tells when the others fired, and ``odometry`` keeps all poses.
-    """
-    if len(log) < 2 or len(log.asked):
-        return log
-    counts = np.diff(log.start)
-    scan = log.echo_scan
-    one_transmitter = np.minimum.reduceat(log.tx, log.start[:-1][counts > 0]) if len(log.tx) else log.tx
-    if not (one_transmitter[np.cumsum(counts > 0)[scan] - 1] == log.tx).all() or len(np.unique(one_transmitter)) < 2:
-        return log
-    transmitter = np.full(len(log), -1)
-    transmitter[counts > 0] = one_transmitter
-    group = _groups_of_firings(log, transmitter)
-    first = np.flatnonzero(np.diff(group, prepend=-1))
-    t = log.t + np.where(np.isnan(log.stamp), 0, log.stamp - log.stamp[first[group]])[scan]
-    known = np.isfinite(log.stamp) & np.isfinite(log.pose).all(axis=1)
-    odometry = np.column_stack([log.stamp, log.pose])[known]
-    return replace(
-        log,
-        scan=log.scan[first],
-        stamp=log.stamp[first],
-        pose=log.pose[first],
-        start=np.append(log.start[first], len(log.tx)),
-        t=t,
-        odometry=odometry if log.odometry is None else log.odometry,
-    )
-
-
-def _groups_of_firings(log: Log, transmitter: Int[np.ndarray, " scans"]) -> Int[np.ndarray, " scans"]:
-    """Number of the merged scan of each firing; firings without a reading (-1) join the scan before them."""
-    has_pose = np.all(np.isfinite(log.pose), axis=1)
-    group = np.zeros(len(log), np.int64)
-    fired: set[int] = set()
-    first = current = 0
-    for row, tx in enumerate(transmitter.tolist()):
-        late = log.stamp[row] - log.stamp[first]  # NaN without stamps
-        joins = tx not in fired and has_pose[row] == has_pose[first] and 0 <= late <= SETTINGS.max_scan_duration
-        if row and not joins:
-            current, first, fired = current + 1, row, set()
-        if tx >= 0:
-            fired.add(tx)
-        group[row] = current
-    return group
 
 
 def _known_poses(log: Log) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 3"]]:

@@ -1,0 +1,129 @@
+"""Logs in which every firing is a scan of its own: the order of the transmitters, and the scans that they form."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jaxsonar.scans.scan_log import Log
+
+
+@dataclass(frozen=True)
+class SingleFiringSettings:
+    """Constants of the grouping of single firings. Chosen by hand."""
+
+    max_scan_duration: float = 2.0
+    """Longest time between the first and the last firing of a scan, seconds."""
+    max_period: int = 256
+    """Longest firing order that is looked for, firings."""
+    min_repetitions: float = 3.0
+    """Echoes for each transmitter of a firing order, at least. With fewer, an order may appear by chance."""
+
+
+SETTINGS = SingleFiringSettings()
+
+
+def group_firings(log: Log) -> Log:
+    """Merge firings that are scans of their own into scans in which every transmitter fires once.
+
+    A log whose scans hold several transmitters is returned unchanged. If the log does not list the paths that heard
+    nothing, they are added as far as the transmitter is known: by an echo of the same firing, or by a periodic firing
+    order that all echoes agree with. A new scan begins with the second firing of a transmitter, where stamps or poses
+    are missing, and after ``SingleFiringSettings.max_scan_duration``. A scan has the number, stamp and pose of its
+    first firing; ``t`` is the time of the others, and ``odometry`` keeps all poses.
+    """
+    if len(log) < 2 or len(log.asked):
+        return log
+    transmitter = _transmitters(log)
+    if transmitter is None:
+        return log
+    if not np.isnan(log.range).any():
+        transmitter = _complete_by_order(transmitter)
+        log = _with_silent_paths(log, transmitter)
+    group = _groups(log, transmitter)
+    first, scan = np.flatnonzero(np.diff(group, prepend=-1)), log.echo_scan
+    t = log.t + np.where(np.isnan(log.stamp), 0, log.stamp - log.stamp[first[group]])[scan]
+    known = np.isfinite(log.stamp) & np.isfinite(log.pose).all(axis=1)
+    odometry = np.column_stack([log.stamp, log.pose])[known]
+    return replace(
+        log,
+        scan=log.scan[first],
+        stamp=log.stamp[first],
+        pose=log.pose[first],
+        start=np.append(log.start[first], len(log.tx)),
+        t=t,
+        odometry=odometry if log.odometry is None else log.odometry,
+    )
+
+
+def _transmitters(log: Log) -> Int[np.ndarray, " scans"] | None:
+    """Transmitter of each scan, -1 without a reading; None if a scan has several, or all have the same."""
+    counts = np.diff(log.start)
+    if not counts.any():
+        return None
+    transmitter = np.full(len(log), -1)
+    transmitter[counts > 0] = np.minimum.reduceat(log.tx, log.start[:-1][counts > 0])
+    if (transmitter[log.echo_scan] != log.tx).any() or (log.tx == log.tx[0]).all():
+        return None
+    return transmitter
+
+
+def _complete_by_order(transmitter: Int[np.ndarray, " scans"]) -> Int[np.ndarray, " scans"]:
+    """Transmitters with those of silent firings (-1) by the shortest period that all others agree with, if any."""
+    heard = np.flatnonzero(transmitter >= 0)
+    tx = transmitter[heard]
+    sensors = len(np.unique(tx))
+    if len(tx) < SETTINGS.min_repetitions * sensors:
+        return transmitter
+    for period in range(sensors, min(SETTINGS.max_period, len(transmitter) // 2) + 1):
+        place = heard % period
+        order = np.full(period, -1)
+        order[place] = tx
+        listed = order[order >= 0]
+        if (order[place] == tx).all() and len(np.unique(listed)) == len(listed):
+            return np.where(transmitter >= 0, transmitter, order[np.arange(len(transmitter)) % period])
+    return transmitter
+
+
+def _with_silent_paths(log: Log, transmitter: Int[np.ndarray, " scans"]) -> Log:
+    """The log with a silent reading for every pair that its transmitter reaches anywhere in the log, but not here."""
+    pairs = np.unique(np.stack([log.tx, log.rx], axis=-1), axis=0)
+    first, last = np.searchsorted(pairs[:, 0], transmitter), np.searchsorted(pairs[:, 0], transmitter, side="right")
+    counts = last - first
+    scan = np.repeat(np.arange(len(log)), counts)
+    row = np.repeat(first - np.cumsum(counts) + counts, counts) + np.arange(len(scan))
+    tx, rx = pairs[row].T
+    silent = ~_is_in((scan, rx), (log.echo_scan, log.rx))
+    scan, tx, rx = scan[silent], tx[silent], rx[silent]
+    nothing, zero = np.full(len(scan), np.nan), np.zeros(len(scan))
+    added = {"tx": tx, "rx": rx, "range": nothing, "amplitude": nothing, "t": zero, "age": zero}
+    scan = np.concatenate([log.echo_scan, scan])
+    order = np.argsort(scan, kind="stable")
+    columns = {name: np.concatenate([getattr(log, name), column])[order] for name, column in added.items()}
+    return replace(log, start=np.searchsorted(scan[order], np.arange(len(log) + 1)), **columns)
+
+
+def _is_in(
+    rows: tuple[Int[np.ndarray, " some"], Int[np.ndarray, " some"]],
+    others: tuple[Int[np.ndarray, " others"], Int[np.ndarray, " others"]],
+) -> Bool[np.ndarray, " some"]:
+    """Which pairs of numbers occur among other pairs."""
+    width = int(max(rows[1].max(initial=0), others[1].max(initial=0))) + 1
+    return np.isin(rows[0] * width + rows[1], others[0] * width + others[1])
+
+
+def _groups(log: Log, transmitter: Int[np.ndarray, " scans"]) -> Int[np.ndarray, " scans"]:
+    """Number of the merged scan of each firing; firings of unknown transmitters (-1) join the scan before them."""
+    has_pose = np.all(np.isfinite(log.pose), axis=1)
+    group = np.zeros(len(log), np.int64)
+    fired: set[int] = set()
+    first = current = 0
+    for row, tx in enumerate(transmitter.tolist()):
+        late = log.stamp[row] - log.stamp[first]  # NaN without stamps
+        joins = tx not in fired and has_pose[row] == has_pose[first] and 0 <= late <= SETTINGS.max_scan_duration
+        if row and not joins:
+            current, first, fired = current + 1, row, set()
+        if tx >= 0:
+            fired.add(tx)
+        group[row] = current
+    return group
