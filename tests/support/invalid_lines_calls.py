@@ -14,11 +14,16 @@ INVALID_CALLS = {
     "abbreviated option": ("lines log.csv --rin faw -o out.jsonl", {}, ["--ring"]),
     "unknown method": (f"{LINES} --method best", {}, ["best", "hough"]),
     "missing log": ("lines no.csv --ring faw -o out.jsonl", {}, ["no.csv", "No such file"]),
-    "log that is a directory": ("lines dir.csv --ring faw -o out.jsonl", {"dir.csv": None}, ["dir.csv", "directory"]),
-    "log of unknown suffix": (
+    "log that is a directory": ("lines dir.csv --ring faw -o out.jsonl", {"dir.csv": None}, ["dir.csv", "folder"]),
+    "log of unknown content": (
         "lines log.txt --ring faw -o out.jsonl",
-        {"log.txt": HEADER},
-        [".txt", ".csv", ".parquet"],
+        {"log.txt": "dear diary\n"},
+        ["log.txt", "dear diary", "CSV", "Parquet", "MCAP", "ROS bag", "--from"],
+    ),
+    "log that is another kind of file": (
+        "lines ring.toml --ring faw -o out.jsonl",
+        {"ring.toml": RING},
+        ["ring.toml", "TOML", "CSV"],
     ),
     "log that is no number": (
         "lines bad.csv --ring faw -o out.jsonl",
@@ -30,7 +35,7 @@ INVALID_CALLS = {
         {"bad.csv": HEADER + "0,,,,3,3,1.0\n"},
         ["bad.csv", "row 2", "7 columns", "8"],
     ),
-    "log without a header": ("lines bad.csv --ring faw -o out.jsonl", {"bad.csv": ""}, ["bad.csv", "row 1", "header"]),
+    "log without a header": ("lines bad.csv --ring faw -o out.jsonl", {"bad.csv": ""}, ["bad.csv", "empty file"]),
     "no such ring": ("lines log.csv --ring fawn -o out.jsonl", {}, ["fawn", "faw", "corridor8", "scitos24", "sew-amr"]),
     "ring with an unknown key": (
         "lines log.csv --ring ring.toml -o out.jsonl",
@@ -167,14 +172,19 @@ INVALID_CALLS = {
         ["p.csv", "row 3", "stamp", "no earlier"],
     ),
     "log to an unknown suffix": ("convert log.csv out.txt", {}, ["out.txt", ".txt", ".csv", ".parquet"]),
-    "log from an unknown suffix": (
-        "convert log.dat out.csv",
-        {"log.dat": HEADER},
-        ["log.dat", "scitos24", "corridor8"],
-    ),
-    "log from an unknown format": ("convert log.csv out.csv --from bag", {}, ["bag", "scitos24", "parquet"]),
-    "log from what it is not": ("convert log.csv out.csv --from parquet", {}, ["log.csv", "Parquet"]),
+    "log from an unknown format": ("convert log.csv out.csv --from bags", {}, ["bags", "scitos24", "parquet"]),
+    "log from what it is not": ("convert log.csv out.csv --from parquet", {}, ["log.csv", "CSV", "Parquet"]),
     "recording from what it is not": ("convert log.csv out.csv --from scitos24", {}, ["log.csv"]),
+    "converted log over its input": ("convert log.csv log.csv", {}, ["log.csv", "input", "another file"]),
+    "table without its format": (
+        "lines table.csv --ring faw -o out.jsonl",
+        {"table.csv": "1.0 2.0 3.0\n1.1 2.1 3.1\n"},
+        ["table.csv", "table of numbers", "--from table"],
+    ),
+    "option of a table without one": ("convert log.csv out.csv --unit cm", {}, ["--unit", "--from table"]),
+    "sensor without an index": (f"{LINES} --sensor left", {}, ["left", "NAME=INDEX"]),
+    "sensor with two indices": (f"{LINES} --sensor left=1 --sensor left=2", {}, ["left=2", "left=1"]),
+    "ring from a log": ("convert log.csv out.csv --ring-out r.toml", {}, ["--ring-out", "ROS bag"]),
     "demo into a file": ("demo -o log.csv", {}, ["log.csv", "folder"]),
     "demo of no seed": ("demo -o d --seed x", {}, ["--seed", "x", "whole number"]),
 }
