@@ -37,6 +37,7 @@ class LogSurvey:
         if len(begin):
             tx, rx = text("tx"), text("rx")
             valid = np.char.isdigit(tx) & np.char.isdigit(rx) & (np.char.str_len(tx) < 11) & (np.char.str_len(rx) < 11)
+            valid[valid] = np.maximum(integers_of(tx[valid]), integers_of(rx[valid])) <= LARGEST_SENSOR
             tx, rx = integers_of(tx[valid]), integers_of(rx[valid])
             scan = self._scans - 1 + np.searchsorted(starts, begin[valid, 0], side="right")
             self.asked.add(scan, tx, rx, text("range")[valid] == b"")

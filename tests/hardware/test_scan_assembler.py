@@ -58,9 +58,35 @@ def test_scans_in_order_are_emitted_at_once():
             assert scan.missing == 0
             assert len(scan.echoes) == GROUPS
             assert scan.stamp == pytest.approx(5.0 + scan.scan * GROUPS * PERIOD_US * 1e-6, abs=1e-9)
-            assert scan.pose.tolist() == [scan.scan, GROUPS - 1, 0.1]  # the pose of the last group
+            assert scan.pose.tolist() == [scan.scan, 0, 0.1]  # at the stamp
+            np.testing.assert_allclose(scan.group_time, np.arange(GROUPS) * PERIOD_US * 1e-6, rtol=0, atol=1e-9)
     counts = assembler.counts
     assert (counts.scans, counts.echoes, counts.lost, counts.late, counts.restarts) == (5, 40, 0, 0, 0)
+
+
+def test_a_missing_group_has_no_time_and_no_silent_paths(faw_ring):
+    """Stamp and pose are those of the first group that arrived; its transmitters that heard nothing are silent."""
+    plan = np.array([(group, tx, tx) for group, sensors in enumerate(faw_ring.firing_groups) for tx in sensors])
+    sent = [message for message in device(1) if not (isinstance(message, Group) and message.group in (0, 3))]
+    (scan,), _ = assembled(sent, ScanAssembler(sensors=24, group_paths=plan))
+    assert np.flatnonzero(np.isnan(scan.group_time)).tolist() == [0, 3]
+    assert scan.stamp == 5.0 + PERIOD_US * 1e-6
+    assert scan.pose.tolist() == [0, 1, 0.1]
+    assert scan.group_time[1] == 0.0
+    assert scan.times.tolist() == scan.group_time[scan.group].tolist()
+    arrived = [1, 2, 4, 5, 6, 7]  # each heard the echo of one transmitter, its first one
+    expected = [[group, tx, tx] for group in arrived for tx in faw_ring.firing_groups[group].tolist() if tx != group]
+    assert sorted(scan.silent.tolist()) == sorted(expected)
+
+
+def test_a_transmitter_that_fires_twice_has_one_time():
+    """All echoes of a path in a scan have the time of its transmitter's last firing."""
+    echoes = np.zeros(1, ECHO)
+    echoes["time_us"] = 1000
+    sent = [Group(k, 100 * k, 0, k, 3, float("nan"), echoes) for k in range(3)]
+    (scan,), _ = assembled(sent)
+    assert scan.group.tolist() == [2, 2, 2]
+    assert scan.times.tolist() == [2e-4] * 3
 
 
 @pytest.mark.slow

@@ -7,21 +7,24 @@ import time
 import numpy as np
 import pytest
 from support.emulated_devices import EmulatedDevice, office_log
+from support.fake_devices import Given
+from support.logs import echoes_of
 from support.maps import assert_same_map
 
-from jaxsonar import (
-    Mapper,
-    Ring,
-    build_map,
-    load_log,
-    load_map,
-    save_log,
-)
+from jaxsonar import Log, Mapper, Ring, build_map, load_log, load_map, save_log
 from jaxsonar.hardware.device_emulator import emulate
+from jaxsonar.hardware.drop_oldest_queue import DropOldestQueue
 from jaxsonar.hardware.fault_injection import FaultSettings
+from jaxsonar.hardware.messages import ECHO, Group, Pose
+from jaxsonar.hardware.protocol import encode
+from jaxsonar.hardware.reader_thread import ReaderThread
+from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler
 from jaxsonar.hardware.transport_servers import listen
 from jaxsonar.live.live_map import LiveMap
+from jaxsonar.live.status import Status
 from jaxsonar.live.stream import stream
+from jaxsonar.scans.measured_paths import measured_paths
+from jaxsonar.scans.raw_scans import group_paths
 from jaxsonar.simulation.device_messages import log_messages
 
 RING = Ring.circular()
@@ -58,7 +61,7 @@ def test_a_stream_records_the_log_and_builds_its_map(link, record, office, log, 
     else:
         with EmulatedDevice(log_messages(log, office.ring), link, speed=0.0) as device:
             status = stream(device.sink.url, office.ring, **choices)
-    recorded = load_log(path)
+    recorded = echoes_of(load_log(path))
     for column in ("scan", "start", "tx", "rx", "stamp", "pose"):
         np.testing.assert_array_equal(getattr(recorded, column), getattr(log, column))
     assert np.abs(recorded.range - log.range).max() < 1e-6
@@ -110,7 +113,7 @@ def test_a_faulty_link_loses_echoes_and_invents_none(office, log, tmp_path):
     faults = FaultSettings(corrupt=0.1, drop=0.05, reorder=0.1, seed=5)
     with EmulatedDevice(log_messages(log, office.ring), "tcp://127.0.0.1:0", speed=0.0, faults=faults) as device:
         status = stream(device.sink.url, office.ring, method="hough", record=tmp_path / "rec.csv", map_filename=None)
-    found = load_log(tmp_path / "rec.csv")
+    found = echoes_of(load_log(tmp_path / "rec.csv"))
     row_of = {int(number): row for row, number in enumerate(log.scan)}
     row = np.array([row_of[int(number)] for number in found.scan])[found.echo_scan]
     same = (row[:, None] == log.echo_scan) & (found.tx[:, None] == log.tx) & (found.rx[:, None] == log.rx)
@@ -232,3 +235,68 @@ def test_errors_are_raised_after_everything_is_written(office, log, tmp_path, mo
     assert issubclass(LogPlayer, real)
     assert 0 < len(load_log(paths["record"])) < len(log)
     assert len(load_map(paths["map_filename"])) > 0
+
+
+def test_an_explicit_log_is_replayed_and_recorded_with_what_it_measured(office, log, tmp_path):
+    """Firing groups with times; some did not fire."""
+    ring, rng = office.ring, np.random.default_rng(2)
+    group_of = np.empty(ring.count, int)
+    for group, sensors in enumerate(ring.firing_groups):
+        group_of[sensors] = group
+    fired = rng.random((len(log), 8)) < 0.8
+    fired[0] = True
+    heard = np.isin(np.arange(len(log.tx)), np.flatnonzero(fired[log.echo_scan, group_of[log.tx]]))
+    rows = [(k, *ring.paths[p]) for k in range(len(log)) for p in range(len(ring.paths))]
+    echoes = {(k, tx, rx) for k, tx, rx in zip(log.echo_scan[heard], log.tx[heard], log.rx[heard], strict=True)}
+    silent = np.array([row for row in rows if row not in echoes and fired[row[0], group_of[row[1]]]])
+    scan = np.concatenate([log.echo_scan[heard], silent[:, 0]])
+    order = np.argsort(scan, kind="stable")
+    tx = np.concatenate([log.tx[heard], silent[:, 1]])[order]
+    rx = np.concatenate([log.rx[heard], silent[:, 2]])[order]
+    ranges = np.concatenate([log.range[heard], np.full(len(silent), np.nan)])[order]
+    scan = scan[order]
+    first = np.argmax(fired, axis=1)
+    t = 0.012 * (group_of[tx] - first[scan])
+    explicit = Log.from_echoes(scan, tx, rx, ranges, t=t, stamp=log.stamp, pose=log.pose)
+    save_log(explicit, tmp_path / "log.csv")
+    status = stream(f"file:{tmp_path}/log.csv?speed=0", ring, method="hough", record=tmp_path / "again.csv")
+    back = load_log(tmp_path / "again.csv")
+    assert status.echoes == explicit.echo_count
+    np.testing.assert_array_equal(measured_paths(ring, back), measured_paths(ring, explicit))
+    a, b = (np.lexsort([one.range, one.rx, one.tx, one.echo_scan]) for one in (back, explicit))
+    for column in ("echo_scan", "tx", "rx"):
+        np.testing.assert_array_equal(getattr(back, column)[a], getattr(explicit, column)[b])
+    np.testing.assert_allclose(back.range[a], explicit.range[b], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(back.t[a], explicit.t[b], rtol=0, atol=1.1e-6)
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "no data came"),
+        (b"1.20, 0.80, 3.10\n" * 200, "no frame of the wire protocol in 3400 bytes"),
+        (b"".join(encode(Pose(k, k, 0.0, 0.0, 0.0)) for k in range(3)), "no firing group in 3 frames"),
+    ],
+)
+def test_a_stream_without_scans_is_explained(data, reason, office):
+    queue: DropOldestQueue[RawScan] = DropOldestQueue()
+    reader = ReaderThread(Given([data]), queue, sensors=24, group_paths=group_paths(office.ring))
+    reader.start()
+    while not queue.ended:
+        queue.get(1.0)
+    status = Status(counts=reader.counts)
+    assert reason in status.why_nothing_is_used(office.ring)
+
+
+def test_a_stream_without_a_used_echo_is_explained(office):
+    ring = office.ring
+    far = np.zeros(1, ECHO)
+    far["time_us"] = 2e4
+    for echoes, reason in ((far[:0], "no echo in 1 scan"), (far, "none of the 1 echoes is within the maximum range")):
+        group = Group(0, 0, 0, 0, 1, float("nan"), echoes)
+        live = LiveMap(ring, method="hough", mapping=False)
+        raw = ScanAssembler(sensors=24, group_paths=group_paths(ring)).push(group, 0.0)
+        live.process(raw)
+        counts = {"bytes": 50, "frames": 1, "scans": 1, "echoes": len(echoes)}
+        status = Status(scans=1, echoes=len(echoes), in_range=live.in_range, warm=True, counts=counts)
+        assert reason in status.why_nothing_is_used(ring)

@@ -22,11 +22,12 @@ from jaxsonar.hardware.mcap_recorder import EVENTS, MESSAGES, read_mcap
 from jaxsonar.hardware.messages import ECHO, Group, Message
 from jaxsonar.hardware.protocol import Decoder, encode, encode_frame
 from jaxsonar.hardware.reader_thread import ReaderThread
-from jaxsonar.hardware.recorder import csv_rows, open_recorder
+from jaxsonar.hardware.recorder import HEADER, csv_rows, open_recorder
 from jaxsonar.hardware.recorder_base import Recorder, recording_marker
 from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler
 from jaxsonar.hardware.transport_base import EndOfStream, LinkEvent, Source, open_source, parse_url
 from jaxsonar.live.replay import messages_of
+from jaxsonar.scans.raw_scans import group_paths, scan_from_raw
 from jaxsonar.scans.recording_journal import TruncatedRecording, journal_filename, open_log_recorder
 
 
@@ -42,8 +43,7 @@ def read_all(source: Source, recorder: Recorder | None = None, **choices) -> tup
 
 
 def as_log(scans):
-    text = "scan,stamp,x,y,theta,tx,rx,range,amplitude\n" + "".join(map(csv_rows, scans))
-    return text
+    return HEADER + "".join(map(csv_rows, scans))
 
 
 def assembled(sent: list[Message]) -> list[RawScan]:
@@ -67,7 +67,28 @@ def test_a_recorded_log_contains_all_scans(suffix, tmp_path):
         assert scan.rx.tolist() == raw.echoes["rx"].tolist()
         assert scan.range.tolist() == raw.ranges.tolist()
         assert scan.amplitude.tolist() == raw.echoes["amplitude"].tolist()
+        assert scan.t.tolist() == raw.times.tolist()
     assert os.listdir(tmp_path) == [path.name], "nothing is left beside it"
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_recorded_log_tells_what_was_measured_and_when(suffix, faw_ring, tmp_path):
+    """Explicit: silent paths of the groups that arrived, none of a missing group; times of the groups."""
+    path, plan = tmp_path / f"log{suffix}", group_paths(faw_ring)
+    sent = [message for message in messages(groups=8) if not (isinstance(message, Group) and message.group == 5)]
+    scans, _ = read_all(Given(map(encode, sent)), open_log_recorder(path), group_paths=plan)
+    log = load_log(path)
+    assert len(log.asked) == 0
+    assert log == Log.from_scans([scan_from_raw(raw) for raw in scans])
+    missing = faw_ring.firing_groups[5].tolist()
+    for scan, raw in zip(log, scans, strict=True):
+        assert not set(scan.tx.tolist()) & set(missing)
+        assert scan.echo_count == len(raw.echoes)
+        pairs = set(zip(scan.tx.tolist(), scan.rx.tolist(), strict=True))
+        assert {(tx, tx) for tx in range(24) if tx not in missing} <= pairs
+        assert set(scan.t.tolist()) <= set(raw.group_time.tolist())
+    assert log[2].echo_count == 0
+    assert len(log[2].tx) > 0  # evidence of free space
 
 
 def test_a_raw_recording_contains_all_bytes_and_both_clocks(tmp_path):
@@ -279,7 +300,7 @@ def test_a_recording_of_another_program_raises_an_error(tmp_path):
 def test_logs_that_no_device_can_send_raise_an_error_before_listening(faw_ring, tmp_path):
     garbage, raw = tmp_path / "x.mcap", tmp_path / "raw.mcap"
     garbage.write_bytes(b"no record at all")
-    with pytest.raises(SonarError, match=r"x\.mcap: this is no MCAP file; needed is a record"):
+    with pytest.raises(SonarError, match=r"x\.mcap: this is a text that begins with 'no record at all'"):
         messages_of(garbage, faw_ring)
     read_all(Given(map(encode, messages(1))), open_recorder(raw))
     assert len(list(messages_of(raw, faw_ring))) == 5

@@ -4,13 +4,18 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.emulated_devices import assert_same_log, echo_order, log_from_messages, office_log
 
 from jaxsonar import Log, Ring, simulate
-from jaxsonar.geometry.se2 import relative
+from jaxsonar.geometry.se2 import relative, wrap_angle
 from jaxsonar.hardware import SonarError
 from jaxsonar.hardware.messages import Group, Pose
 from jaxsonar.hardware.protocol import Decoder, encode
+from jaxsonar.hardware.scan_assembler import ScanAssembler
+from jaxsonar.scans.firing_poses import reading_poses
+from jaxsonar.scans.raw_scans import group_paths, scan_from_raw
 from jaxsonar.simulation.device_messages import log_messages, room_messages
 
 
@@ -40,8 +45,14 @@ def test_the_farthest_echo_keeps_a_tenth_of_a_millimetre():
 
 def test_a_scan_becomes_one_pose_and_its_groups(office, log):
     """A pose, then the groups in order; consecutive numbers, ascending times, and the right transmitters per group."""
-    sent = list(log_messages(log, office.ring, temperature=21.5))
-    assert [message.sequence for message in sent] == list(range(17 * 9))
+    sent = list(log_messages(log, office.ring, moving=True, temperature=21.5))
+    sent = [m for m in sent if isinstance(m, Group) or sent[m.sequence + 1].group == 0]
+    at_once = list(log_messages(log, office.ring))
+    assert [(type(a), a.time_us) for a in at_once if isinstance(a, Pose)] == [
+        (type(a), a.time_us) for a in sent if isinstance(a, Pose)
+    ]
+    assert all(a.time_us == at_once[9 * (k // 9)].time_us for k, a in enumerate(at_once))  # without t: at the stamp
+    assert [message.sequence for message in at_once] == list(range(17 * 9))
     groups = [message for message in sent if isinstance(message, Group)]
     assert [type(message) for message in sent] == ([Pose] + [Group] * 8) * 17
     assert [(g.scan, g.group, g.groups) for g in groups] == [(i, k, 8) for i in range(17) for k in range(8)]
@@ -71,7 +82,9 @@ def test_logs_with_hardly_any_data_are_sent(office):
     for moving in (False, True):
         sent = list(log_messages(log, office.ring, moving=moving))
         assert all(isinstance(message, Group) and len(message.echoes) == 0 for message in sent)
-        assert np.diff([message.time_us for message in sent]) == pytest.approx(11655, abs=1)
+        steps = np.diff([message.time_us for message in sent])
+        assert steps[7::8] == pytest.approx(11655 if moving else 8 * 11655, abs=8)
+        assert np.delete(steps, [7, 15]) == pytest.approx(11655 if moving else 0, abs=1)
     assert list(log_messages(log[:0], office.ring)) == []
 
 
@@ -127,19 +140,21 @@ def test_a_descending_stamp_is_rejected(office, log):
 
 
 def test_poses_are_interpolated_between_scans(office):
-    """A robot at constant speed whose heading crosses pi: the poses of its groups follow."""
+    """A robot on a circle whose heading crosses pi: the poses of its groups follow."""
+
+    def circle(time):
+        theta = 3.0 + 1.0 * time
+        return np.stack([1.0 + 0.5 * np.sin(theta), 2.0 - 0.5 * np.cos(theta), wrap_angle(theta)], axis=-1)
+
     stamps = np.arange(6) * 0.2
-    poses = np.stack([1.0 + 0.5 * stamps, 2.0 - 0.3 * stamps, 3.0 + 1.0 * stamps], axis=-1)
-    poses[:, 2] = (poses[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    poses = circle(stamps)
     nothing = np.zeros(0, dtype=int)
     log = Log.from_echoes(nothing, nothing, nothing, np.zeros(0), stamp=stamps, pose=poses)
     sent = list(log_messages(log, office.ring, moving=True))
     found = np.array([[m.time_us / 1e6, m.x, m.y, m.theta] for m in sent if isinstance(m, Pose)])
     assert [type(message) for message in sent] == [Pose, Group] * 48
-    assert np.array_equal(found[7::8, 1:], poses)  # the last group has the pose of the log
-    since = np.maximum(found[:, 0] - found[7, 0], 0)  # before the first scan there is no motion
-    expected = poses[0] + since[:, None] * np.array([0.5, -0.3, 1.0])
-    assert np.abs(relative(expected, found[:, 1:])).max() < 1e-5
+    assert np.array_equal(found[::8, 1:], poses)  # the first group has the pose of the log
+    assert np.abs(relative(circle(found[:, 0]), found[:, 1:])).max() < 1e-6  # times have whole microseconds
     assert np.abs(found[:, 3]).max() <= np.pi
 
 
@@ -192,3 +207,80 @@ def test_a_moving_robot_gets_each_group_at_its_own_pose(office):
         assert [echo[2] for echo in got] == pytest.approx([echo[2] for echo in want], abs=1e-5)
         compared += len(got)
     assert compared > 50
+
+
+RING = Ring.circular(count=8, neighbors=1)
+"""Four groups of two sensors."""
+
+
+def received(sent):
+    """The log that a recorder makes of messages."""
+    assembler = ScanAssembler(sensors=RING.count, group_paths=group_paths(RING))
+    raws = [raw for message in sent for raw in assembler.push(message, 0.0)] + assembler.flush()
+    return Log.from_scans([scan_from_raw(raw) for raw in raws])
+
+
+def readings(log):
+    """{(scan, stamp, tx, rx): (ranges, t)} of a log."""
+    found = {}
+    for scan in log:
+        for tx, rx, distance, t in zip(scan.tx.tolist(), scan.rx.tolist(), scan.range, scan.t, strict=True):
+            key = (scan.scan, round(scan.stamp + t, 5), tx, rx)
+            found.setdefault(key, []).append(None if np.isnan(distance) else round(distance, 5))
+    return found
+
+
+def explicit_log(seed, *, how):
+    """A random explicit log: groups of the ring, or one sensor after another; some firings are missing."""
+    rng = np.random.default_rng(seed)
+    group = np.arange(8) % 4 if how == "groups" else np.arange(8)
+    rows, stamps = [], []
+    for scan in range(6):
+        fired = np.flatnonzero(rng.random(group.max() + 1) < 0.7) if scan else np.arange(group.max() + 1)
+        late = 0.01 * np.arange(group.max() + 1) + rng.uniform(0, 0.005)
+        late -= late[fired].min(initial=np.inf) if len(fired) else 0.0
+        for tx, rx in RING.paths.tolist():
+            if group[tx] in fired:
+                count = rng.integers(0, 3) if scan else 1
+                ranges = np.sort(rng.integers(300, 1900, count)) / 1000 if count else [np.nan]
+                rows += [(scan, tx, rx, distance, late[group[tx]]) for distance in ranges]
+        stamps.append(3.0 + 0.2 * scan)
+    index, tx, rx, distance, t = np.array(rows).T
+    index, tx, rx = (column.astype(int) for column in (index, tx, rx))
+    pose = np.stack([0.3 * np.array(stamps), np.zeros(6), 0.2 * np.array(stamps)], axis=-1)
+    return Log.from_echoes(index, tx, rx, distance, t=t, stamp=np.array(stamps), pose=pose)
+
+
+@pytest.mark.parametrize("how", ["groups", "sensors"])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_an_explicit_log_comes_back_with_what_it_measured_and_when(how, seed):
+    """Only groups that fired are sent, at their times; silent paths stay silent, and others unmeasured."""
+    log = explicit_log(seed, how=how)
+    sent = list(log_messages(log, RING))
+    back = received(sent)
+    assert readings(back) == readings(log)
+    assert len(back.asked) == 0
+    poses = {message.time_us: (message.x, message.y, message.theta) for message in sent if isinstance(message, Pose)}
+    expected = reading_poses(log)
+    for scan, pose, t in zip(log.stamp[log.echo_scan], expected, log.t, strict=True):
+        if round((scan + t) * 1e6) in poses:
+            np.testing.assert_allclose(poses[round((scan + t) * 1e6)], pose, rtol=0, atol=1e-9)
+
+
+def test_sensors_that_fire_in_turn_come_back_one_scan_each():
+    tx = np.arange(16) % 8
+    stamps = 1.0 + 0.025 * np.arange(16)
+    distance = np.where(np.arange(16) % 5 == 3, np.nan, 1.0 + 0.01 * np.arange(16))
+    log = Log.from_echoes(np.arange(16), tx, tx, distance, stamp=stamps, pose=np.zeros((16, 3)))
+    assert readings(received(log_messages(log, RING))) == readings(log)
+
+
+def test_repeated_old_readings_are_not_sent():
+    """A reading with an age whose original is in the log was not measured again."""
+    index, tx = np.repeat(np.arange(3), 2), np.tile([0, 4], 3)
+    distance = np.array([1.0, 1.1, 1.2, 1.1, 1.3, np.nan])
+    age = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+    pose = np.zeros((3, 3))
+    log = Log.from_echoes(index, tx, tx, distance, age=age, stamp=0.1 * np.arange(3), pose=pose)
+    back = readings(received(log_messages(log, RING)))
+    assert [(scan, tx) for scan, _, tx, _ in back] == [(0, 0), (0, 4), (1, 0), (2, 0), (2, 4)]

@@ -73,6 +73,23 @@ SMALL_CSV = f"""{HEADER},amplitude
 """
 
 
+def echoes_of(log):
+    """The log without paths that heard nothing."""
+    heard = np.isfinite(log.range)
+    return Log.from_echoes(
+        log.echo_scan[heard],
+        log.tx[heard],
+        log.rx[heard],
+        log.range[heard],
+        amplitude=log.amplitude[heard],
+        t=log.t[heard],
+        age=log.age[heard],
+        stamp=log.stamp,
+        pose=log.pose,
+        scan=log.scan,
+    )
+
+
 def read(text, name="log.csv"):
     """The log in a file with these bytes."""
     with tempfile.TemporaryDirectory() as folder:
