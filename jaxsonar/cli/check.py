@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.reports.terminal_tables import health_table
 
     check_outputs({"--json": options.json, "--figure": options.figure}, [options.log, options.ring])
-    ring, log = load_inputs(options)
+    ring, log = load_inputs(options, as_recorded=True)
     with errors_in(options.log), progress_bar("scans", None) as show:
         health = check_ring(
             ring,
@@ -58,6 +58,8 @@ def run(options: argparse.Namespace) -> None:
     write_figure(figure, options.figure)
     if options.json != "-":
         print_tables(health_table(health))
+    if health.unmeasured:
+        print_status(f"not measured: {', '.join(health.unmeasured)}")
     for finding in health.findings:
         print_status(finding)
     print_status(f"{len(log)} scans, {plural(len(health.findings), 'finding')}" if health.source else health.empty)

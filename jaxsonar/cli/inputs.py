@@ -169,21 +169,28 @@ class InputMessages:
             raise SonarError(f"--strict: {plural(self.warnings, 'warning')} came; allowed is input without warnings")
 
 
-def load_inputs(options: argparse.Namespace) -> tuple["Ring", "Log"]:
+def load_inputs(options: argparse.Namespace, *, as_recorded: bool = False) -> tuple["Ring", "Log"]:
     """Load the ring and the log of a command; print notes and warnings.
 
-    Readings that are no echoes but marks become silent, and firings that are scans of their own are merged into scans.
+    The log is prepared for computations (``prepared_log``).
+
+    Args:
+        options: the options of the command.
+        as_recorded: return the log as it was recorded, for a command that reports itself what is wrong with it.
 
     Raises:
         SonarError: an input cannot be read, or there was a warning and ``--strict`` was given.
     """
-    ring, logs = load_all_inputs(options, [options.log])
+    ring, logs = load_all_inputs(options, [options.log], as_recorded=as_recorded)
     return ring, logs[0]
 
 
-def load_all_inputs(options: argparse.Namespace, filenames: Sequence[str]) -> tuple["Ring", list["Log"]]:
+def load_all_inputs(
+    options: argparse.Namespace, filenames: Sequence[str], *, as_recorded: bool = False
+) -> tuple["Ring", list["Log"]]:
     """Load the ring of a command and several logs, as ``load_inputs``."""
     from jaxsonar.recordings.prepared_log import prepared_log
+    from jaxsonar.scans.unheard_paths import unheard_warning
     from jaxsonar.sensors.ring_toml import load_ring
 
     messages = InputMessages(strict=options.strict)
@@ -191,7 +198,13 @@ def load_all_inputs(options: argparse.Namespace, filenames: Sequence[str]) -> tu
     for name in filenames:
         log = read_log(name, options, messages, ring=ring)
         with errors_in(name):
-            logs.append(prepared_log(ring, log, on_note=messages.note))
+            if not as_recorded:
+                log = prepared_log(ring, log, on_note=messages.note)
+            elif options.strict:
+                prepared_log(ring, log, on_note=messages.note)
+            elif (text := unheard_warning(ring, log)) is not None:
+                messages.warn(text)
+        logs.append(log)
     messages.check()
     return ring, logs
 

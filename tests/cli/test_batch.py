@@ -154,8 +154,7 @@ def test_a_bag_gives_the_lines_of_the_lines_command(tmp_path, kind, capsys):
     bag, ring_file = spinning_bag(tmp_path / "run", kind)
     assert call("lines", bag, "--ring", ring_file, "-o", tmp_path / "lines.jsonl") == 0
     models = [json.loads(line) for line in (tmp_path / "lines.jsonl").read_text().splitlines()]
-    options = {"workers": 1, "shard_scans": 7}
-    report = batch([bag], load_ring(ring_file), tmp_path / "out", **options)
+    report = batch([bag], load_ring(ring_file), tmp_path / "out", workers=1, shard_scans=7)
     assert report.scans == len(models) > 14
     found = pq.read_table(tmp_path / "out" / "lines").to_pylist()
     wanted = [(model["scan"], *(line[key] for key in ("rho", "theta"))) for model in models for line in model["lines"]]
