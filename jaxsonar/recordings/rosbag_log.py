@@ -22,7 +22,14 @@ from jaxsonar.recordings.rosbag_odometry import Odometry, choose_odometry
 from jaxsonar.recordings.rosbag_ranges import ECHO, NOT_MEASURED, SILENT, reading_kinds
 from jaxsonar.recordings.rosbag_scans import log_from_readings
 from jaxsonar.recordings.rosbag_sensors import BagSensor, name_numbers, sensor_indices
-from jaxsonar.recordings.rosbag_transforms import DescribedSensor, FrameTree, described_ring, planar_pose
+from jaxsonar.recordings.rosbag_transforms import (
+    DescribedSensor,
+    FrameTree,
+    described_ring,
+    places_in_ring,
+    planar_pose,
+    warn_of_other_headings,
+)
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -64,7 +71,11 @@ def read_bag(
         given=options.sensors,
         name=name,
         note=note,
+        places=None if ring is None else places_in_ring(sensors, poses.tree, ring),
     )
+    if ring is not None:
+        known = [(sensor, k) for sensor, k in zip(sensors, index, strict=True) if k is not None]
+        warn_of_other_headings([sensor for sensor, _ in known], [k for _, k in known], poses.tree, ring, note)
     used = [(one, k) for one, k in zip(ranges, index, strict=True) if k is not None]
     chosen = choose_odometry(
         poses.candidates,

@@ -144,13 +144,15 @@ class Odometry:
 
     def poses(self, time: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 3"]:
         """world_from_robot at some times; NaN where the odometry has a gap, and before and after it."""
-        if len(self.samples) < 2:
+        if len(self.samples) < 2:  # one pose does not tell whether the robot moved
             return np.full((len(time), 3), np.nan)
         pose = poses_at(self.samples[:, 0], self.samples[:, 1:], time)
         return np.where(self.known(time)[:, None], pose, np.nan)
 
     def known(self, time: Float[np.ndarray, " times"]) -> Bool[np.ndarray, " times"]:
         """Whether the pose is known at some times."""
+        if len(self.samples) < 2:
+            return np.zeros(len(time), bool)
         stamp, pose = self.samples[:, 0], self.samples[:, 1:]
         gap = np.diff(stamp)
         longest = max(SETTINGS.max_gap, SETTINGS.max_gap_periods * float(np.median(gap)))

@@ -31,7 +31,7 @@ def log_from_readings(
     rows = np.lexsort((order, time))
     time, sensor, reported, order = time[rows], sensor[rows], reported[rows], order[rows]
     state = np.zeros(len(time), np.int64)
-    if odometry is not None and len(odometry.samples):
+    if odometry is not None and len(odometry.samples) > 1:
         state = np.where(odometry.known(time), odometry.part_at(time), -1)
     scan = _scans(time, sensor, order, state)
     first = np.flatnonzero(np.diff(scan, prepend=-1))

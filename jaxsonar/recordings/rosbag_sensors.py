@@ -28,6 +28,7 @@ def sensor_indices(
     given: Mapping[str, int],
     name: str,
     note: Callable[[str], None],
+    places: Sequence[int] | None = None,
 ) -> list[int | None]:
     """Index in the ring of each sensor; None for sensors that are left out.
 
@@ -41,6 +42,7 @@ def sensor_indices(
         given: index by name, a topic or a frame.
         name: name of the bag in error messages.
         note: called with one line for each choice.
+        places: index of each sensor by the place of its frame, which a question proposes; None if unknown.
 
     Raises:
         SonarError: the names do not tell which sensor is which; the message says what to write.
@@ -59,7 +61,7 @@ def sensor_indices(
         kind, numbers = next(iter(usable.items()))
         _note_numbers(sensors, kind, numbers.values, count, note)
         return list(numbers.values)
-    raise SonarError(f"{shown(name)}: {_question(sensors, found, usable, count)}")
+    raise SonarError(f"{shown(name)}: {_question(sensors, found, usable, count, places)}")
 
 
 def name_numbers(sensors: Sequence[BagSensor]) -> tuple[int, ...] | None:
@@ -185,37 +187,44 @@ def _note_numbers(
 
 
 def _question(
-    sensors: Sequence[BagSensor], found: Mapping[str, _Numbers], usable: Mapping[str, _Numbers], count: int | None
+    sensors: Sequence[BagSensor],
+    found: Mapping[str, _Numbers],
+    usable: Mapping[str, _Numbers],
+    count: int | None,
+    places: Sequence[int] | None,
 ) -> str:
     """What came, why it does not tell the sensors apart, and what to write."""
-    last = "" if count is None else f" 0 to {count - 1}"
     labels = _labels(sensors)
     numbers = found.get("frame") or found.get("topic")
-    order = list(range(len(sensors)))
-    if len(usable) > 1:
-        why = "the numbers of frames and topics contradict each other"
-    elif numbers is None:
+    values = range(len(sensors)) if numbers is None else numbers.values
+    order = sorted(range(len(sensors)), key=lambda row: values[row])
+    proposed, condition = ["INDEX"] * len(sensors), ""
+    if places is not None:
+        proposed, condition = places, ", which is where the transforms place them"
+        order.sort(key=lambda row: places[row])
+    elif numbers is not None and min(values) == 1 and len(sensors) == count:
+        proposed, condition = [k - 1 for k in values], f", if {labels[order[0]]} is sensor 0"
+    written = " ".join(f"--sensor {labels[row]}={proposed[row]}" for row in order[:_MOST_SHOWN])
+    written += " ..." if len(order) > _MOST_SHOWN else ""
+    names = 'frame = "..." or topic = "..." in each [[sensor]] of the ring'
+    why = "the numbers of frames and topics contradict each other" if len(usable) > 1 else _why(labels, numbers, count)
+    return f"{_came(sensors)}; {why}; write {shown(written, 2000)}{condition}, or {names}"
+
+
+def _why(labels: Sequence[str], numbers: _Numbers | None, count: int | None) -> str:
+    """Why names do not tell the sensors apart."""
+    last = "" if count is None else f" 0 to {count - 1}"
+    if numbers is None:
         shared = [one for one, times in Counter(labels).items() if times > 1]
-        why = (
+        return (
             f"{shared[0]} came more than once" if shared else "these names do not tell which sensor of the ring each is"
         )
-    else:
-        order.sort(key=lambda row: numbers.values[row])
-        low, high = min(numbers.values), max(numbers.values)
-        if (count is not None and high > count) or (low == 0 and len(sensors) > 1):
-            why = f"the numbers {low} to {high} are not those of the ring's sensors{last}"
-        elif high == count or (count is None and low == 1):
-            why = f"the numbers {low} to {high} seem to count from 1, the ring's sensors are{last or ' counted from 0'}"
-        else:
-            why = f"these names do not show whether they count from 0 or from 1, the ring's sensors are{last}"
-    by_order = numbers is not None and min(numbers.values) == 1 and len(sensors) == count
-    written = " ".join(
-        f"--sensor {labels[row]}={place if by_order else 'INDEX'}" for place, row in enumerate(order[:_MOST_SHOWN])
-    )
-    written += " ..." if len(order) > _MOST_SHOWN else ""
-    condition = f", if {labels[order[0]]} is sensor 0" if by_order else ""
-    names = 'frame = "..." or topic = "..." in each [[sensor]] of the ring'
-    return f"{_came(sensors)}; {why}; write {shown(written, 2000)}{condition}, or {names}"
+    low, high = min(numbers.values), max(numbers.values)
+    if (count is not None and high > count) or (low == 0 and len(labels) > 1):
+        return f"the numbers {low} to {high} are not those of the ring's sensors{last}"
+    if high == count or (count is None and low == 1):
+        return f"the numbers {low} to {high} seem to count from 1, the ring's sensors are{last or ' counted from 0'}"
+    return f"these names do not show whether they count from 0 or from 1, the ring's sensors are{last}"
 
 
 def _came(sensors: Sequence[BagSensor]) -> str:

@@ -1,11 +1,13 @@
 """The tree of frames in a bag (``/tf_static``, ``/tf``), and the ring that it and the messages describe."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError, shown
 from jaxsonar.recordings.rosbag_messages import Messages
 from jaxsonar.recordings.rosbag_sensors import BagSensor
@@ -13,6 +15,8 @@ from jaxsonar.sensors.ring import Ring
 
 BASES = ("base_link", "base_footprint", "base")
 """Names of the robot frame, without namespace, the preferred one first."""
+SAME_PLACE = (0.1, np.radians(20))
+"""A frame and a sensor of a ring that differ by less are the same sensor, metres and radians."""
 MIN_HORIZONTAL = 0.5
 """A sensor whose axis has a smaller horizontal part looks up or down and belongs to no ring."""
 MAX_FIELD_OF_VIEW = np.pi
@@ -62,6 +66,51 @@ class FrameTree:
 def planar_pose(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 3"]:
     """x, y (m) and the direction of the x axis (rad) of a transform."""
     return np.array([matrix[0, 3], matrix[1, 3], np.arctan2(matrix[1, 0], matrix[0, 0])])
+
+
+def places_in_ring(sensors: Sequence[BagSensor], tree: FrameTree, ring: Ring) -> list[int] | None:
+    """Sensor of the ring at the place of the frame of each sensor; None if the frames do not tell all of them."""
+    poses = [_robot_pose(tree, one) for one in sensors]
+    found = []
+    for pose in poses:
+        if pose is None:
+            return None
+        distance = np.hypot(*(np.asarray(ring.position) - pose[:2]).T) / SAME_PLACE[0]
+        turn = np.abs(wrap_angle(np.asarray(ring.heading) - pose[2])) / SAME_PLACE[1]
+        off = np.maximum(distance, turn)
+        if off.min() > 1:
+            return None
+        found.append(int(np.argmin(off)))
+    return found if len(set(found)) == len(found) else None
+
+
+def warn_of_other_headings(
+    sensors: Sequence[BagSensor], index: Sequence[int], tree: FrameTree, ring: Ring, note: Callable[[str], None]
+) -> None:
+    """Note a warning if sensors do not look where the ring says, as far as the frames tell."""
+    frames = Counter(one.frame for one in sensors)
+    poses = [(one, k, _robot_pose(tree, one)) for one, k in zip(sensors, index, strict=True) if frames[one.frame] == 1]
+    poses = [(one, k, pose) for one, k, pose in poses if pose is not None]
+    if len({float(pose[2]) for _, _, pose in poses}) < 2:  # frames without orientations tell nothing
+        return
+    heading = np.asarray(ring.heading)
+    off = [(one, k, pose) for one, k, pose in poses if abs(wrap_angle(heading[k] - pose[2])) > SAME_PLACE[1]]
+    if not off:
+        return
+    one, k, pose = off[0]
+    came = (
+        f"{one.frame} looks to {np.degrees(pose[2]):.0f} deg and sensor {k} of the ring to {np.degrees(heading[k]):.0f}"
+    )
+    cause = "the ring is numbered or turned in another way"
+    remedy = "name its sensors, or make a ring of the bag with convert --ring-out"
+    note(f"warning: {len(off)} sensors do not look where their frames do: {shown(came)} deg; {cause}; {remedy}")
+
+
+def _robot_pose(tree: FrameTree, sensor: BagSensor) -> Float[np.ndarray, " 3"] | None:
+    """robot_from_sensor in the plane; None if the frame is not connected to the robot frame, or is that frame."""
+    base = tree.base()
+    matrix = None if base in (None, sensor.frame) else tree.lookup(base, sensor.frame)
+    return None if matrix is None else planar_pose(matrix)
 
 
 @dataclass(frozen=True)
@@ -132,8 +181,8 @@ def described_ring(
     names = frames if len(set(frames)) == len(frames) else [one.sensor.topic for one in sensors]
     return Ring(
         np.round(position, 6),
-        np.round(heading, 9),
-        beam=np.round(beam, 9),
+        np.radians(np.round(np.degrees(heading), 6)),
+        beam=np.radians(np.round(np.degrees(beam), 6)),
         neighbors=0,
         max_range=float(f"{max_range:.6g}"),
         name=name,

@@ -78,3 +78,27 @@ def test_what_a_ring_needs(tmp_path):
         SonarError, match=r"frame 'us_0' of /us_0 is not connected to 'base_link'.* base_link, laser came"
     ):
         ring_from_bag(bag.write(tmp_path / "other"))
+
+
+def test_a_question_proposes_the_places_of_the_frames(tmp_path):
+    path = described().write(tmp_path / "run")
+    with pytest.raises(SonarError, match=r"us_a=0 --sensor us_b=1 --sensor us_c=2 --sensor us_d=3, which is where the"):
+        read_bag(path, ring=RING)
+    moved = dataclasses.replace(RING, position=np.asarray(RING.position) + 1.0)
+    with pytest.raises(SonarError, match="us_a=INDEX"):
+        read_bag(path, ring=moved)
+
+
+def test_sensors_that_look_elsewhere_are_a_warning(tmp_path):
+    path = described(names=[f"us_{k}" for k in range(RING.count)]).write(tmp_path / "run")
+    notes = []
+    read_bag(path, ring=RING, on_note=notes.append)
+    assert not any(one.startswith("warning") for one in notes)
+    mirrored = dataclasses.replace(RING, heading=np.asarray(RING.heading) + np.radians([0, 0, 0, 90]))
+    read_bag(path, ring=mirrored, on_note=notes.append)
+    warnings = [one for one in notes if one.startswith("warning")]
+    assert len(warnings) == 1
+    assert (
+        "1 sensors do not look where their frames do: us_3 looks to 15 deg and sensor 3 of the ring to 105"
+        in warnings[0]
+    )

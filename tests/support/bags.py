@@ -19,13 +19,16 @@ class BagMessages:
 
     def __init__(self, kind="sqlite"):
         pytest.importorskip("rosbags")
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         self.kind = kind
         self.store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+        if kind == "ros1":  # the library lacks this type
+            transforms = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
         self.messages = []
 
-    def new(self, name, **fields):
+    def new(self, name, /, **fields):
         return self.store.types[name](**fields)
 
     def header(self, seconds, frame):
