@@ -60,10 +60,10 @@ class Status:
         if not counts["bytes"]:
             return "no data came: is the device on, and does it send?"
         if not counts["frames"]:
-            rejected = f", {self.counts.get('rejected', 0)} damaged{self._rejected_text()}"
-            return (
-                f"no frame of the wire protocol in {counts['bytes']} bytes{rejected}: does the device use another one?"
+            damaged = (
+                f", {self.counts['rejected']} damaged{self._rejected_text()}" if self.counts.get("rejected") else ""
             )
+            return f"no frame of the wire protocol in {counts['bytes']} bytes{damaged}: is this another protocol?"
         if not counts["scans"]:
             return f"no firing group in {counts['frames']} frames"
         if not self.warm:  # the scans were only recorded

@@ -91,9 +91,9 @@ class StreamLoop:
         self._compilation = _run_in_background(live.warm_up)
 
     def wait_until_compiled(self, stop: threading.Event) -> bool:
-        """Wait for the compilation. False if ``stop`` was set before."""
+        """Wait for the compilation. False if ``stop`` was set, or the stream ended without a scan, before."""
         while not wait([self._compilation], SETTINGS.poll_interval).done:
-            if stop.is_set():
+            if stop.is_set() or self._queue.ended:
                 return False
             self._report()
         self._compilation.result()

@@ -35,12 +35,10 @@ class LogSurvey:
             return fields_of(block, begin[:, column], end[:, column])
 
         if len(begin):
-            tx, rx = text("tx"), text("rx")
-            valid = np.char.isdigit(tx) & np.char.isdigit(rx) & (np.char.str_len(tx) < 11) & (np.char.str_len(rx) < 11)
-            valid[valid] = np.maximum(integers_of(tx[valid]), integers_of(rx[valid])) <= LARGEST_SENSOR
-            tx, rx = integers_of(tx[valid]), integers_of(rx[valid])
+            tx, rx = _sensors(text("tx")), _sensors(text("rx"))
+            valid = (tx >= 0) & (rx >= 0)
             scan = self._scans - 1 + np.searchsorted(starts, begin[valid, 0], side="right")
-            self.asked.add(scan, tx, rx, text("range")[valid] == b"")
+            self.asked.add(scan, tx[valid], rx[valid], text("range")[valid] == b"")
             self.times = self.times or ("t" in columns and bool((text("t") != b"").any()))
             if "age" in columns:
                 self.age = max(self.age, float(np.max(_numbers_of(np.unique(text("age"))))))
@@ -73,6 +71,19 @@ class LogSurvey:
             self.age = max(self.age, float(np.nan_to_num(column("age")).max(initial=0.0)))
             self._stamps.append(batch.column("stamp").cast(pa.float64()).to_numpy(zero_copy_only=False))
         self._scans += len(batch)
+
+
+def _sensors(text: np.ndarray) -> Int[np.ndarray, " texts"]:
+    """Sensor indices; -1 for fields that are none."""
+    given = text != b""
+    try:
+        number = integers_of(text[given])
+    except (ValueError, OverflowError):
+        number = np.nan_to_num(_numbers_of(text[given], missing=-1.0), posinf=-1.0)
+        number = np.where((number == np.floor(number)) & (number <= LARGEST_SENSOR), number, -1).astype(np.int64)
+    sensor = np.full(len(text), -1)
+    sensor[given] = np.where((number >= 0) & (number <= LARGEST_SENSOR), number, -1)
+    return sensor
 
 
 def _numbers_of(text: np.ndarray, *, missing: float = 0.0) -> Float[np.ndarray, " texts"]:

@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.emulated_devices import office_log
+from support.logs import echoes_of
 from support.maps import assert_same_map
 
 from jaxsonar import (
@@ -84,7 +86,22 @@ def test_emulate_and_stream_give_the_map_of_the_map_command(device, command, log
     reference = tmp_path / "reference.geojson"
     assert main(["map", str(log_file), "--ring", "faw", "--method", "hough", "-o", str(reference)]) == 0
     assert_same_map(load_map(map_path), load_map(reference))
-    assert np.abs(load_log(record).range - load_log(log_file).range).max() < 1e-4
+    assert np.abs(echoes_of(load_log(record)).range - load_log(log_file).range).max() < 1e-4
+
+
+@pytest.mark.slow
+def test_a_stream_of_another_protocol_is_named(command, tmp_path):
+    """Comma-separated numbers, as a sketch on a microcontroller prints them."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        streaming = command("stream", url, "--ring", "faw", "--record", tmp_path / "t.csv")
+        server.settimeout(60)
+        link, _ = server.accept()
+        with link:
+            link.sendall(b"12,55,103,48\r\n" * 100)
+        _, told = streaming.communicate(timeout=60)
+    assert streaming.returncode == 1, told
+    assert f"nothing found: {url}: no frame of the wire protocol in 1400 bytes" in told.splitlines()[-1]
 
 
 @pytest.mark.slow
