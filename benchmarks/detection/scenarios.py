@@ -166,4 +166,5 @@ def echoes_of_one(condition: Condition, room: Room, pose, polar, kind: str, pose
 def log_of(ring: Ring, scan: np.ndarray, path: np.ndarray, ranges: np.ndarray, scans: int) -> Log:
     """A log without poses."""
     tx, rx = ring.paths[path].T
-    return Log.from_echoes(scan, tx, rx, ranges, stamp=0.1 * np.arange(scans), pose=np.full((scans, 3), np.nan))
+    stamp, pose = 0.1 * np.arange(scans), np.full((scans, 3), np.nan)
+    return Log.from_echoes(scan, tx, rx, ranges, stamp=stamp, pose=pose, asked=ring.paths)
