@@ -56,13 +56,11 @@ class Status:
 
     def why_nothing_is_used(self, ring: Ring) -> str:
         """Why no echo of a finished stream could be used; empty if one was."""
-        counts = {"bytes": 0, "frames": 0, "scans": 0, "echoes": 0, **self.counts}
+        counts = {"bytes": 0, "frames": 0, "rejected": 0, "scans": 0, "echoes": 0, **self.counts}
         if not counts["bytes"]:
             return "no data came: is the device on, and does it send?"
         if not counts["frames"]:
-            damaged = (
-                f", {self.counts['rejected']} damaged{self._rejected_text()}" if self.counts.get("rejected") else ""
-            )
+            damaged = f", {counts['rejected']} damaged{self._rejected_text()}" if counts["rejected"] else ""
             return f"no frame of the wire protocol in {counts['bytes']} bytes{damaged}: is this another protocol?"
         if not counts["scans"]:
             return f"no firing group in {counts['frames']} frames"

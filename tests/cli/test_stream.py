@@ -75,7 +75,10 @@ def device(log_file, command):
 
 @pytest.mark.slow
 def test_emulate_and_stream_give_the_map_of_the_map_command(device, command, log_file, tmp_path):
-    """End to end with processes and a real link; the first line of the device is its URL."""
+    """End to end with processes and a real link; the recording gives the same map as the stream.
+
+    The first line of the device is its URL.
+    """
     map_path, record = tmp_path / "map.geojson", tmp_path / "rec.parquet"
     url = device("tcp://127.0.0.1:0", "--speed", "0")
     assert re.fullmatch(r"tcp://127\.0\.0\.1:\d+", url)
@@ -84,7 +87,7 @@ def test_emulate_and_stream_give_the_map_of_the_map_command(device, command, log
     assert (streaming.returncode, out) == (0, ""), told
     assert "17 scans" in told.splitlines()[-1]
     reference = tmp_path / "reference.geojson"
-    assert main(["map", str(log_file), "--ring", "faw", "--method", "hough", "-o", str(reference)]) == 0
+    assert main(["map", str(record), "--ring", "faw", "--method", "hough", "-o", str(reference)]) == 0
     assert_same_map(load_map(map_path), load_map(reference))
     assert np.abs(echoes_of(load_log(record)).range - load_log(log_file).range).max() < 1e-4
 
