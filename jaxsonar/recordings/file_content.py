@@ -79,7 +79,7 @@ def file_content(filename: str | os.PathLike[str]) -> FileContent:
     """What a file or folder holds.
 
     Raises:
-        SonarError: it cannot be read, or a folder is no recording.
+        SonarError: it cannot be read.
     """
     try:
         is_folder = os.path.isdir(filename)
@@ -88,7 +88,7 @@ def file_content(filename: str | os.PathLike[str]) -> FileContent:
     except (OSError, ValueError) as failure:  # ValueError: a NUL in the filename
         raise SonarError(f"{shown(filename)}: {reason(failure)}; needed is a readable file with a recording") from None
     if is_folder:
-        return _known(_folder_format(filename, entries))
+        return _folder_content(entries)
     if head.startswith(b"PAR1"):
         return _known("parquet")
     if head.startswith((b"#ROSBAG V", b"SQLite format 3\0")):
@@ -118,19 +118,17 @@ def _head(filename: str | os.PathLike[str]) -> bytes:
         return file.read(HEAD)
 
 
-def _folder_format(folder: str | os.PathLike[str], entries: list[str]) -> str:
-    """Format of a folder with these entries."""
+def _folder_content(entries: list[str]) -> FileContent:
+    """Content of a folder with these entries."""
     if "metadata.yaml" in entries:
-        return "bag"
+        return _known("bag")
     if "measurement.txt" in entries and "poses.txt" in entries:
-        return "corridor8"
+        return _known("corridor8")
     if "sensor_readings_24.data" in entries:
-        return "scitos24"
+        return _known("scitos24")
     bags = [name for name in entries if name.lower().endswith((".db3", ".mcap"))]
-    if bags:
-        came = f"a folder with {shown(bags[0], 40)} but without metadata.yaml came"
-        raise SonarError(f"{shown(folder)}: {came}; name the file itself, or add its metadata.yaml")
-    raise SonarError(f"{shown(folder)}: a folder came; allowed is a file, or the folder of a ROS 2 bag (metadata.yaml)")
+    held = f" with {shown(bags[0], 40)}" if bags else ""
+    return FileContent(None, f"a folder{held} without metadata.yaml, which the folder of a ROS 2 bag has")
 
 
 def _known(format: str) -> FileContent:

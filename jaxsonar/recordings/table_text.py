@@ -144,7 +144,8 @@ def _delimiter(lines: list[str]) -> str:
         if all(delimiter in line for line in lines):
             return delimiter
     last = lines[-1].split()
-    if len(last) > 1 and all(COMMA_NUMBER.fullmatch(field) for field in last):
+    commas = ["," in field and not field.endswith(",") and bool(COMMA_NUMBER.fullmatch(field)) for field in last]
+    if sum(commas) > 1 and all(comma or "," not in field for comma, field in zip(commas, last, strict=True)):
         return " "  # blanks between numbers with decimal commas
     return "," if all("," in line for line in lines) else " "
 

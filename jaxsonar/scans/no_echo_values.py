@@ -111,7 +111,7 @@ def find_no_echo_values(log: Log) -> tuple[NoEchoValue, ...]:
     - Hardly any reading is beyond the value: it is the smallest or the largest range that the device reports, and the
       largest one if it is noisy.
 
-    Without poses, only exact maxima are found. The readings of a robot at rest do not tell.
+    Without poses, only exact maxima of ranges with a fine resolution are found. A robot at rest tells nothing.
 
     Returns:
         The values, the most frequent one first; empty for a sound log.
@@ -246,7 +246,7 @@ def _exact(sample: _Sample, value: float) -> NoEchoValue | None:
         return None
     _, which, count = np.unique(sample.range[~has_it], return_inverse=True, return_counts=True)
     is_fine = len(which) == 0 or float(np.mean(count[which] > 1)) < SETTINGS.repeated
-    if not sample.has_poses and near.any() and not is_fine:
+    if not sample.has_poses and not is_fine:
         return None
     counted = sample.echo_counts >= SETTINGS.path_readings
     if sample.has_poses:
