@@ -126,8 +126,7 @@ def _fire_together(log: Log, plan: Int[np.ndarray, " sensors"], all_fire: bool) 
         return False
     fired = np.zeros((len(log), len(plan)), bool)
     fired[scan, log.tx] = True
-    count = np.zeros((len(log), groups), np.int64)
-    np.add.at(count, (slice(None), plan), fired)
+    count = fired.astype(np.int64) @ (plan[:, None] == np.arange(groups))
     return all_fire or bool(((count == 0) | (count == np.bincount(plan))).all())
 
 

@@ -1,5 +1,7 @@
 """Which paths a device measured: only those of transmitters that fired and of receivers that listen."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,7 +16,7 @@ PLAN = np.array([(tx % GROUPS, tx, (tx + offset) % SENSORS) for offset in OFFSET
 NONE = np.zeros((0, 3), int)
 
 
-def silent(plan, arrived, echoes=NONE):
+def silent(plan: FiringPlan, arrived: Any, echoes: Any = NONE) -> set[tuple[int, ...]]:
     """{(group, tx, rx)} of the silent paths; ``echoes`` has rows (group, tx, rx)."""
     group, tx, rx = np.array(echoes).reshape(-1, 3).T
     return set(map(tuple, plan.silent_paths(np.array(arrived), tx, rx, group).tolist()))

@@ -76,6 +76,7 @@ def test_a_missing_group_has_no_time_and_no_silent_paths(faw_ring):
     assert scan.times.tolist() == scan.group_time[scan.group].tolist()
     arrived = [1, 2, 4, 5, 6, 7]  # each heard the echo of one transmitter, its first one
     expected = [[group, tx, tx] for group in arrived for tx in faw_ring.firing_groups[group].tolist() if tx != group]
+    assert scan.silent is not None
     assert sorted(scan.silent.tolist()) == sorted(expected)
 
 

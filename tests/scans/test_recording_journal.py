@@ -67,7 +67,7 @@ def test_a_recorded_log_contains_all_scans(suffix, tmp_path):
         assert scan.rx.tolist() == raw.echoes["rx"].tolist()
         assert scan.range.tolist() == raw.ranges.tolist()
         assert scan.amplitude.tolist() == raw.echoes["amplitude"].tolist()
-        assert scan.t.tolist() == raw.times.tolist()
+        assert scan.as_log().t.tolist() == raw.times.tolist()
     assert os.listdir(tmp_path) == [path.name], "nothing is left beside it"
 
 
@@ -86,7 +86,7 @@ def test_a_recorded_log_tells_what_was_measured_and_when(suffix, faw_ring, tmp_p
         assert scan.echo_count == len(raw.echoes)
         pairs = set(zip(scan.tx.tolist(), scan.rx.tolist(), strict=True))
         assert {(tx, tx) for tx in range(24) if tx not in missing} <= pairs
-        assert set(scan.t.tolist()) <= set(raw.group_time.tolist())
+        assert set(scan.as_log().t.tolist()) <= set(raw.group_time.tolist())
     assert log[2].echo_count == 0
     assert len(log[2].tx) > 0  # evidence of free space
 
