@@ -160,6 +160,8 @@ class ScanAssembler:
         self._distinct_count = 0
         self._newest_time_us = 0
         self._newest_scan = -1
+        self._forgotten = (-1, -1, 0)  # the last group that left the history: sequence, rank; poses that left after it
+        self._pose_gap = -1  # sequence of the group after the last gap that left the history and may hide a pose
 
     def push(self, message: Message, received: float) -> list[RawScan]:
         """Add one message.
@@ -242,7 +244,7 @@ class ScanAssembler:
             rank = message.scan * message.groups + message.group
         self._history[sequence] = (message.time_us, rank)
         if len(self._history) > SETTINGS.message_history:
-            del self._history[next(iter(self._history))]
+            self._forget(min(self._history))
         if isinstance(message, Pose):
             insort(self._poses, (sequence, message), key=_sequence)
             del self._poses[: -SETTINGS.message_history]
@@ -353,18 +355,36 @@ class ScanAssembler:
 
     def _pose_lost(self, pose: int, group: int) -> bool:
         """Whether a pose may be missing between a pose and a group: more missing messages than missing groups."""
-        if group - pose > SETTINGS.message_history // 2 or all(s in self._history for s in range(pose + 1, group)):
+        if pose < self._pose_gap:
+            return True
+        first, rank, poses = self._forgotten
+        if all(s in self._history for s in range(max(pose, first + poses) + 1, group)):
             return False
         own = self._history.get(group, (0, None))[1]
-        before = max((s for s, (_, rank) in self._history.items() if rank is not None and s < pose), default=None)
-        first = pose if before is None else before
-        known = [rank for s, (_, rank) in self._history.items() if first < s < group]
-        messages = group - first - 1 - len(known)
-        rank = None if before is None else self._history[before][1]
-        if own is None or rank is None:
+        in_history = [s for s, (_, rank_) in self._history.items() if rank_ is not None]
+        before = max((s for s in in_history if s < pose), default=-1)
+        if before < 0 and first < 0:  # no group came before the pose: take the one after it
+            after = min((s for s in in_history if s > pose), default=group)
+            before = after if all(s in self._history for s in range(pose + 1, after)) else -1
+        if before >= 0:
+            first, rank, poses = before, self._history[before][1], 0
+        if own is None or rank is None or first < 0:
             return True
-        groups = own - rank - 1 - sum(between is not None for between in known)
-        return messages > groups
+        known = [r for s, (_, r) in self._history.items() if first < s < group]
+        messages = group - first - 1 - len(known) - poses
+        return messages > own - rank - 1 - sum(between is not None for between in known)
+
+    def _forget(self, sequence: int) -> None:
+        """Remove the oldest message from the history; remember whether a pose may be missing before it."""
+        _, rank = self._history.pop(sequence)
+        first, before, poses = self._forgotten
+        if rank is None:
+            self._forgotten = (first, before, poses + 1)
+            return
+        missing = sequence - max(first, self._first_sequence - 1) - 1 - poses
+        if missing > (max(rank - before - 1, 0) if first >= 0 else 0):
+            self._pose_gap = sequence
+        self._forgotten = (sequence, rank, 0)
 
 
 def _sequence(entry: tuple[int, Pose]) -> int:

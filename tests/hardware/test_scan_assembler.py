@@ -142,6 +142,42 @@ def test_a_lost_pose_is_not_replaced_by_an_old_one():
         assert np.isfinite(other.group_pose).all()
 
 
+def only_first_poses(count, *, every=10**9):
+    """Messages of a device that sends a pose before the first group of every so many scans."""
+    sent = [m for m in device(count) if isinstance(m, Group) or (m.y == 0 and m.x % every == 0)]
+    for k, message in enumerate(sent):
+        object.__setattr__(message, "sequence", k)
+    return sent
+
+
+def test_a_pose_is_held_as_long_as_no_message_is_missing():
+    scans, _ = assembled(only_first_poses(80))
+    assert all(np.isfinite(scan.group_pose).all() for scan in scans)
+
+
+@pytest.mark.parametrize("lost", [3, 100, 117, 118, 119, 200, 300, 700])
+def test_a_long_gap_leaves_no_old_pose(lost):
+    """However many messages are lost, and however long ago: the poses among them are not replaced by older ones."""
+    sent = only_first_poses(200, every=5)
+    gap = sent[403 : 403 + lost]  # before the pose of scan 50
+    kept = [m for m in sent if m not in gap]
+    scans, _ = assembled(kept)
+    for scan in scans:
+        known = np.isfinite(scan.group_pose[:, 0])
+        assert (scan.group_pose[known, 0] == scan.scan - scan.scan % 5).all()
+        if scan.scan < 45 or scan.scan >= 55 + lost // GROUPS:
+            assert scan.missing or known.all()
+
+
+def test_lost_groups_long_ago_do_not_cost_a_pose():
+    """A device that sent its pose once; groups were lost, and all missing messages are those groups."""
+    sent = only_first_poses(80)
+    scans, counts = assembled([m for m in sent if m.sequence not in (20, 21, 300)])
+    assert counts.missing == 3
+    for scan in scans:
+        assert np.isfinite(scan.group_pose[np.isfinite(scan.group_time)]).all()
+
+
 def test_a_lost_group_does_not_cost_a_pose():
     sent = [m for m in device(3) if isinstance(m, Group) or m.y == 0]  # one pose per scan, before its first group
     for k, message in enumerate(sent):
