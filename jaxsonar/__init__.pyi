@@ -40,6 +40,8 @@ from .mapping.build_map import build_map as build_map
 from .mapping.global_map import GlobalMap as GlobalMap
 from .mapping.map_geojson import load_map as load_map
 from .mapping.map_geojson import save_map as save_map
+from .recordings.input_options import InputOptions as InputOptions
+from .recordings.input_options import TableFormat as TableFormat
 from .recordings.load_log import load_log as load_log
 from .scans.log_file import save_log as save_log
 from .scans.scan_log import Log as Log

@@ -1,7 +1,7 @@
 """Batch processing: any number of logs to Parquet tables of lines and points, in shards and in parallel.
 
 Entry point: ``run_batch.batch``. It finds the inputs (``inputs``), splits them into shards (``shards``, with
-``parquet_staging`` for formats that cannot be read in parts), runs the shards on an executor (``process_pool`` or
+``parquet_staging`` for inputs that must be read as a whole), runs the shards on an executor (``process_pool`` or
 ``dask_cluster``, both call ``worker.run_shard``), and records results and progress in a manifest (``manifest``).
 
 Design decisions:

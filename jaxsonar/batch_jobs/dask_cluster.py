@@ -14,7 +14,7 @@ from importlib import metadata
 from itertools import islice
 from typing import Any
 
-from jaxsonar.batch_jobs.shards import Shard
+from jaxsonar.batch_jobs.shard import Shard
 from jaxsonar.batch_jobs.worker import ShardResult, run_shard
 from jaxsonar.batch_jobs.worker_environment import (
     available_gpus,

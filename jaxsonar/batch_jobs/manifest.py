@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from jaxsonar.batch_jobs.parquet_tables import TABLES
-from jaxsonar.batch_jobs.shards import Shard
+from jaxsonar.batch_jobs.shard import Shard
 from jaxsonar.batch_jobs.worker import ShardResult
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder, reason, shown
 from jaxsonar.hardware.errors import SonarError

@@ -9,7 +9,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from socket import socketpair
 
-from jaxsonar.batch_jobs.shards import Shard
+from jaxsonar.batch_jobs.shard import Shard
 from jaxsonar.batch_jobs.worker import ShardResult
 from jaxsonar.batch_jobs.worker_environment import available_gpus, worker_count, worker_environment
 from jaxsonar.fileio.atomic_files import shown

@@ -12,7 +12,8 @@ from jaxsonar.batch_jobs.inputs import Input, find_inputs, fingerprint
 from jaxsonar.batch_jobs.manifest import MANIFEST_NAME, STAGING_NAME, Manifest, Record, open_manifest
 from jaxsonar.batch_jobs.parquet_staging import check_extras
 from jaxsonar.batch_jobs.parquet_tables import check_parquet
-from jaxsonar.batch_jobs.shards import SHARD_SCANS, Shard, split_input
+from jaxsonar.batch_jobs.shard import Shard
+from jaxsonar.batch_jobs.shards import SHARD_SCANS, split_input
 from jaxsonar.batch_jobs.worker import ShardResult, job_spec
 from jaxsonar.detection.settings import check_method, check_sigma, hough_settings
 from jaxsonar.fileio.atomic_files import shown

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Int
 
-from jaxsonar.batch_jobs.shards import Shard
+from jaxsonar.batch_jobs.shard import Shard
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.log_chunks import csv_chunk_reader, parquet_chunk_reader

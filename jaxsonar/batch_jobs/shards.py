@@ -2,14 +2,18 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from jaxsonar.batch_jobs.inputs import Input
+from jaxsonar.batch_jobs.parquet_staging import regroup, stage_whole
+from jaxsonar.batch_jobs.shard import Shard
+from jaxsonar.batch_jobs.shard_reader import concatenate, read_shard
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.recordings.input_options import InputOptions
-from jaxsonar.scans.log_chunks import LogChunk, csv_chunks, parquet_chunks
+from jaxsonar.recordings.prepared_log import prepared_log
+from jaxsonar.scans.log_chunks import csv_chunks, parquet_chunks
 from jaxsonar.sensors.ring import Ring
 
 SHARD_SCANS = 2048
@@ -19,28 +23,6 @@ MAX_ROW_GROUP = 32 * SHARD_SCANS
 shard would read all of a group."""
 HEAD_SCANS = 2048
 """Number of scans at the beginning of a log that decide whether it must be prepared as a whole."""
-
-
-@dataclass(frozen=True)
-class Shard:
-    """Consecutive scans of one log: one task, and one file per table."""
-
-    key: str
-    """Name of its files, without suffix."""
-    source: str
-    """Name of the log."""
-    filename: str
-    """File to read: the log, or its staged copy."""
-    format: str
-    """csv or parquet."""
-    size: int
-    """Size of that file when the shard was planned, bytes."""
-    modified_ns: int
-    """Modification time of that file when the shard was planned, nanoseconds."""
-    chunk: LogChunk
-    """The scans in that file."""
-    odometry: str = ""
-    """NumPy file with the motion of the robot (``Log.motion``) in a staged copy; empty if there is none."""
 
 
 def split_input(
@@ -69,7 +51,6 @@ def split_input(
     Raises:
         SonarError: the input cannot be read, or is not a log.
     """
-    from jaxsonar.batch_jobs.parquet_staging import regroup, stage_whole
 
     def copy() -> str:
         staging.mkdir(exist_ok=True)
@@ -101,9 +82,6 @@ def _split(log: Input, filename: str, format_: str, scans: int) -> list[Shard]:
 
 def _head_is_prepared(shards: list[Shard], ring: Ring, on_note: Callable[[str], None]) -> bool:
     """Whether the first scans of a log need no preparation; only then its warnings are reported here."""
-    from jaxsonar.batch_jobs.shard_reader import concatenate, read_shard
-    from jaxsonar.recordings.prepared_log import prepared_log
-
     if not shards:
         return True
     if shards[0].chunk.in_turn:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from jaxsonar.batch_jobs.shards import Shard
+from jaxsonar.batch_jobs.shard import Shard
 from jaxsonar.batch_jobs.worker_environment import use_single_thread
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
