@@ -55,22 +55,25 @@ class _NameTable(msgspec.Struct, forbid_unknown_fields=True):
     topic: _Name = ""
 
 
-class _File(msgspec.Struct, forbid_unknown_fields=True):
+class _FileHead(msgspec.Struct, forbid_unknown_fields=True):
     name: Annotated[str, Meta(description="a text")]
     speed_of_sound: Annotated[float, Meta(gt=0, description="a finite number above 0 (m/s)")] = REFERENCE_SPEED_OF_SOUND
     ring: Annotated[_RingTable | None, Meta(description="one table [ring]")] = None
     array: Annotated[_ArrayTable | None, Meta(description="one table [array]")] = None
-    sensor: Annotated[list[_SensorTable] | None, Meta(description="tables [[sensor]], one a sensor")] = None
     # Results of a calibration; ignored here.
     calibration: Annotated[dict[str, Any] | None, Meta(description="one table [calibration]")] = None
 
 
-class _CircleFile(_File, forbid_unknown_fields=True):
+class _ArrayFile(_FileHead, forbid_unknown_fields=True):
+    sensor: Annotated[list[_SensorTable] | None, Meta(description="tables [[sensor]], one a sensor")] = None
+
+
+class _CircleFile(_FileHead, forbid_unknown_fields=True):
     sensor: Annotated[list[_NameTable] | None, Meta(description="tables [[sensor]], one a sensor")] = None
 
 
-_TABLES = {"": _File, "ring": _RingTable, "array": _ArrayTable, "sensor": _SensorTable}
-_CIRCLE_TABLES = _TABLES | {"sensor": _NameTable}
+_TABLES = {"": _ArrayFile, "ring": _RingTable, "array": _ArrayTable, "sensor": _SensorTable}
+_CIRCLE_TABLES = _TABLES | {"": _CircleFile, "sensor": _NameTable}
 
 
 def shipped_rings() -> tuple[str, ...]:
@@ -124,10 +127,10 @@ def load_ring(filename: str | os.PathLike[str]) -> Ring:
         raise SonarError(f"{shown(file)}: {error}") from None
 
 
-def _ring(given: _File) -> Ring:
-    sensors = given.sensor or []
-    names = [_name(k, sensor) for k, sensor in enumerate(sensors)]
-    if given.ring is not None:
+def _ring(given: _ArrayFile | _CircleFile) -> Ring:
+    names = [_name(k, sensor) for k, sensor in enumerate(given.sensor or [])]
+    if isinstance(given, _CircleFile):
+        assert given.ring is not None
         return Ring.circular(
             count=given.ring.count,
             radius=given.ring.radius,
@@ -140,6 +143,7 @@ def _ring(given: _File) -> Ring:
             names=names,
         )
     assert given.array is not None
+    sensors = given.sensor or []
     return Ring(
         np.array([(sensor.x, sensor.y) for sensor in sensors]),
         np.radians([sensor.heading_deg for sensor in sensors]),
@@ -239,11 +243,11 @@ def _degrees(angle: float) -> float:
     return round(math.degrees(angle), 12) + 0.0
 
 
-def _read(file: Path) -> _File:
+def _read(file: Path) -> _ArrayFile | _CircleFile:
     data = read_toml(file, what="a ring")
     _refuse_not_finite(file, {key: value for key, value in data.items() if key != "calibration"}, "")
     try:
-        return msgspec.convert(data, type=_CircleFile if "ring" in data and "array" not in data else _File)
+        return msgspec.convert(data, type=_CircleFile if "ring" in data and "array" not in data else _ArrayFile)
     except (msgspec.ValidationError, OverflowError) as failure:
         _refuse(file, data, str(failure))
 

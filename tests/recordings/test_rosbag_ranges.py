@@ -1,5 +1,7 @@
 """Meaning of the values of sensor_msgs/Range (REP 117), and of what drivers send instead."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,7 +12,7 @@ from jaxsonar.recordings.rosbag_ranges import ECHO, NOT_MEASURED, SILENT, readin
 INF, NAN = np.inf, np.nan
 
 
-def kinds(values, low=0.02, high=3.0, ring_max_range=4.0):
+def kinds(values, low: Any = 0.02, high: Any = 3.0, ring_max_range: float | None = 4.0):
     """Kinds of readings, after 32-bit messages, and the notes."""
     notes = []
     reported, low, high = (

@@ -1,6 +1,7 @@
 """Rings from the transforms and messages of a bag."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def described(kind="sqlite", names=NAMES, *, quaternion=None, view=None):
     return bag
 
 
-def assert_same_ring(ring, order=slice(None)):
+def assert_same_ring(ring, order: Any = slice(None)):
     np.testing.assert_allclose(ring.position, np.asarray(RING.position)[order], atol=2e-6)
     np.testing.assert_allclose(np.exp(1j * ring.heading), np.exp(1j * np.asarray(RING.heading)[order]), atol=1e-8)
     np.testing.assert_allclose(ring.beam, np.asarray(RING.beam)[order], atol=1e-6)

@@ -1,5 +1,7 @@
 """Names of the sensors of a bag: a mapping or certain numbers, otherwise a question in one line."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,7 +12,7 @@ from jaxsonar.recordings.rosbag_sensors import BagSensor, sensor_indices
 SIDES = ["front", "front_left", "left", "rear_left", "rear", "rear_right", "right", "front_right"]
 
 
-def resolved(frames, topics=None, *, count=8, ring_names=(), given=None):
+def resolved(frames, topics=None, *, count: int | None = 8, ring_names=(), given=None) -> tuple[Any, list[str]]:
     """Indices of sensors, and the notes."""
     topics = topics or [f"/range/{k}" if len(set(frames)) < len(frames) else f"/{one}" for k, one in enumerate(frames)]
     sensors = [BagSensor(topic, frame) for topic, frame in zip(topics, frames, strict=True)]
@@ -126,8 +128,9 @@ def test_names_are_given(place, rng):
         [f"/hcsr04_{side}" for side in SIDES],
     ):
         pairs = {name: k for k, name in enumerate(names)}
-        given = {"given": pairs} if place == "option" else {"ring_names": names}
-        index, notes = resolved(frames, topics, **given)
+        index, notes = (
+            resolved(frames, topics, given=pairs) if place == "option" else resolved(frames, topics, ring_names=names)
+        )
         assert index == order.tolist()
         assert notes[0].startswith("sensors: 8 by name: ")
 

@@ -176,7 +176,9 @@ def firing_log(ring: Ring, room: Room, pose_at, times, *, sigma=0.003, seed=0) -
     )
 
 
-def bag_of_firings(log: Log, kind="sqlite", *, names="sonar_{}", pose_at=None, odometry_period=0.02, no_echo=np.inf):
+def bag_of_firings(
+    log: Log, kind="sqlite", *, names: str | list[str] = "sonar_{}", pose_at=None, odometry_period=0.02, no_echo=np.inf
+):
     """The messages of a bag with one Range topic per sensor, and odometry at its own rate.
 
     Args:
