@@ -51,8 +51,9 @@ def endless(scans: float) -> Iterator[Message]:
             if isinstance(message, Group) and message.scan + k * len(stamps) >= scans:
                 return
             shifted = {"sequence": message.sequence + k * len(messages), "time_us": message.time_us + k * lap_us}
-            if isinstance(message, Group):
+            if isinstance(message, Group):  # the groups follow each other; the robot stands during a scan
                 shifted["scan"] = message.scan + k * len(stamps)
+                shifted["time_us"] += round(1e6 * SCAN / message.groups) * message.group
             yield replace(message, **shifted)
 
 
