@@ -58,8 +58,6 @@ def run(options: argparse.Namespace) -> None:
     write_figure(figure, options.figure)
     if options.json != "-":
         print_tables(health_table(health))
-    if health.unmeasured:
-        print_status(f"not measured: {', '.join(health.unmeasured)}")
     for finding in health.findings:
         print_status(finding)
     print_status(f"{len(log)} scans, {plural(len(health.findings), 'finding')}" if health.source else health.empty)

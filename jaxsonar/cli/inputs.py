@@ -209,6 +209,23 @@ def load_all_inputs(
     return ring, logs
 
 
+def _check_names_are_used(name: str, options: argparse.Namespace) -> None:
+    """Check that options with names of sensors or topics belong to the format of a log.
+
+    Raises:
+        SonarError: they do not.
+    """
+    if not options.sensor and options.odometry_topic is None:
+        return
+    from jaxsonar.fileio.atomic_files import shown
+    from jaxsonar.recordings.file_content import file_content
+
+    content = file_content(name)
+    if (options.from_ or content.format) in ("csv", "parquet", "record", "beesoft", "corridor8", "scitos24", "sew-amr"):
+        option = "--sensor" if options.sensor else "--odometry-topic"
+        raise SonarError(f"{shown(name)}: {option} came with {content.description}; allowed is it with a ROS bag")
+
+
 def nothing_used(ring: "Ring", log: "Log", name: str) -> bool:
     """Whether no echo of a log can be used; prints the reason."""
     from jaxsonar.fileio.atomic_files import shown
@@ -225,14 +242,16 @@ def read_log(name: str, options: argparse.Namespace, messages: InputMessages, *,
     """Read a log as its options say; nothing is changed in it.
 
     Raises:
-        SonarError: it cannot be read.
+        SonarError: it cannot be read, or an option does not belong to its format.
     """
     from jaxsonar.recordings.load_log import load_log
     from jaxsonar.scans.recording_journal import TruncatedRecording
 
+    reading = input_options(options)
+    _check_names_are_used(name, options)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", TruncatedRecording)
-        log = load_log(name, ring=ring, options=input_options(options), on_note=messages.note)
+        log = load_log(name, ring=ring, options=reading, on_note=messages.note)
     for one in caught:
         if issubclass(one.category, TruncatedRecording):
             messages.warn(f"{one.message}; the recording was interrupted; its complete scans are used")

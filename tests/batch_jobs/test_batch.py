@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.bags import firing_log, sonar_ring, spinning
 from support.batches import JOB, RING, office_scans, one_shard
 from support.commands import HEADER
+from support.input_files import WALLS
 
-from jaxsonar import Log, SonarError, batch, load_log, local_models, save_log
+from jaxsonar import Log, Room, SonarError, batch, load_log, local_models, save_log
 from jaxsonar.batch_jobs import process_pool, worker_environment
 from jaxsonar.batch_jobs.inputs import find_inputs
 from jaxsonar.batch_jobs.manifest import open_manifest
@@ -23,6 +25,7 @@ from jaxsonar.batch_jobs.scan_tables import scan_tables
 from jaxsonar.batch_jobs.shards import split_input
 from jaxsonar.batch_jobs.worker import run_shard
 from jaxsonar.detection.settings import hough_settings
+from jaxsonar.scans.single_firings import group_firings
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -383,3 +386,38 @@ def test_a_folder_with_other_content_is_rejected(logs, tmp_path):
     (tmp_path / "manifest.jsonl").write_text("hello\n")
     with pytest.raises(SonarError, match="this is no manifest of a batch"), open_manifest(tmp_path, {"batch": 1}):
         pass
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("in_turn", [False, True], ids=["scans with times and ages", "one firing per scan"])
+def test_the_split_does_not_change_the_results(tmp_path, in_turn):
+    """Of a robot that turns while its sensors fire; every third reading of a scan repeats the one before."""
+    ring = sonar_ring(16)
+    pose_at = spinning((1.7, 1.3), np.radians(40))
+    each = firing_log(ring, Room(WALLS), pose_at, np.arange(0.0, 6.0, 0.025))
+    log = each if in_turn else with_repetitions(group_firings(each))
+    save_log(log, tmp_path / "log.csv")
+    save_log(log, tmp_path / "log.parquet")
+    results = []
+    for name, scans in (("log.csv", 3), ("log.csv", 100), ("log.parquet", 4)):
+        folder = tmp_path / f"{name}-{scans}"
+        report = batch([tmp_path / name], ring, folder, workers=1, shard_scans=scans)
+        assert report.scans == 15
+        results.append([{**row, "source": ""} for row in table(folder, "lines")])
+    assert len(results[0]) > 30
+    assert results[0] == results[1] == results[2]
+    wanted = [
+        line for model in local_models(ring, group_firings(load_log(tmp_path / "log.csv"))) for line in model.lines
+    ]
+    np.testing.assert_allclose([row["rho"] for row in results[0]], [line.rho for line in wanted], atol=1e-5)
+
+
+def with_repetitions(log):
+    """A log of equal scans in which every third sensor reports its reading of the scan before again, with its age."""
+    columns = {name: getattr(log, name).copy() for name in ("range", "amplitude", "age")}
+    old = np.flatnonzero((log.tx % 3 == 0) & (log.echo_scan % 2 == 1))
+    fired = log.stamp[log.echo_scan] + log.t
+    for name in ("range", "amplitude"):
+        columns[name][old] = columns[name][old - 16]
+    columns["age"][old] = fired[old] - fired[old - 16]
+    return replace(log, **columns)

@@ -182,6 +182,7 @@ INVALID_CALLS = {
         ["table.csv", "table of numbers", "--from table"],
     ),
     "option of a table without one": ("convert log.csv out.csv --unit cm", {}, ["--unit", "--from table"]),
+    "name of a sensor of a log": (f"{LINES} --sensor left=1", {}, ["log.csv", "--sensor", "CSV", "ROS bag"]),
     "sensor without an index": (f"{LINES} --sensor left", {}, ["left", "NAME=INDEX"]),
     "sensor with two indices": (f"{LINES} --sensor left=1 --sensor left=2", {}, ["left=2", "left=1"]),
     "ring from a log": ("convert log.csv out.csv --ring-out r.toml", {}, ["--ring-out", "ROS bag"]),
