@@ -39,7 +39,7 @@ class _Line(NamedTuple):
     kind: str
     """sonar, #ROBOT, position:, time, begin or end."""
     values: tuple[float, ...] = ()
-    count: int = 0
+    announced: int = 0
     """sonar: number of ranges that the line announces."""
     fraction: str = ""
     """time: digits after the decimal point."""
@@ -76,8 +76,8 @@ def load_beesoft(filename: str | os.PathLike[str], *, on_note: Callable[[str], N
             x, y, heading = line.values
             readings.add_pose(now, x / 100, y / 100, math.remainder(math.radians(heading), math.tau))
         elif line.kind == "sonar":
-            if len(line.values) != line.count:
-                raise _fault(filename, line, f"{line.count} ranges, as the line announces")
+            if len(line.values) != line.announced:
+                raise _fault(filename, line, f"{line.announced} ranges, as the line announces")
             ranges = {k: _metres(value) for k, value in enumerate(line.values) if value > 0 or math.isnan(value)}
             silent += sum(map(math.isnan, ranges.values()))
             fired |= ranges.keys()
@@ -85,7 +85,7 @@ def load_beesoft(filename: str | os.PathLike[str], *, on_note: Callable[[str], N
                 pending = ranges  # its position follows
             else:
                 readings.add_scan(now, ranges)
-    sensors = max(line.count for line in lines if line.kind == "sonar")
+    sensors = max(line.announced for line in lines if line.kind == "sonar")
     on_note(f"Beesoft: {len(readings.stamp)} scans of {sensors} sonars, numbered as in the file; ranges in cm")
     if silent:
         on_note(f"{silent} ranges of {SATURATED:.1f} cm (255 inches) or more than {LARGEST:.0f} cm mean no echo")

@@ -56,6 +56,7 @@ def load_log(
         if (text := check_suffix(filename, content)) is not None:
             note(text)
     log = _read(filename, options.format or str(content.format), ring, options, note)
+    _check_numbering(filename, log, ring)
     return log if options.format == "table" else without_no_echo_values(log, options.no_echo)
 
 
@@ -118,6 +119,17 @@ def check_content(filename: str | os.PathLike[str], content: FileContent) -> Non
         raise SonarError(
             f"{shown(filename)}: this is {content.description}; name its format, if it is one: --from {content.format}"
         )
+
+
+def _check_numbering(filename: str | os.PathLike[str], log: Log, ring: "Ring | None") -> None:
+    """Raise an error if the sensors of a log are counted from 1."""
+    if ring is None or not len(log.tx):
+        return
+    first = min(int(log.tx.min()), int(log.rx.min()))
+    last = max(int(log.tx.max()), int(log.rx.max()))
+    if first == 1 and last == ring.count:
+        came = f"the sensors 1 to {last} came, so the log seems to count from 1"
+        raise SonarError(f"{shown(filename)}: {came}; allowed are 0 to {ring.count - 1}, the sensors of '{ring.name}'")
 
 
 def _no_note(text: str) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from jaxsonar.recordings.plausible_input import implausible_input
 from jaxsonar.scans.held_readings import find_held_readings, with_ages
 from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
 from jaxsonar.scans.scan_log import Log
@@ -23,6 +24,8 @@ def prepared_log(ring: Ring, log: Log, *, on_note: Callable[[str], None]) -> Log
         on_note: called with one line for each change; a line that begins with ``warning:`` is about a probable
             mistake: what, likely cause, what to do.
     """
+    for text in implausible_input(ring, log):
+        on_note(f"warning: {text}")
     if values := find_no_echo_values(log):
         listed = ", ".join(map(str, values))
         exact = " ".join(f"--no-echo {one.value:.6g}" for one in values if not one.sigma)

@@ -13,6 +13,9 @@ from jaxsonar.hardware.recorder import CsvRecorder, open_recorder
 from jaxsonar.hardware.recorder_base import Recorder, recording_marker
 from jaxsonar.scans.scan_log import Log, log_format
 
+MAX_MARKER_DIGITS = 20
+"""A marker with more digits is no size of a file."""
+
 
 class TruncatedRecording(UserWarning):
     """A recording is incomplete: its process was killed or is still writing."""
@@ -78,7 +81,7 @@ def recover_recording(filename: str | os.PathLike[str]) -> Log:
         return read_parquet(filename)  # complete; only the journal was not yet deleted
     text = read_bytes(source, what="a scan log (CSV)")
     marker = read_bytes(recording_marker(filename), what="the size of a log").strip()
-    size = int(marker) if marker.isdigit() else 0
+    size = int(marker or b"0") if len(marker) < MAX_MARKER_DIGITS and (marker or b"0").isdigit() else len(text) + 1
     complete = text[:size] if len(text) >= size else _without_last_scan(text)
     log = read_csv_text(source, complete) if b"\n" in complete else Log.from_scans([])
     if parquet or len(complete) < len(text):

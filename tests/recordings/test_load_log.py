@@ -168,3 +168,13 @@ def test_a_raw_recording_without_a_message_is_rejected(tmp_path):
 
     open_recorder(tmp_path / "raw.mcap").close()
     assert "raw.mcap: no message of a device can be read" in refused(load, tmp_path / "raw.mcap")
+
+
+def test_sensors_that_are_counted_from_1_are_named(tmp_path):
+    from jaxsonar import Ring
+
+    (tmp_path / "a.csv").write_text(f"{HEADER}\n" + "".join(f"0,,,,,{k},{k},1.5\n" for k in range(1, 9)))
+    with pytest.raises(ValueError, match="the sensors 1 to 8 came, so the log seems to count from 1; allowed are 0"):
+        load_log(tmp_path / "a.csv", ring=Ring.circular(count=8, neighbors=0))
+    assert len(load_log(tmp_path / "a.csv", ring=Ring.circular(count=9, neighbors=0)).tx) == 8
+    assert len(load_log(tmp_path / "a.csv").tx) == 8

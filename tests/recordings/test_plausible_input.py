@@ -1,0 +1,86 @@
+"""Warnings about probable mistakes of a log, and none about sound logs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.recordings import recorded
+from support.wandering_robot import RING, along_a_wall, log_of, ranges, trajectory
+
+from jaxsonar import Ring, load_log, load_ring, random_pose, random_room, simulate
+from jaxsonar.recordings.input_options import InputOptions
+from jaxsonar.recordings.plausible_input import implausible_input
+from jaxsonar.simulation.office import load_office
+
+POSES = trajectory()
+LOG = log_of(ranges(POSES), POSES)
+
+
+def warnings(ring, log):
+    """The warnings, each with its three parts."""
+    texts = [*implausible_input(ring, log)]
+    assert all(text.count("; ") == 2 and text.isprintable() for text in texts)
+    return texts
+
+
+def scaled(log, factor):
+    """The log with x and y in another unit."""
+    return replace(log, pose=log.pose * [factor, factor, 1])
+
+
+@pytest.mark.parametrize(("factor", "every"), [(1000, 1), (100, 8), (1000, 8)])
+def test_poses_in_millimetres_or_centimetres(factor, every):
+    (text,) = warnings(RING, scaled(LOG[::every], factor))
+    assert "the poses are in mm or cm" in text
+
+
+@pytest.mark.parametrize(
+    "poses", [trajectory(), trajectory() * [1, -1, -1], along_a_wall(), trajectory() + [0, 0, np.pi]]
+)
+def test_headings_in_degrees(poses):
+    poses = poses.copy()
+    poses[:, 2] += 0.7
+    turned = poses @ np.array([[np.cos(0.7), np.sin(0.7), 0], [-np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])
+    assert warnings(RING, replace(log_of(ranges(poses), turned))) == []
+    turned[:, 2] = np.degrees(turned[:, 2])
+    (text,) = warnings(RING, log_of(ranges(poses), turned))
+    assert "theta is in degrees" in text
+
+
+def test_falling_stamps():
+    stamp = LOG.stamp.copy()
+    stamp[200:] -= 30
+    (text,) = warnings(RING, replace(LOG, stamp=stamp))
+    assert text.startswith("the stamps fall 1 times, first from 119.900 s to 90.000 s; the clock was set")
+    stamp[10:20] = np.nan
+    assert len(warnings(RING, replace(LOG, stamp=stamp))) == 1
+
+
+@pytest.mark.parametrize("factor", [2.5, 39.37, 100, 1000])
+def test_ranges_in_another_unit(factor):
+    (text,) = warnings(RING, replace(LOG, range=LOG.range * factor))
+    assert "of the echoes are beyond the maximum range of the ring, 5 m; the ranges are lengths out and back" in text
+
+
+def test_sound_logs_have_no_warning():
+    assert warnings(RING, LOG) == []
+    assert warnings(RING, replace(LOG, pose=POSES + SIDEWAYS)) == []
+    assert warnings(RING, replace(LOG, pose=np.full((len(LOG), 3), np.nan))) == []
+    assert warnings(RING, LOG[:0]) == []
+    office = load_office()
+    log = simulate(office.ring, office.room, office.poses, sigma=0.003).as_log(office.ring, office.poses)
+    assert warnings(office.ring, log) == []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        room = random_room(rng)
+        poses = np.array([random_pose(rng, room) for _ in range(32)])
+        ring = Ring.circular(count=16, max_range=(0.8, 2.0, 4.0, 8.0)[seed])
+        assert warnings(ring, simulate(ring, room, poses, sigma=0.003, clutter=0.2).as_log(ring, poses)) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "format"), [("corridor8", "corridor8"), ("slip8", "corridor8"), ("scitos24", "scitos24")]
+)
+def test_recordings_have_no_warning(name, format):
+    log = load_log(recorded(name), options=InputOptions(format=format))
+    assert warnings(load_ring(format), log) == []
