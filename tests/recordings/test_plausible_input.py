@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.recordings import recorded
-from support.wandering_robot import RING, along_a_wall, log_of, ranges, trajectory
+from support.wandering_robot import RING, log_of, ranges, trajectory
 
 from jaxsonar import Ring, load_log, load_ring, random_pose, random_room, simulate
 from jaxsonar.recordings.input_options import InputOptions
@@ -21,30 +21,6 @@ def warnings(ring, log):
     texts = [*implausible_input(ring, log)]
     assert all(text.count("; ") == 2 and text.isprintable() for text in texts)
     return texts
-
-
-def scaled(log, factor):
-    """The log with x and y in another unit."""
-    return replace(log, pose=log.pose * [factor, factor, 1])
-
-
-@pytest.mark.parametrize(("factor", "every"), [(1000, 1), (100, 8), (1000, 8)])
-def test_poses_in_millimetres_or_centimetres(factor, every):
-    (text,) = warnings(RING, scaled(LOG[::every], factor))
-    assert "the poses are in mm or cm" in text
-
-
-@pytest.mark.parametrize(
-    "poses", [trajectory(), trajectory() * [1, -1, -1], along_a_wall(), trajectory() + [0, 0, np.pi]]
-)
-def test_headings_in_degrees(poses):
-    poses = poses.copy()
-    poses[:, 2] += 0.7
-    turned = poses @ np.array([[np.cos(0.7), np.sin(0.7), 0], [-np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])
-    assert warnings(RING, replace(log_of(ranges(poses), turned))) == []
-    turned[:, 2] = np.degrees(turned[:, 2])
-    (text,) = warnings(RING, log_of(ranges(poses), turned))
-    assert "theta is in degrees" in text
 
 
 def test_falling_stamps():
@@ -64,7 +40,6 @@ def test_ranges_in_another_unit(factor):
 
 def test_sound_logs_have_no_warning():
     assert warnings(RING, LOG) == []
-    assert warnings(RING, replace(LOG, pose=POSES + SIDEWAYS)) == []
     assert warnings(RING, replace(LOG, pose=np.full((len(LOG), 3), np.nan))) == []
     assert warnings(RING, LOG[:0]) == []
     office = load_office()
