@@ -25,7 +25,11 @@ class OdometrySettings:
     jump: tuple[float, float] = (0.2, 0.35)
     """Smallest jump between two messages, metres and radians."""
     max_speed: tuple[float, float] = (5.0, 8.0)
-    """Faster motion is a jump, too: metres and radians per second."""
+    """A jump is faster than this, metres and radians per second, ..."""
+    contrast: float = 3.0
+    """... and by this factor faster than the motion before and after it: vehicles may be fast."""
+    hold: float = 1e-6
+    """A pose is held until less than this time before a jump, seconds; larger than the resolution of a stamp."""
 
 
 SETTINGS = OdometrySettings()
@@ -122,13 +126,12 @@ class Odometry:
             note(f"odometry: {int((~known).sum())} messages without a finite pose or orientation are left out")
         time, first = np.unique(time[known], return_index=True)
         pose = pose[known][first]
-        step, turn, dt = (
-            np.hypot(*np.diff(pose[:, :2], axis=0).T),
-            np.abs(wrap_angle(np.diff(pose[:, 2]))),
-            np.diff(time),
-        )
-        jump = step > np.maximum(SETTINGS.jump[0], SETTINGS.max_speed[0] * dt)
-        jump |= turn > np.maximum(SETTINGS.jump[1], SETTINGS.max_speed[1] * dt)
+        step, turn = np.hypot(*np.diff(pose[:, :2], axis=0).T), np.abs(wrap_angle(np.diff(pose[:, 2])))
+        jump = np.zeros(len(step), bool)
+        for motion, least, fastest in zip((step, turn), SETTINGS.jump, SETTINGS.max_speed, strict=True):
+            jump |= _jumps(motion, np.diff(time), least, fastest)
+        if jump.size and jump[-1]:  # nothing follows this pose
+            time, pose, jump = time[:-1], pose[:-1], jump[:-1]
         rows = np.flatnonzero(jump)
         if len(rows):
             k = rows[np.argmax(step[rows])]
@@ -138,7 +141,7 @@ class Odometry:
         # The pose is held until just before the jump, so that nothing is interpolated across it.
         held = np.column_stack([np.nextafter(time[rows + 1], -np.inf), pose[rows]])
         samples = np.insert(np.column_stack([time, pose]), rows + 1, held, axis=0)
-        part = np.append(0, np.cumsum(jump))[: len(time)]
+        part = np.append(0, np.cumsum(jump))[: len(time)].astype(np.int64)
         part = np.insert(part, rows + 1, part[rows])
         return cls(samples, part)
 
@@ -157,7 +160,9 @@ class Odometry:
         gap = np.diff(stamp)
         longest = max(SETTINGS.max_gap, SETTINGS.max_gap_periods * float(np.median(gap)))
         moved = np.hypot(*np.diff(pose[:, :2], axis=0).T), np.abs(wrap_angle(np.diff(pose[:, 2])))
-        closed = (gap <= longest) | ((moved[0] <= SETTINGS.still[0]) & (moved[1] <= SETTINGS.still[1]))
+        still = (moved[0] <= SETTINGS.still[0]) & (moved[1] <= SETTINGS.still[1])
+        still &= np.append(gap[1:] >= SETTINGS.hold, True)  # not if the pose is only held
+        closed = (gap <= longest) | still
         before = np.searchsorted(stamp, time, side="right") - 1
         inside = (before >= 0) & (before < len(stamp) - 1)
         margin = np.minimum(gap[[0, -1]], longest)
@@ -168,3 +173,19 @@ class Odometry:
         """Number of the part without a jump at some times."""
         before = np.clip(np.searchsorted(self.samples[:, 0], time, side="right") - 1, 0, len(self.samples) - 1)
         return self.part[before]
+
+
+def _jumps(
+    motion: Float[np.ndarray, " steps"], dt: Float[np.ndarray, " steps"], least: float, fastest: float
+) -> Bool[np.ndarray, " steps"]:
+    """Which steps between messages are jumps.
+
+    Args:
+        motion: distance or angle of each step.
+        dt: time of each step, seconds.
+        least: smallest jump.
+        fastest: smallest speed of a jump.
+    """
+    speed = motion / dt
+    near = np.maximum(np.append(0.0, speed[:-1]), np.append(speed[1:], 0.0)) if len(speed) else speed
+    return (motion > least) & (speed > fastest) & (speed > SETTINGS.contrast * near)

@@ -141,6 +141,10 @@ def described_ring(
     Raises:
         SonarError: a frame is not connected to the robot frame, a sensor looks up or down, or values are missing.
     """
+    frames = [one.sensor.frame for one in sensors]
+    if shared := [one for one, times in Counter(frames).items() if times > 1]:
+        came = f"{Counter(frames)[shared[0]]} sensors have the frame '{shown(shared[0])}'"
+        raise SonarError(f"{shown(name)}: {came}; needed for a ring is a frame for each sensor")
     position, heading = [], []
     for one in sensors:
         matrix = tree.lookup(base, one.sensor.frame)
@@ -177,8 +181,6 @@ def described_ring(
         f"ring: {len(sensors)} sensors from the transforms to '{base}', beams from field_of_view, "
         f"max_range {max_range:g} m, {what}"
     )
-    frames = [one.sensor.frame for one in sensors]
-    names = frames if len(set(frames)) == len(frames) else [one.sensor.topic for one in sensors]
     return Ring(
         np.round(position, 6),
         np.radians(np.round(np.degrees(heading), 6)),
@@ -186,7 +188,7 @@ def described_ring(
         neighbors=0,
         max_range=float(f"{max_range:.6g}"),
         name=name,
-        names=names,
+        names=frames,
     )
 
 

@@ -104,6 +104,27 @@ def test_nothing_is_interpolated_across_a_jump():
     assert (np.diff(odometry.samples[:, 0]) > 0).all()
 
 
+def test_a_fast_vehicle_does_not_jump_and_a_last_jump_is_left_out():
+    time = np.arange(0, 4, 0.1)
+    fast = np.stack([15.0 * time, np.zeros_like(time), np.zeros_like(time)], axis=-1)
+    odometry = Odometry.of(time, fast, lambda text: pytest.fail(text))
+    np.testing.assert_allclose(odometry.poses(np.array([1.234]))[0, 0], 15 * 1.234)
+    last = np.zeros((40, 3))
+    last[-1] = 5.0
+    odometry = Odometry.of(time, last, lambda text: None)
+    np.testing.assert_array_equal(odometry.poses(np.array([3.85, 3.89])), np.zeros((2, 3)))
+
+
+def test_a_pose_is_not_held_for_long_before_a_jump():
+    time = np.array([0.0, 0.1, 0.2, 9.9, 10.0, 10.1])
+    pose = np.zeros((6, 3))
+    pose[4:, 0] = 3.0
+    assert Odometry.of(time, pose, lambda text: None).known(np.array([9.95])).all()
+    pose[3:, 0] = 80.0  # within 9.7 s
+    odometry = Odometry.of(time, pose, lambda text: None)
+    assert odometry.known(np.array([0.15, 5.0, 9.95])).tolist() == [True, False, True]
+
+
 def times(*streams):
     notes = []
     found = message_times(streams, notes.append)

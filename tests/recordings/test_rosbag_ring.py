@@ -70,6 +70,12 @@ def test_what_a_ring_needs(tmp_path):
     up = (0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5))
     with pytest.raises(SonarError, match="the x axis of frame 'us_a' points up or down"):
         ring_from_bag(described(quaternion=up).write(tmp_path / "up"))
+    one_frame = BagMessages()
+    one_frame.transform(0.0, "base_link", "sonars", (0, 0, 0))
+    for k in range(3):
+        one_frame.range(0.1 * k, 1.0, frame="sonars", topic=f"/us{k}")
+    with pytest.raises(SonarError, match="3 sensors have the frame 'sonars'; needed for a ring is a frame for each"):
+        ring_from_bag(one_frame.write(tmp_path / "one"))
     bag = BagMessages()
     bag.range(0.0, 1.0, frame="us_0")
     with pytest.raises(SonarError, match="no robot frame base_link came; no transforms came"):
