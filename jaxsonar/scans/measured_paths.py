@@ -64,13 +64,15 @@ def is_repeated(log: Log) -> Bool[np.ndarray, " readings"]:
     measured_at = measurement_times(log)
     # One group for each path and range (silent readings have a group of their own), sorted by time of measurement.
     reported = np.where(np.isnan(log.range), -1.0, log.range)
-    order = np.lexsort((log.echo_scan, measured_at, reported, log.rx, log.tx))
-    same = np.ones(max(len(order) - 1, 0), bool)
+    order = np.lexsort((measured_at, reported, log.rx, log.tx))
+    same = np.diff(measured_at[order]) < SETTINGS.same_measurement
     for column in (log.tx, log.rx, reported):
         same &= column[order[1:]] == column[order[:-1]]
-    later_scan = np.diff(log.echo_scan[order]) != 0
-    same &= later_scan & (np.diff(measured_at[order]) < SETTINGS.same_measurement)
-    repeated[order[1:]] = same & (log.age[order[1:]] > 0)
+    begins = np.flatnonzero(np.append(True, ~same))
+    # Of the readings of one measurement, those of the first scan stand for it.
+    scan = log.echo_scan[order]
+    first = np.repeat(np.minimum.reduceat(scan, begins), np.diff(np.append(begins, len(order))))
+    repeated[order] = (scan > first) & (log.age[order] > 0)
     return repeated
 
 

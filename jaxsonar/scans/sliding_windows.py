@@ -139,8 +139,10 @@ class WindowBuffer:
         heard = np.isfinite(log.range)
         readings = [*zip(*(column[heard].tolist() for column in (log.tx, log.rx, log.range)), strict=True)]
         runs = {reading: self.runs.get(reading, -1) + 1 for reading in readings}
+        listed = has_ages or not len(log.asked)
         if not np.isfinite(scan.pose).all():
-            latest = {pair: one._replace(place=-1) for pair, one in self.latest.items()}
+            latest = _new_measurements(log, self.latest, -1)[1] if listed else self.latest
+            latest = {pair: one._replace(place=-1) for pair, one in latest.items()}
             return WindowBuffer(runs=runs, place=self.place, latest=latest, has_ages=has_ages), False
         travelled, place, at_rest = 0.0, self.place, False
         if self.scans:
@@ -150,7 +152,7 @@ class WindowBuffer:
             place += distance / SETTINGS.place_distance + abs(float(wrap_angle(step[2]))) / SETTINGS.place_rotation
             at_rest = np.floor(place) == np.floor(self.place)
         fresh, new, latest = frozenset(), frozenset(), self.latest
-        if has_ages or not len(log.asked):
+        if listed:
             new, latest = _new_measurements(log, self.latest, int(np.floor(place)))
         elif not at_rest:
             fresh = frozenset(r for r, run in runs.items() if run % SETTINGS.renewal_period == 0)

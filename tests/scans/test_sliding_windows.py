@@ -1,6 +1,7 @@
 """Sliding windows, incremental and of whole logs, against loops and matrices."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,9 +11,11 @@ from hypothesis import strategies as st
 from support import oracles
 
 from jaxsonar import HoughSettings, Log, Ring, SonarError, local_models
-from jaxsonar.geometry.se2 import relative, wrap_angle
+from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.scans.flat_echoes import FlatEchoes
+from jaxsonar.scans.measured_paths import is_repeated
 from jaxsonar.scans.scan_log import Scan
+from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.scans.sliding_windows import SETTINGS as WINDOWS
 from jaxsonar.scans.sliding_windows import WindowBuffer, gather_windows, has_moved, is_fresh_reading
 
@@ -370,9 +373,10 @@ def test_incremental_windows_handle_duplicates_in_a_scan():
 def test_adding_a_scan_does_not_change_the_buffer():
     log = a_log(5, missing=0.0)
     buffer, _ = WindowBuffer().add(log[0], length=1.0)
-    before = (buffer.scans, buffer.travelled, buffer.fresh, dict(buffer.runs), buffer.place)
+    before = (buffer.scans, buffer.travelled, buffer.fresh, dict(buffer.runs), buffer.place, dict(buffer.latest))
     buffer.add(log[1], length=1.0)
-    assert (buffer.scans, buffer.travelled, buffer.fresh, dict(buffer.runs), buffer.place) == before
+    after = (buffer.scans, buffer.travelled, buffer.fresh, dict(buffer.runs), buffer.place, dict(buffer.latest))
+    assert after == before
 
 
 def test_the_buffer_drops_scans_older_than_a_window():
@@ -385,3 +389,119 @@ def test_the_buffer_drops_scans_older_than_a_window():
         buffer, _ = buffer.add(step(scan=k, pose=np.array([k / 8, 0.0, 0.0])), length=1.0)
         assert len(buffer.scans) <= 9
     assert [scan.scan for scan in buffer.scans] == list(range(191, 200))
+
+
+# logs that list what was measured
+
+
+def listed_log(seed, *, scans=40, in_turn=False, ages=True):
+    """Readings of four sensors and silence, with poses of a stop-and-go robot; some readings repeat an older one."""
+    rng = np.random.default_rng(seed)
+    step = rng.choice([0.0, 0.004, 0.1], scans - 1)[:, None] * [1.0, 0.2, 0.3]
+    poses = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
+    poses[rng.random(scans) < 0.05] = np.nan
+    rows, latest = [], {}
+    for scan in range(scans):
+        for sensor in [scan % 4] if in_turn else range(4):
+            if sensor in latest and ages and rng.random() < 0.3:
+                reported, measured_at = latest[sensor]
+                rows.append((scan, sensor, reported, 0.1 * scan - measured_at))
+            elif rng.random() < 0.9:
+                latest[sensor] = (rng.choice([1.0, 1.25, np.nan]), 0.1 * scan)
+                rows.append((scan, sensor, latest[sensor][0], 0.0))
+    scan, sensor, reported, age = np.array(rows).T
+    scan, sensor = scan.astype(int), sensor.astype(int)
+    return Log.from_echoes(
+        scan,
+        sensor,
+        sensor,
+        reported,
+        age=age,
+        stamp=0.1 * np.arange(scans),
+        pose=poses,
+        asked=np.zeros((0, 2), int),
+        odometry=np.array([[-10.0, 0, 0, 0], [10, 0, 0, 0]]),  # the readings belong to the poses of their scans
+    )
+
+
+def expected_weights(log, spans):
+    """Number of scans of all four sensors to which the measurements of each window amount, by a loop."""
+    seen, place, new, ever = {}, -1, [], set()
+    first = oracles.is_first_at_place(log.pose, WINDOWS.place_distance, WINDOWS.place_rotation)
+    repeated = is_repeated(log)
+    for scan in range(len(log)):
+        place += first[scan]
+        new.append([])
+        for row in range(log.start[scan], log.start[scan + 1]):
+            sensor = int(log.tx[row])
+            if repeated[row]:
+                continue
+            ever.add(sensor)
+            if np.isfinite(log.pose[scan]).all() and seen.get(sensor) != place:
+                seen[sensor] = place
+                new[-1].append(sensor)
+    weights = []
+    for begin, last in spans:
+        counts = np.bincount([s for scan in new[begin : last + 1] for s in scan], minlength=4)
+        weights.append(counts.sum() / max((counts > 0).sum(), 1))  # the cones of the four sensors do not overlap
+    return np.maximum(weights, 1)
+
+
+@pytest.mark.slow
+@settings(max_examples=40)
+@given(st.integers(0, 10_000), st.booleans(), st.sampled_from([0.25, 0.7, 50.0]))
+def test_windows_weigh_measurements_and_count_each_path_once_at_a_place(seed, in_turn, length):
+    log = listed_log(seed, in_turn=in_turn)
+    windows, _ = gather_windows(FOUR, log, length=length)
+    wanted = expected_weights(log, oracles.window_spans(log.pose, length))
+    np.testing.assert_allclose(windows.echoes.scans_per_window, wanted, rtol=0.02)
+    assert_same_windows(FOUR, log, length)
+
+
+def test_firings_in_turn_weigh_as_much_as_the_same_firings_at_once():
+    """One firing per scan, or all four sensors in every fourth scan."""
+    poses = straight([0.02] * 79)
+    in_turn = log_of([[(k % 4, k % 4, 1.0 + k / 1000)] for k in range(80)], poses)
+    at_once = log_of([[(s, s, 1.0 + (4 * k + s) / 1000) for s in range(4)] for k in range(20)], poses[::4])
+    one, other = (gather_windows(FOUR, log, length=2.0)[0].echoes for log in (in_turn, at_once))
+    assert one.scans_per_window is not None
+    assert other.scans_per_window is not None
+    assert one.scans_per_window[-1] == pytest.approx(20, rel=0.05)
+    assert other.scans_per_window[-1] == pytest.approx(20)
+    assert len(one.scan) == pytest.approx(len(other.scan), rel=0.05)
+
+
+def test_silence_that_was_measured_weighs_and_what_was_not_measured_does_not():
+    poses, heard = straight([0.1] * 9), [[(0, 0, 1.0)]] * 10
+    silent = [[(0, 0, 1.0), (1, 1, np.nan)]] * 10
+    weights = []
+    for readings in (heard, silent):
+        log = replace(log_of(readings, poses), asked=np.zeros((0, 2), int))
+        (weight,) = gather_windows(FOUR, log, length=50.0)[0].echoes.scans_per_window
+        weights.append(weight * len({tx for tx, _, _ in readings[0]}))  # measurements
+    np.testing.assert_allclose(weights, [10, 20], rtol=0.02)
+
+
+def test_readings_of_a_robot_that_waits_between_firings_count_once_per_path():
+    """All four sensors fire in turn, twice, at the same place."""
+    log = log_of([[(k % 4, k % 4, 1.0 + k / 100)] for k in range(8)], np.zeros((8, 3)))
+    windows, _ = gather_windows(FOUR, log, length=1.0)
+    assert windows.scan.tolist() == [0, 1, 2, 3]
+
+
+def test_echoes_of_a_window_have_the_poses_of_their_own_times():
+    """Four sensors fire in turn within a scan, or in scans of their own."""
+    poses = straight([0.025] * 39)
+    single = log_of([[(k % 4, k % 4, 1.0)] for k in range(40)], poses)
+    grouped = group_firings(single)
+    assert len(grouped) == 10
+    for length in (0.5, 5.0):
+        world = []
+        for log in (single, grouped):
+            windows, _ = gather_windows(FOUR, log, length=length)
+            flat = windows.echoes
+            assert flat.pose is not None
+            at = compose(log.pose[windows.last[flat.scan]], flat.pose)
+            world.append({(int(p), round(float(x), 6)) for p, x in zip(flat.path, at[:, 0], strict=True)})
+        assert world[0] == world[1]
+        assert len(world[0]) == 40
