@@ -19,8 +19,8 @@ from jaxsonar.detection.settings import check_method, check_sigma, hough_setting
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.kernels import HoughSettings
+from jaxsonar.plausibility.unused_echoes import EchoCounts
 from jaxsonar.recordings.input_options import InputOptions
-from jaxsonar.scans.unused_echoes import EchoCounts
 from jaxsonar.sensors.ring import Ring
 
 ENGINES = ("local", "dask")

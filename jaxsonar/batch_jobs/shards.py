@@ -11,8 +11,8 @@ from jaxsonar.batch_jobs.shard import Shard
 from jaxsonar.batch_jobs.shard_reader import concatenate, read_shard
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.plausibility.prepared_log import prepared_log
 from jaxsonar.recordings.input_options import InputOptions
-from jaxsonar.recordings.prepared_log import prepared_log
 from jaxsonar.scans.log_chunks import csv_chunks, parquet_chunks
 from jaxsonar.sensors.ring import Ring
 

@@ -189,8 +189,8 @@ def load_all_inputs(
     options: argparse.Namespace, filenames: Sequence[str], *, as_recorded: bool = False
 ) -> tuple["Ring", list["Log"]]:
     """Load the ring of a command and several logs, as ``load_inputs``."""
-    from jaxsonar.recordings.prepared_log import prepared_log
-    from jaxsonar.scans.unheard_paths import unheard_warning
+    from jaxsonar.plausibility.prepared_log import prepared_log
+    from jaxsonar.plausibility.unheard_paths import unheard_warning
     from jaxsonar.sensors.ring_toml import load_ring
 
     messages = InputMessages(strict=options.strict)
@@ -229,7 +229,7 @@ def _check_names_are_used(name: str, options: argparse.Namespace) -> None:
 def nothing_used(ring: "Ring", log: "Log", name: str) -> bool:
     """Whether no echo of a log can be used; prints the reason."""
     from jaxsonar.fileio.atomic_files import shown
-    from jaxsonar.scans.unused_echoes import EchoCounts
+    from jaxsonar.plausibility.unused_echoes import EchoCounts
 
     with errors_in(name):
         reason = EchoCounts.of(ring, log).why_none_is_used(ring)

@@ -25,8 +25,8 @@ from jaxsonar.diagnostics.repeated_ranges import RepeatedRanges
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.diagnostics.swapped_sensors import find_exchanged_sensors
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
 from jaxsonar.scans.flat_echoes import FlatEchoes
-from jaxsonar.scans.held_readings import find_held_readings, with_ages
 from jaxsonar.scans.measured_paths import is_repeated
 from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
 from jaxsonar.scans.scan_log import Log

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
+from jaxsonar.plausibility.unheard_paths import neighbor_offsets, unheard_offsets
 from jaxsonar.scans.measured_paths import measured_paths
 from jaxsonar.scans.scan_log import Log
-from jaxsonar.scans.unheard_paths import neighbor_offsets, unheard_offsets
 from jaxsonar.sensors.ring import Ring
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jaxsonar.scans.unused_echoes import EchoCounts
+from jaxsonar.plausibility.unused_echoes import EchoCounts
 from jaxsonar.sensors.ring import Ring
 
 _REJECTED = ("oversized", "impossible", "out_of_ring", "unknown", "newer", "refused")

@@ -32,6 +32,7 @@ LAYERS = (
     ("sensors", "floor_plans"),
     ("scans",),
     ("recordings",),
+    ("plausibility",),
     ("simulation", "detection"),
     ("occupancy", "mapping", "registration", "batch_jobs"),
     ("diagnostics", "estimation"),

@@ -32,7 +32,8 @@ def implausible_input(ring: Ring, log: Log) -> Iterator[str]:
     fall = np.flatnonzero(np.diff(log.stamp) < 0)  # False for NaN
     if len(fall):
         before, after = log.stamp[fall[0] : fall[0] + 2]
-        what = f"the stamps fall {len(fall)} times, first from {before:.3f} s to {after:.3f} s"
+        times = "once" if len(fall) == 1 else f"{len(fall)} times, first"
+        what = f"the stamps fall {times} from {before:.3f} s to {after:.3f} s"
         yield f"{what}; the clock was set, or logs were joined; give the scans the times at which they were taken"
     heard = log.range[np.isfinite(log.range)]
     if len(heard) >= SETTINGS.least_echoes and (share := float(np.mean(heard > ring.max_range))) > SETTINGS.beyond:

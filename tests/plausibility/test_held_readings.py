@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.wandering_robot import RING, along_a_wall, held, log_of, ranges, trajectory
 
-from jaxsonar.scans.held_readings import find_held_readings, with_ages
+from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
 from jaxsonar.scans.measured_paths import unique_readings
 
 POSE = trajectory()

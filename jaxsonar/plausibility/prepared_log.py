@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-from jaxsonar.recordings.plausible_input import implausible_input
-from jaxsonar.scans.held_readings import find_held_readings, with_ages
+from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
+from jaxsonar.plausibility.implausible_input import implausible_input
+from jaxsonar.plausibility.unheard_paths import unheard_warning
 from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import group_firings
-from jaxsonar.scans.unheard_paths import unheard_warning
 from jaxsonar.sensors.ring import Ring
 
 
