@@ -77,12 +77,12 @@ def _silent_sensors(health: Health, measured: MeasuredSensors) -> Iterator[Findi
             )
         elif echoes[k] == 0 and others >= _FINDINGS.min_echoes and (measured.any[k] or not measured.certain):
             sentence = f"sensor {k} hears nothing: no echo in the log, the others {others:.0f} each"
-            doubt = "" if measured.any[k] else "; or it was not measured"
+            doubt = "" if measured.any[k] else "; it is dead, or was not measured"
             yield Finding(sentence + doubt, {k: "dead"}, exclusive=True)
         elif _never_in_one_role(measured, k) and others_cross >= _FINDINGS.min_echoes:
             remark, meaning = _ROLES[int(measured.cross[k, 0])]
             yield Finding(
-                f"sensor {k} is {remark}, {meaning}: no such echo in the log; or these paths were not measured",
+                f"sensor {k} is {remark}, {meaning}: no such echo in the log, unless these paths were not measured",
                 {k: remark},
                 exclusive=True,
             )
@@ -144,7 +144,7 @@ def _stuck_sensors(health: Health, pairs: Int[np.ndarray, " sensors"]) -> Iterat
                 {k: "stale"},
                 exclusive=True,
             )
-        elif health.direct[k] >= _FINDINGS.min_samples and constant > max(_FINDINGS.min_constant, 4 * usual_constant):
+        elif constant > max(_FINDINGS.min_constant, 4 * usual_constant):
             yield Finding(
                 f"sensor {k} reports exactly {value:.3f} m in {100 * constant:.0f} % of its direct echoes: is this its "
                 f"code for no echo?",
@@ -198,7 +198,7 @@ def _ring_findings(health: Health, measured: MeasuredSensors) -> Iterator[str]:
         yield f"cones are measured {width:.0f} ± {error:.0f} deg wide, the ring has {nominal:.0f} deg"
     usual_constant = _usual_constant_fraction(health)
     if usual_constant > 0.1:
-        value = float(np.median(health.constant[health.direct >= _FINDINGS.min_samples, 0]))
+        value = float(np.nanmedian(health.constant[:, 0]))
         yield (
             f"every sensor reports one range again and again, {value:.3f} m in {100 * usual_constant:.0f} % of its "
             f"echoes"
@@ -213,8 +213,8 @@ def _ring_findings(health: Health, measured: MeasuredSensors) -> Iterator[str]:
 
 def _usual_constant_fraction(health: Health) -> float:
     """Fraction of direct echoes with a sensor's most frequent range, the median over the sensors."""
-    many = health.direct >= _FINDINGS.min_samples
-    return float(np.median(health.constant[many, 1])) if many.any() else 0.0
+    known = np.isfinite(health.constant[:, 1])
+    return float(np.median(health.constant[known, 1])) if known.any() else 0.0
 
 
 def _usual_rates(health: Health) -> Float[np.ndarray, " 3"]:

@@ -58,9 +58,9 @@ class Health:
     spread: Float[np.ndarray, "sensors 2"]
     """1.4826 x median absolute deviation of the residuals of its direct echoes, and of all its echoes, metres."""
     repeats: Float[np.ndarray, " sensors"]
-    """Fraction of its first direct echoes with exactly the range of the previous scan."""
+    """Fraction of its first direct echoes with exactly the range of the previous scan, while the robot moved."""
     constant: Float[np.ndarray, "sensors 2"]
-    """Its most frequent range, metres, and the fraction of its direct echoes with that range."""
+    """Its most frequent range, metres, and the fraction of its direct echoes with that range, while the robot moved."""
     beam: Float[np.ndarray, " 2"]
     """Measured full width of the cones and its standard deviation, radians."""
     curve: Float[np.ndarray, " 4"]

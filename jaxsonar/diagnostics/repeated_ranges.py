@@ -5,20 +5,25 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.scans.measured_paths import is_repeated
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import has_moved
 
 
 class RepeatedRanges(NamedTuple):
-    """Repeated direct ranges of each sensor while the robot moved; all scans count if the log has no poses."""
+    """Repeated direct ranges of each sensor while the robot moved: a robot at rest reads the same again and again.
+
+    All scans count if the log has no poses.
+    """
 
     repeats: Float[np.ndarray, " sensors"]
     """Fraction of first direct echoes with exactly the range of the previous scan; NaN without such pairs."""
     pairs: Int[np.ndarray, " sensors"]
     """Number of pairs of consecutive scans that were compared."""
     constant: Float[np.ndarray, "sensors 2"]
-    """Most frequent range, metres, and the fraction of the direct echoes with that range; NaN without echoes."""
+    """Most frequent range, metres, and the fraction of the direct echoes with that range; NaN for fewer echoes than a
+    fraction needs (``FindingSettings.min_samples``)."""
 
     @classmethod
     def of(cls, log: Log, sensors: int) -> "RepeatedRanges":
@@ -37,6 +42,6 @@ class RepeatedRanges(NamedTuple):
         own = own[moved[log.echo_scan[own]]]
         for k in range(sensors):
             values, times = np.unique(log.range[own[log.tx[own] == k]], return_counts=True)
-            if len(values):
+            if times.sum() >= SETTINGS.findings.min_samples:
                 constant[k] = values[times.argmax()], times.max() / times.sum()
         return cls(np.where(pairs > 0, same / np.maximum(pairs, 1), np.nan), pairs, constant)

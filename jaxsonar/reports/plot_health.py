@@ -180,6 +180,8 @@ def _write_findings(axes: Axes, health: Health) -> None:
     findings = list(health.findings) or ["no findings" if health.source else ""]
     if health.empty:
         findings.insert(0, f"sensors are not compared with walls: {health.empty}")
+    if health.unmeasured:
+        findings.append(f"not measured: {', '.join(health.unmeasured)}")
     if health.source == "map":
         findings.append("walls from a map: residuals include errors of the poses and the delay of the sensors")
     lines = [line for text in findings if text for line in textwrap.wrap(f"• {text}", 150, subsequent_indent="   ")]

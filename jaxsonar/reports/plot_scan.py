@@ -20,7 +20,7 @@ from jaxsonar.detection.connected_components import label_components
 from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import hough_settings
 from jaxsonar.floor_plans.room import Room
-from jaxsonar.geometry.se2 import transform_points
+from jaxsonar.geometry.se2 import compose, transform_points
 from jaxsonar.reports.plot_style import (
     CROSS_COLOR,
     DIRECT_COLOR,
@@ -41,7 +41,9 @@ from jaxsonar.reports.plot_style import (
 )
 from jaxsonar.reports.text import plural
 from jaxsonar.scans.echo_batches import pack
+from jaxsonar.scans.firing_poses import path_poses
 from jaxsonar.scans.flat_echoes import FlatEchoes
+from jaxsonar.scans.measured_paths import measured_paths
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -83,7 +85,9 @@ def ring_figure(ring: Ring, *, transmitter: int = 0, arc_range: float | None = N
 def arcs_figure(
     ring: Ring, scan: Scan, *, room: Room | None = None, pose: Float[np.ndarray, "3"] | None = None
 ) -> Figure:
-    """Draw the arcs of a scan; paths without an echo as light arcs at the maximum range (paper, figure 3).
+    """Draw the arcs of a scan; measured paths without an echo as light arcs at the maximum range (paper, figure 3).
+
+    Each arc is drawn where the robot was when the path was measured. Readings that were not renewed are dashed.
 
     Args:
         ring: the sensors.
@@ -92,9 +96,8 @@ def arcs_figure(
         pose: world_from_robot (x, y, theta); by default the robot frame.
     """
     pose = np.zeros(3) if pose is None else pose
-    figure, axes = plan_view(f"Scan {scan.scan}: {len(scan.tx)} echoes on {len(ring.paths)} paths")
-    _draw_arcs(axes, ring, scan, pose)
-    handles = _arc_handles(ring)
+    figure, axes = plan_view(f"Scan {scan.scan}: {_echoes(scan)} on {_measured(ring, scan)}")
+    handles = _draw_arcs(axes, ring, scan, pose)
     if room is not None:
         draw_room(axes, room)
         handles += [wall_handle(), *pole_handles(room)]
@@ -120,8 +123,8 @@ def lines_figure(
         pose: world_from_robot (x, y, theta); by default the robot frame.
     """
     pose = np.zeros(3) if pose is None else pose
-    figure, axes = plan_view(f"Scan {scan.scan}: {plural(len(model.lines), 'line')} from {len(scan.tx)} echoes")
-    _draw_arcs(axes, ring, scan, pose, alpha=0.35)
+    figure, axes = plan_view(f"Scan {scan.scan}: {plural(len(model.lines), 'line')} from {_echoes(scan)}")
+    arc_handles = _draw_arcs(axes, ring, scan, pose, alpha=0.35)
     handles = [Line2D([], [], color=LINE_COLOR, lw=3, label="line segment")]
     if room is not None:
         draw_room(axes, room)
@@ -146,8 +149,7 @@ def lines_figure(
     handles.append(Line2D([], [], color=LINE_COLOR, lw=0.8, ls=(0, (4, 3)), label="infinite line"))
     handles += _draw_points(axes, model, pose)
     draw_robot(axes, ring, pose)
-    handles += _arc_handles(ring)
-    return finish_plan_view(figure, axes, [*handles, robot_handle()])
+    return finish_plan_view(figure, axes, [*handles, *arc_handles, robot_handle()])
 
 
 def accumulator_figure(
@@ -159,7 +161,8 @@ def accumulator_figure(
     packed = next(pack(ring, echoes, settings.cells)).packed
     arcs = arc_tables(ring, settings).arcs
     votes, smooth = (np.asarray(image)[0] for image in kernels.accumulators(arcs, packed, settings=settings))
-    level = float(arcs.vote_threshold)
+    scans = 1.0 if packed.scans_per_row is None else float(packed.scans_per_row[0])
+    level = float(arcs.vote_threshold) * scans  # as kernels.vote: relative to what was measured
     labels = np.abs(label_components((smooth > level)[None])[0][0, :-1])
 
     with figure_style():
@@ -242,26 +245,42 @@ def _tangent(theta: float) -> Float[np.ndarray, "2"]:
     return np.array([-np.sin(theta), np.cos(theta)])
 
 
-def _draw_arcs(axes: Axes, ring: Ring, scan: Scan, pose: Float[np.ndarray, "3"], *, alpha: float = 0.8) -> None:
+def _draw_arcs(axes: Axes, ring: Ring, scan: Scan, pose: Float[np.ndarray, "3"], *, alpha: float = 0.8) -> list[Line2D]:
+    """Draw echoes, and paths that were measured and heard nothing. Returns the legend handles."""
+    log = scan.as_log()
     path = ring.path_index[scan.tx, scan.rx]
-    audible = np.asarray(ring.echo_paths.width) > 0
     ranges = np.asarray(ring.corrected(scan.range, scan.tx, scan.rx))
-    has_echo = (path >= 0) & (ranges < ring.max_range)
+    has_echo = (path >= 0) & (ranges < ring.max_range)  # False for NaN
+    audible = measured_paths(ring, log)[0] & (np.asarray(ring.echo_paths.width) > 0)
     no_echo = np.setdiff1d(np.flatnonzero(audible), path[has_echo])
-    direct = scan.tx == scan.rx
-    for rows, arc_ranges, color, width in (
-        (no_echo, np.full(len(no_echo), ring.max_range), FAINT_COLOR, 0.6),
-        (path[has_echo & ~direct], ranges[has_echo & ~direct], CROSS_COLOR, 0.9),
-        (path[has_echo & direct], ranges[has_echo & direct], DIRECT_COLOR, 1.1),
-    ):
-        arcs = transform_points(pose, arc_points(ring, rows, arc_ranges))
-        axes.add_collection(
-            LineCollection(list(arcs), colors=color, linewidths=width, alpha=1.0 if color == FAINT_COLOR else alpha)
-        )
-
-
-def _arc_handles(ring: Ring) -> list[Line2D]:
+    moved = path_poses(ring, log)
+    poses = np.broadcast_to(pose, (len(ring.paths), 3)) if moved is None else compose(pose, moved[0])
+    direct, is_old = scan.tx == scan.rx, log.age > 0
+    groups = [(no_echo, np.full(len(no_echo), ring.max_range), FAINT_COLOR, 0.6, "-")]
+    for of_kind, color, width in ((~direct, CROSS_COLOR, 0.9), (direct, DIRECT_COLOR, 1.1)):
+        for of_age, style in ((~is_old, "-"), (is_old, (0, (3, 2)))):
+            of_it = has_echo & of_kind & of_age
+            groups.append((path[of_it], ranges[of_it], color, width, style))
+    for rows, arc_ranges, color, width, style in groups:
+        if style != "-" and not len(rows):
+            continue
+        arcs = transform_points(poses[rows][:, None], arc_points(ring, rows, arc_ranges))
+        opacity = 1.0 if color == FAINT_COLOR else alpha
+        axes.add_collection(LineCollection(list(arcs), colors=color, linewidths=width, alpha=opacity, linestyles=style))
     labels = {DIRECT_COLOR: "direct echo", FAINT_COLOR: f"no echo up to {ring.max_range:g} m"}
     if ring.neighbors:
         labels[CROSS_COLOR] = "cross echo"
-    return [Line2D([], [], color=color, lw=1.4, label=label) for color, label in labels.items()]
+    handles = [Line2D([], [], color=color, lw=1.4, label=label) for color, label in labels.items()]
+    if (has_echo & is_old).any():
+        handles.append(Line2D([], [], color=DIRECT_COLOR, lw=1.4, ls=(0, (3, 2)), label="old reading, not renewed"))
+    return handles
+
+
+def _echoes(scan: Scan) -> str:
+    return f"{scan.echo_count} echo{'es' * (scan.echo_count != 1)}"
+
+
+def _measured(ring: Ring, scan: Scan) -> str:
+    """The number of paths that a scan measured, as text."""
+    count, paths = int(measured_paths(ring, scan.as_log())[0].sum()), len(ring.paths)
+    return plural(paths, "path") if count == paths else f"{plural(count, 'measured path')} of {paths}"

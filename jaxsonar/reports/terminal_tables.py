@@ -172,8 +172,9 @@ def _health_caption(health: Health) -> str:
         else f"beam width {width:.1f} ± {error:.1f} deg"
     )
     noise = "" if math.isnan(health.sigma) else f"; range noise {1e3 * health.sigma:.1f} mm"
+    unmeasured = f"not measured: {', '.join(health.unmeasured)}\n" if health.unmeasured else ""
     return (
-        f"{scans}; {walls}{noise}\n{cone}, nominal {nominal:.0f} deg\n"
+        f"{scans}; {walls}{noise}\n{cone}, nominal {nominal:.0f} deg\n{unmeasured}"
         "expected, detected: echoes of walls well inside the cones, direct and cross; axis offset: counter-clockwise; "
         "±: one standard deviation"
     )

@@ -189,6 +189,26 @@ def test_all_audible_paths_of_a_scan_have_an_arc(faw_ring):
     assert cross == int((here.scan.tx != here.scan.rx).sum())
 
 
+@pytest.mark.slow
+def test_arcs_show_what_was_measured_and_when():
+    """Silence only of measured paths; old readings dashed; each arc where the robot was."""
+    ring = Ring.circular(count=8, neighbors=0)
+    time = np.array([-1.0, 1.0])
+    tx = np.array([0, 1, 2, 5])
+    log = Log.from_echoes(
+        np.zeros(4, int), tx, tx, np.array([1.0, 1.0, 1.0, np.nan]),
+        t=np.array([0.0, 0.5, 0.0, 0.5]), age=np.array([0.0, 0.0, 0.25, 0.0]), stamp=np.zeros(1), pose=np.zeros((1, 3)),
+        odometry=np.column_stack([time, 2 * time, np.zeros((2, 2))]),
+    )  # fmt: skip
+    axes = plot_scan.arcs_figure(ring, log[0]).axes[0]
+    drawn = [np.array(collection.get_segments()) for collection in axes.collections]
+    silent, direct, old = (segments.mean(axis=1) for segments in drawn if len(segments))
+    at_rest = plot_scan.arc_points(ring, np.array([5, 0, 1, 2]), np.array([2.0, 1.0, 1.0, 1.0])).mean(axis=1)
+    found = np.concatenate([silent, direct, old])
+    np.testing.assert_allclose(found - at_rest, [[1, 0], [0, 0], [1, 0], [-0.5, 0]], atol=1e-5)
+    assert "3 echoes on 4 measured paths of 8" in axes.get_title(loc="left")
+
+
 # Many scans
 
 
