@@ -187,9 +187,11 @@ def _odometry(chosen: Messages, time: Float[np.ndarray, " messages"], tree: Fram
     """Poses of the robot frame from the chosen messages, whose child frame may be another one."""
     pose = np.array(chosen.values, np.float64).reshape(-1, 3)
     base = tree.base()
-    if chosen.child and base and not chosen.child.split("/")[-1].startswith("base"):
-        matrix = tree.lookup(base, chosen.child)
-        if matrix is not None:
+    if chosen.child and not chosen.child.split("/")[-1].startswith("base"):
+        matrix = tree.lookup(base, chosen.child) if base else None
+        if matrix is None:
+            note(f"odometry: its frame '{chosen.child}' is taken for the robot frame, as no transform says otherwise")
+        else:
             note(f"odometry: moved from '{chosen.child}' to '{base}' by the transforms")
             pose = compose(pose, inverse(planar_pose(matrix)))
     return Odometry.of(time, pose, note)

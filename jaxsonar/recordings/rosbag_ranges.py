@@ -19,6 +19,8 @@ class RangeValueSettings:
     """A minimum that a larger share of the echoes stays below is no limit."""
     different_values: int = 10
     """A maximum that no echo stays below, but that so many different ranges exceed, is no limit."""
+    farthest: float = 20.0
+    """No ultrasound sensor hears farther in air, metres; 40 kHz loses over 1 dB per metre."""
     repetitions: int = 3
     """A range beyond the ring's maximum that is repeated exactly so often means no echo."""
 
@@ -50,7 +52,8 @@ def reading_kinds(
         low: minimum ranges of the messages, metres.
         high: maximum ranges of the messages, metres.
         ring_max_range: maximum range of the ring, metres; None if it is unknown.
-        note: called with one line about silent and invalid readings, and one about limits that are no limits.
+        note: called with one line about silent and invalid readings, about limits that are no limits, and with a
+            warning about ranges that are not in metres.
     """
     positive = np.isfinite(reported) & (reported > 0)
     low, high = _limits(reported, low, high, positive, note)
@@ -77,6 +80,10 @@ def reading_kinds(
         "NaN": np.isnan(reported),
         "-inf": np.isneginf(reported),
     }
+    echoes = reported[kind == ECHO]
+    if len(echoes) and np.median(echoes) > SETTINGS.farthest:
+        came = f"ranges of {echoes.min():.4g} to {echoes.max():.4g} m came"
+        note(f"warning: {came}; the driver probably sends cm or mm, not metres; correct the driver, or scale the bag")
     for value, meaning in ((SILENT, "no echo"), (NOT_MEASURED, "not measured")):
         parts = [f"{what} ({int(rows.sum())})" for what, rows in names.items() if (rows & (kind == value)).any()]
         if parts:

@@ -71,6 +71,14 @@ def test_limits_of_each_message():
     assert kinds([1.0, 1.0, 1.0], [0.02, 0.02, 1.5], [0.9, 2.0, 2.0])[0] == [SILENT, ECHO, NOT_MEASURED]
 
 
+@pytest.mark.parametrize("scale", [100, 1000])
+def test_ranges_in_other_units_are_a_warning(rng, scale):
+    kind, notes = kinds(scale * rng.uniform(0.3, 2.5, 50), 0.02 * scale, 3.0 * scale)
+    assert kind == [ECHO] * 50
+    assert len(notes) == 1
+    assert notes[0].startswith("warning: ranges of ")
+
+
 def test_sound_ranges_give_no_note(rng):
     assert kinds(rng.uniform(0.1, 2.9, 100)) == ([ECHO] * 100, [])
 
