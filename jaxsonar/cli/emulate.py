@@ -94,9 +94,7 @@ def _messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
             raise SonarError("--path or --sigma came with a log; allowed are they with a room (.geojson)")
         return _log_messages(options, ring)
     if options.from_ or options.sensor or options.no_echo or options.odometry_topic:
-        raise SonarError(
-            "--from, --sensor, --odometry-topic or --no-echo came with a room; allowed are they with a log"
-        )
+        raise SonarError("--from, --sensor, --odometry-topic or --no-echo came with a room; allowed with it is --path")
     if not options.path:
         raise SonarError("a room came without --path; needed is a trajectory, --path CSV")
     from jaxsonar.floor_plans.room_geojson import load_room

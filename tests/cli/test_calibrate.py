@@ -105,7 +105,7 @@ MISTAKES = {
     "log that is none": (
         "calibrate bad.csv --ring faw -o out.toml",
         {"bad.csv": "some\ntext\n"},
-        ["bad.csv", "row 1"],
+        ["bad.csv", "this is a text"],
     ),
     "figure of unknown suffix": (f"{OUT} --figure a.gif", {}, ["--figure", "a.gif", ".svg"]),
     "figure into a missing folder": (f"{OUT} --figure no/a.svg", {}, ["no/a.svg", "folder"]),
