@@ -19,10 +19,18 @@ from jaxsonar.recordings.rosbag_transforms import FrameTree
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
-SONAR_WORDS = ("sonar", "ultraso", "us_", "uss")
-"""A cloud whose topic contains one of these is one of sonar points."""
-MOST_POINTS = 4
-"""A cloud with more points per sensor of the ring is that of a laser or a camera."""
+
+@dataclass(frozen=True)
+class CloudSettings:
+    """Constants of the recognition of sonar points. Chosen by hand."""
+
+    words: tuple[str, ...] = ("sonar", "ultraso")
+    """A cloud whose topic contains one of these is one of sonar points."""
+    most_points: int = 4
+    """A cloud with more points per sensor of the ring is that of a laser or a camera."""
+
+
+SETTINGS = CloudSettings()
 
 
 def sonar_topics(topics: Sequence[Topic], *, name: str) -> list[str]:
@@ -31,13 +39,13 @@ def sonar_topics(topics: Sequence[Topic], *, name: str) -> list[str]:
     Raises:
         SonarError: several topics with points came, and none has such a name.
     """
-    named = [one.name for one in topics if any(word in one.name.lower() for word in SONAR_WORDS)]
+    named = [one.name for one in topics if any(word in one.name.lower() for word in SETTINGS.words)]
     if named or len(topics) < 2:
         return named or [one.name for one in topics]
     listed = ", ".join(one.name for one in topics)
     raise SonarError(
         f"{shown(name)}: several topics with points came: {shown(listed, 400)}; allowed are clouds of sonar points on "
-        "a topic whose name contains sonar"
+        "a topic whose name contains sonar or ultrasound"
     )
 
 
@@ -117,10 +125,10 @@ def _readings(
 ) -> CloudReadings:
     """Sensor and range of each point."""
     counts = np.array([len(some) for some in points])
-    if np.median(counts) > MOST_POINTS * ring.count:
+    if np.median(counts) > SETTINGS.most_points * ring.count:
         raise SonarError(
             f"{shown(name)}: clouds of {int(np.median(counts))} points came on {shown(one.topic)}; allowed are sonar "
-            f"points, at most {MOST_POINTS} for each of the ring's {ring.count} sensors"
+            f"points, at most {SETTINGS.most_points} for each of the ring's {ring.count} sensors"
         )
     message, p_robot = np.repeat(np.arange(len(points)), counts), np.concatenate([np.zeros((0, 2)), *points])
     position, heading = np.asarray(ring.position), np.asarray(ring.heading)

@@ -15,12 +15,21 @@ from jaxsonar.sensors.ring import Ring
 
 BASES = ("base_link", "base_footprint", "base")
 """Names of the robot frame, without namespace, the preferred one first."""
-SAME_PLACE = (0.1, np.radians(20))
-"""A frame and a sensor of a ring that differ by less are the same sensor, metres and radians."""
-MIN_HORIZONTAL = 0.5
-"""A sensor whose axis has a smaller horizontal part looks up or down and belongs to no ring."""
-MAX_FIELD_OF_VIEW = np.pi
-"""Largest field of view of an ultrasound sensor, radians."""
+
+
+@dataclass(frozen=True)
+class TransformSettings:
+    """Constants of the comparison of frames and sensors. Chosen by hand."""
+
+    same_place: tuple[float, float] = (0.1, float(np.radians(20)))
+    """A frame and a sensor of a ring that differ by less are the same sensor, metres and radians."""
+    min_horizontal: float = 0.5
+    """A sensor whose axis has a smaller horizontal part looks up or down and belongs to no ring."""
+    max_field_of_view: float = float(np.pi)
+    """Largest field of view of an ultrasound sensor, radians."""
+
+
+SETTINGS = TransformSettings()
 
 
 class FrameTree:
@@ -75,8 +84,8 @@ def places_in_ring(sensors: Sequence[BagSensor], tree: FrameTree, ring: Ring) ->
     for pose in poses:
         if pose is None:
             return None
-        distance = np.hypot(*(np.asarray(ring.position) - pose[:2]).T) / SAME_PLACE[0]
-        turn = np.abs(wrap_angle(np.asarray(ring.heading) - pose[2])) / SAME_PLACE[1]
+        distance = np.hypot(*(np.asarray(ring.position) - pose[:2]).T) / SETTINGS.same_place[0]
+        turn = np.abs(wrap_angle(np.asarray(ring.heading) - pose[2])) / SETTINGS.same_place[1]
         off = np.maximum(distance, turn)
         if off.min() > 1:
             return None
@@ -94,7 +103,7 @@ def warn_of_other_headings(
     if len({float(pose[2]) for _, _, pose in poses}) < 2:  # frames without orientations tell nothing
         return
     heading = np.asarray(ring.heading)
-    off = [(one, k, pose) for one, k, pose in poses if abs(wrap_angle(heading[k] - pose[2])) > SAME_PLACE[1]]
+    off = [(one, k, pose) for one, k, pose in poses if abs(wrap_angle(heading[k] - pose[2])) > SETTINGS.same_place[1]]
     if not off:
         return
     one, k, pose = off[0]
@@ -154,7 +163,7 @@ def described_ring(
                 f"{shown(name)}: frame '{shown(one.sensor.frame)}' of {shown(one.sensor.topic)} is not connected to "
                 f"'{shown(base)}'; needed for a ring is its transform in /tf_static; {shown(listed, 400)} came"
             )
-        if np.hypot(*matrix[:2, 0]) < MIN_HORIZONTAL:
+        if np.hypot(*matrix[:2, 0]) < SETTINGS.min_horizontal:
             raise SonarError(
                 f"{shown(name)}: the x axis of frame '{shown(one.sensor.frame)}' points up or down; allowed are "
                 "sensors that look along the floor"
@@ -163,10 +172,10 @@ def described_ring(
         position.append((x, y))
         heading.append(theta)
     beam = np.array([one.field_of_view for one in sensors])
-    unknown = ~((beam > 0) & (beam <= MAX_FIELD_OF_VIEW))
+    unknown = ~((beam > 0) & (beam <= SETTINGS.max_field_of_view))
     if unknown.all():
         came = ", ".join(f"{one:.4g}" for one in np.unique(beam))
-        needed = f"needed for a ring are radians above 0 and up to {MAX_FIELD_OF_VIEW:.4g}"
+        needed = f"needed for a ring are radians above 0 and up to {SETTINGS.max_field_of_view:.4g}"
         raise SonarError(f"{shown(name)}: field_of_view is {shown(came)}; {needed}")
     if unknown.any():
         beam[unknown] = np.median(beam[~unknown])
