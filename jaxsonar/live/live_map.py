@@ -205,9 +205,9 @@ class LiveMap:
 
     def _path_pose(self, scan: Scan) -> Float[np.ndarray, "paths 3"] | None:
         """Pose of the robot when each path was measured, relative to its pose at the first firing; None if it stood."""
-        poses = path_poses_of_scan(self.ring, scan)
-        moved = poses is not None and np.abs(poses).max() >= SETTINGS.standing_threshold
-        return poses if moved else None
+        if scan.odometry is None or np.ptp(scan.odometry[:, 1:], axis=0).max() < SETTINGS.standing_threshold:
+            return None
+        return path_poses_of_scan(self.ring, scan)
 
     def _follow_temperature(self, raw_scans: Sequence[RawScan]) -> None:
         measured = [raw.temperature for raw in raw_scans if not np.isnan(raw.temperature)]
