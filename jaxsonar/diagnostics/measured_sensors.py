@@ -31,15 +31,15 @@ class MeasuredSensors(NamedTuple):
     def of(cls, ring: Ring, log: Log) -> "MeasuredSensors":
         """Find what a log measured of a ring."""
         tx, rx = ring.paths.T
-        measured, offset = measured_paths(ring, log).any(axis=0), neighbor_offsets(ring)
-        audible = np.asarray(ring.exact_paths.width) > 0
+        measured, offset = np.any(measured_paths(ring, log), axis=0), neighbor_offsets(ring)
+        audible = np.greater(ring.exact_paths.width, 0)
         missing = [k for k in unheard_offsets(ring, log) if not measured[offset == k].any()]
         kinds = ["direct echoes"] if 0 in missing else []
         if neighbors := [k for k in missing if k]:
             kinds.append(f"echoes from neighbor{'s' * (len(neighbors) > 1)} {_listed(neighbors)}")
         # A sensor is judged by the kinds of paths that were measured at all.
-        exists = audible & ~np.isin(offset, missing)
-        cross = exists & (tx != rx)
+        exists = np.logical_and(audible, ~np.isin(offset, missing))
+        cross = np.logical_and(exists, tx != rx)
 
         def has(which: Bool[np.ndarray, " paths"], sensor: np.ndarray) -> Bool[np.ndarray, " sensors"]:
             return np.bincount(sensor[which], minlength=ring.count) > 0

@@ -192,7 +192,8 @@ def _may_stay(
     geometry = ring.exact_paths
     half = SETTINGS.cone_factor * geometry.width[path] / 2 + SETTINGS.cone_margin
     center = geometry.start[path] + geometry.width[path] / 2
-    origin, to = (transform_points(pose, geometry.midpoint[path]) for pose in (before, after))
+    midpoint = np.asarray(geometry.midpoint)[path]
+    origin, to = transform_points(before, midpoint), transform_points(after, midpoint)
     angle = (before[:, 2] + center)[:, None] + half[:, None] * np.linspace(-1, 1, SETTINGS.directions)
     way, axis = to - origin, (after[:, 2] + center)[:, None]
     # Change of the range of a wall with this normal, and of a point in this direction.

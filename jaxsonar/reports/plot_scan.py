@@ -1,6 +1,7 @@
 """Figures of one scan: the ring, the echo arcs, the accumulator and the lines (paper, figures 1 to 4)."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -256,7 +257,7 @@ def _draw_arcs(axes: Axes, ring: Ring, scan: Scan, pose: Float[np.ndarray, "3"],
     moved = path_poses(ring, log)
     poses = np.broadcast_to(pose, (len(ring.paths), 3)) if moved is None else compose(pose, moved[0])
     direct, is_old = scan.tx == scan.rx, log.age > 0
-    groups = [(no_echo, np.full(len(no_echo), ring.max_range), FAINT_COLOR, 0.6, "-")]
+    groups: list[tuple[Any, ...]] = [(no_echo, np.full(len(no_echo), ring.max_range), FAINT_COLOR, 0.6, "-")]
     for of_kind, color, width in ((~direct, CROSS_COLOR, 0.9), (direct, DIRECT_COLOR, 1.1)):
         for of_age, style in ((~is_old, "-"), (is_old, (0, (3, 2)))):
             of_it = has_echo & of_kind & of_age
