@@ -128,7 +128,8 @@ def ring_from_bag(
             raise _nothing(bag)
         candidates, tree = bag.read(ODOMETRY), FrameTree(_static_first(bag))
     sensors, ranges = _of_robot([BagSensor(one.topic, one.frame) for one in ranges], ranges, options, note)
-    children = [one.child for one in candidates if not options.odometry or one.topic == options.odometry]
+    wanted = (options.odometry or "").strip("/")
+    children = [one.child for one in candidates if wanted in ("", one.topic.strip("/"))]
     base = tree.base(next((child for child in children if child.split("/")[-1].startswith("base")), ""))
     if base is None:
         listed = ", ".join(sorted(tree.frames)) or "no transforms"
