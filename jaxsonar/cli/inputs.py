@@ -189,6 +189,7 @@ def load_all_inputs(
     options: argparse.Namespace, filenames: Sequence[str], *, as_recorded: bool = False
 ) -> tuple["Ring", list["Log"]]:
     """Load the ring of a command and several logs, as ``load_inputs``."""
+    from jaxsonar.plausibility.implausible_input import implausible_input
     from jaxsonar.plausibility.prepared_log import prepared_log
     from jaxsonar.plausibility.unheard_paths import unheard_warning
     from jaxsonar.sensors.ring_toml import load_ring
@@ -202,8 +203,10 @@ def load_all_inputs(
                 log = prepared_log(ring, log, on_note=messages.note)
             elif options.strict:
                 prepared_log(ring, log, on_note=messages.note)
-            elif (text := unheard_warning(ring, log)) is not None:
-                messages.warn(text)
+            else:
+                for text in (*implausible_input(ring, log), unheard_warning(ring, log)):
+                    if text is not None:
+                        messages.warn(text)
         logs.append(log)
     messages.check()
     return ring, logs

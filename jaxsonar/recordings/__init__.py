@@ -1,7 +1,6 @@
 """Recordings of any robot as logs.
 
-Entry points: ``load_log.load_log``, ``input_options.InputOptions``, ``prepared_log.prepared_log``,
-``rosbag_log.ring_from_bag``.
+Entry points: ``load_log.load_log``, ``input_options.InputOptions``, ``rosbag_log.ring_from_bag``.
 
 Design decisions:
 
