@@ -86,6 +86,7 @@ def test_the_motion_beyond_the_last_pose_is_extrapolated_by_one_interval_only():
 def test_paths_have_the_pose_of_their_readings():
     log = full_scans(np.array([0.0, 0.1, 0.2, 0.3]), np.zeros(4))
     poses = path_poses(RING, log)
+    assert poses is not None
     direct = RING.path_index[np.arange(4), np.arange(4)]
     assert_same_poses(poses[:, direct].reshape(-1, 3), reading_motion(log))
     assert not np.delete(poses, direct, axis=1).any()
