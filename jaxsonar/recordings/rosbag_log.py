@@ -59,8 +59,9 @@ def read_bag(
     """
     name, note = name or os.fspath(filename), on_note or _ignore
     with open_bag(filename, name) as bag:
-        ranges = _ultrasound(bag, note)
-        poses = _poses(bag, options)
+        messages = bag.read([*bag.named(RANGE), *bag.named(ODOMETRY), *_static_topics(bag)])
+        ranges = _ultrasound(messages, note)
+        poses = _poses(bag, messages, options)
         if not ranges:
             return _cloud_log(bag, poses, ring, options, note)
     sensors, ranges = _of_robot([BagSensor(one.topic, one.frame) for one in ranges], ranges, options, note)
@@ -123,10 +124,11 @@ def ring_from_bag(
     """
     name, note = name or os.fspath(filename), on_note or _ignore
     with open_bag(filename, name) as bag:
-        ranges = _ultrasound(bag, note)
+        messages = bag.read([*bag.named(RANGE), *bag.named(ODOMETRY), *bag.named(TRANSFORM)])
+        ranges = _ultrasound(messages, note)
         if not ranges:
             raise _nothing(bag)
-        candidates, tree = bag.read(ODOMETRY), FrameTree(_static_first(bag))
+        candidates, tree = _of_types(messages, ODOMETRY), FrameTree(_static_first(messages))
     sensors, ranges = _of_robot([BagSensor(one.topic, one.frame) for one in ranges], ranges, options, note)
     wanted = (options.odometry or "").strip("/")
     children = [one.child for one in candidates if wanted in ("", one.topic.strip("/"))]
@@ -147,16 +149,16 @@ class _Poses:
         self.tree = tree
 
 
-def _poses(bag: Bag, options: InputOptions) -> _Poses:
+def _poses(bag: Bag, messages: Sequence[Messages], options: InputOptions) -> _Poses:
     """Candidates for the robot's poses. ``/tf`` is read only if there is no odometry."""
     wanted = options.odometry and f"/{options.odometry.strip('/')}"
     types = {one.name: one.type for one in bag.topics}
-    candidates = bag.read(ODOMETRY)
+    candidates = _of_types(messages, ODOMETRY)
     if wanted and types.get(wanted) in POSE:
-        candidates += bag.read(POSE, [wanted])
+        candidates += bag.read([wanted])
     if candidates and types.get(wanted or "") not in TRANSFORM:
-        return _Poses(candidates, FrameTree(bag.read(TRANSFORM, _static_topics(bag))))
-    transforms = _static_first(bag)
+        return _Poses(candidates, FrameTree(_of_types(messages, TRANSFORM)))
+    transforms = _static_first(bag.read(bag.named(TRANSFORM)))
     moving = [one for one in transforms if one.topic not in _static_topics(bag) and len(one.values) > 1]
     robot = [
         Messages(
@@ -179,9 +181,13 @@ def _static_topics(bag: Bag) -> list[str]:
     return [one.name for one in bag.topics if one.type in TRANSFORM and one.name.endswith("static")]
 
 
-def _static_first(bag: Bag) -> list[Messages]:
+def _static_first(messages: Sequence[Messages]) -> list[Messages]:
     """All transforms, those of static topics first."""
-    return sorted(bag.read(TRANSFORM), key=lambda one: not one.topic.endswith("static"))
+    return sorted(_of_types(messages, TRANSFORM), key=lambda one: not one.topic.endswith("static"))
+
+
+def _of_types(messages: Sequence[Messages], types: Sequence[str]) -> list[Messages]:
+    return [one for one in messages if one.type in types]
 
 
 def _odometry(chosen: Messages, time: Float[np.ndarray, " messages"], tree: FrameTree, note: _Note) -> Odometry:
@@ -198,10 +204,10 @@ def _odometry(chosen: Messages, time: Float[np.ndarray, " messages"], tree: Fram
     return Odometry.of(time, pose, note)
 
 
-def _ultrasound(bag: Bag, note: _Note) -> list[Messages]:
+def _ultrasound(messages: Sequence[Messages], note: _Note) -> list[Messages]:
     """The ultrasound ranges by topic and frame; others are left out and reported."""
     found, others = [], {}
-    for one in bag.read(RANGE):
+    for one in _of_types(messages, RANGE):
         radiation = np.array([value[4] for value in one.values])
         if (rest := radiation != 0).any():
             others[one.frame or one.topic] = int(rest.sum())
@@ -254,7 +260,7 @@ def _cloud_log(bag: Bag, poses: _Poses, ring: Ring | None, options: InputOptions
         raise SonarError(
             f"{shown(bag.name)}: sonar points came; needed is the ring, which tells the sensor of each point"
         )
-    streams = bag.read(CLOUD, sonar_topics(clouds, name=bag.name))
+    streams = _of_types(bag.read(sonar_topics(clouds, name=bag.name)), CLOUD)
     chosen = choose_odometry(
         poses.candidates,
         wanted=options.odometry,
@@ -263,7 +269,7 @@ def _cloud_log(bag: Bag, poses: _Poses, ring: Ring | None, options: InputOptions
         note=note,
     )
     times = message_times([*([chosen] if chosen else []), *streams], note)
-    tree = FrameTree(_static_first(bag))
+    tree = FrameTree(_static_first(bag.read(bag.named(TRANSFORM))))
     odometry = None if chosen is None else _odometry(chosen, times[0], tree, note)
     log = log_from_clouds(
         streams,

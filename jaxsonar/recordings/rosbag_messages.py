@@ -49,6 +49,7 @@ class Messages:
     """Place in the bag."""
     values: list[Any]
     """What the message says, one each: see ``_VALUES``."""
+    type: str = ""
 
     @property
     def path(self) -> str:
@@ -99,17 +100,17 @@ class Bag:
             counts[key] = counts.get(key, 0) + one.msgcount
         return [Topic(*key, messages) for key, messages in sorted(counts.items()) if messages]
 
-    def read(self, types: Collection[str], topics: Collection[str] | None = None) -> list[Messages]:
-        """The messages of some types, by topic and frame, in the order of their first message.
+    def named(self, types: Collection[str]) -> list[str]:
+        """The topics with messages of some types."""
+        return [one.name for one in self.topics if one.type in types]
 
-        Args:
-            types: names of message types.
-            topics: only these topics; None: all.
+    def read(self, topics: Collection[str]) -> list[Messages]:
+        """The messages of some topics, by topic, type and frame, in the order of their first message.
+
+        Every call reads the file once, and types that this module does not know are left out.
         """
         wanted = [
-            one
-            for one in self._reader.connections
-            if one.msgtype in types and one.msgcount and (topics is None or one.topic in topics)
+            one for one in self._reader.connections if one.topic in topics and one.msgcount and one.msgtype in _VALUES
         ]
         if not wanted:  # the library reads everything if nothing is wanted
             return []
@@ -117,13 +118,14 @@ class Bag:
         for order, (connection, received, data) in enumerate(self._reader.messages(connections=wanted)):
             message = self._reader.deserialize(data, connection.msgtype)
             for key, stamp, value in _VALUES[connection.msgtype](message):
-                rows.setdefault((connection.topic, *key), []).append((order, received * 1e-9, stamp, value))
+                key = (connection.topic, connection.msgtype, *key)
+                rows.setdefault(key, []).append((order, received * 1e-9, stamp, value))
         return [_messages(*key, rows=found) for key, found in rows.items()]
 
 
-def _messages(topic: str, frame: str, child: str, *_: str, rows: list[tuple[int, float, float, Any]]) -> Messages:
+def _messages(topic: str, type: str, frame: str, child: str, *, rows: list[tuple[int, float, float, Any]]) -> Messages:
     order, received, stamp, values = (list(column) for column in zip(*rows, strict=True))
-    return Messages(topic, frame, child, np.array(received), np.array(stamp), np.array(order), values)
+    return Messages(topic, frame, child, np.array(received), np.array(stamp), np.array(order), values, type)
 
 
 _Values = Iterator[tuple[tuple[str, str], float, Any]]
