@@ -18,7 +18,6 @@ from jaxsonar.graph_slam.incremental_mapper import Mapper
 from jaxsonar.hardware.scan_assembler import RawScan
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.scans.firing_poses import path_poses_of_scan
-from jaxsonar.scans.flat_echoes import corrected_echoes
 from jaxsonar.scans.raw_scans import scan_from_raw
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring, speed_of_sound
@@ -147,9 +146,7 @@ class LiveMap:
         """
         scans = [scan_from_raw(raw) for raw in raw_scans]
         self._follow_temperature(raw_scans)
-        for scan in scans:
-            self.left_out += int((self._path_index[scan.tx, scan.rx] < 0).sum())
-            self.in_range += len(corrected_echoes(self.ring, scan)[0])
+        self._count_echoes(scans)
         poses = [self._path_pose(scan) for scan in scans]
         robot_stood = all(pose is None for pose in poses)
         if len(scans) >= SETTINGS.min_batch and self._options["method"] == "hough" and robot_stood:
@@ -208,6 +205,16 @@ class LiveMap:
         if scan.odometry is None or np.ptp(scan.odometry[:, 1:], axis=0).max() < SETTINGS.standing_threshold:
             return None
         return path_poses_of_scan(self.ring, scan)
+
+    def _count_echoes(self, scans: Sequence[Scan]) -> None:
+        none = np.zeros(0, np.int64)
+        tx, rx, reported = (
+            np.concatenate([none, *(getattr(scan, name) for scan in scans)]) for name in ("tx", "rx", "range")
+        )
+        on_path = self._path_index[tx, rx] >= 0
+        distance = np.asarray(self.ring.corrected(reported, tx, rx))
+        self.left_out += int((~on_path).sum())
+        self.in_range += int((on_path & (distance > 0) & (distance < self.ring.max_range)).sum())
 
     def _follow_temperature(self, raw_scans: Sequence[RawScan]) -> None:
         measured = [raw.temperature for raw in raw_scans if not np.isnan(raw.temperature)]
