@@ -48,7 +48,7 @@ def in_order(log, rows):
 
 
 def with_poses(log, pose):
-    return Log(log.scan, log.stamp, pose, log.start, log.tx, log.rx, log.range, log.amplitude)
+    return dataclasses.replace(log, pose=pose)
 
 
 def world_moved(log, turn, shift):
@@ -269,7 +269,7 @@ def test_echoes_of_pairs_that_the_ring_does_not_listen_to_are_reported(office_lo
     first = office_log[0]
     more = dataclasses.replace(
         first, tx=np.append(first.tx, 3), rx=np.append(first.rx, 15), range=np.append(first.range, 1.0),
-        amplitude=np.append(first.amplitude, np.nan),
+        amplitude=np.append(first.amplitude, np.nan), t=None, age=None,
     )  # fmt: skip
     reported_counts = []
     with_it = build_map(RING, Log.from_scans([more, *list(office_log)[1:]]), on_left_out=reported_counts.append)
