@@ -175,4 +175,5 @@ def known_walls_missed(
 
 
 def _transform_paths(paths: kernels.EchoPaths, poses: Float[np.ndarray, "paths 3"]) -> kernels.EchoPaths:
-    return jax.tree.map(np.asarray, jax.vmap(kernels.transform_path)(paths, jnp.asarray(poses)))
+    with jax.enable_x64(True):
+        return jax.tree.map(np.asarray, jax.vmap(kernels.transform_path)(paths, jnp.asarray(poses)))
