@@ -3,7 +3,7 @@
 A sensor without an echo does not prove that its whole cone is empty, because a smooth wall reflects sound back only if
 it faces the sensor. A missing echo excludes walls at a position with a direction. Therefore the map of free space has a
 cell for every position on the floor and every direction of a wall's normal. Each cell stores the times of the latest
-scans that would have detected a wall there.
+scans that would have detected a wall there. Only paths that were measured can miss a wall.
 """
 
 from collections.abc import Mapping, Sequence
