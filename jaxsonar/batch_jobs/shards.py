@@ -21,7 +21,7 @@ SHARD_SCANS = 2048
 MAX_ROW_GROUP = 32 * SHARD_SCANS
 """Maximum number of rows in a Parquet row group. A log with larger ones is staged in small row groups; otherwise every
 shard would read all of a group."""
-HEAD_SCANS = 2048
+HEAD_SCANS = 512
 """Number of scans at the beginning of a log that decide whether it must be prepared as a whole."""
 
 
