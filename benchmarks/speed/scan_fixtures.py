@@ -53,10 +53,10 @@ def batch(count: int, *, seed: int = 0, ring: Ring | None = None) -> Batch:
 
 
 def single_scans(ring: Ring, ranges: Float[np.ndarray, "scans paths slots"]) -> list[Scan]:
-    """The same scans as ``Scan`` objects."""
+    """The same scans as ``Scan`` objects, which measured all paths."""
     scan, path, slot = np.nonzero(np.isfinite(ranges))
     tx, rx = ring.paths[path].T
     count = len(ranges)
     range_ = ranges[scan, path, slot].astype(np.float64)
-    log = Log.from_echoes(scan, tx, rx, range_, stamp=0.1 * np.arange(count), pose=np.full((count, 3), np.nan))
-    return list(log)
+    stamp, pose = 0.1 * np.arange(count), np.full((count, 3), np.nan)
+    return list(Log.from_echoes(scan, tx, rx, range_, stamp=stamp, pose=pose, asked=ring.paths))

@@ -32,8 +32,10 @@ def reading_motion(log: Log) -> Float[np.ndarray, "readings 3"] | None:
     Returns:
         The poses; None if every reading belongs to the pose of its scan.
     """
+    if not (log.t.any() or log.age.any()):
+        return None
     time, pose = _known_poses(log)
-    if not (log.t.any() or log.age.any()) or len(time) < 2:
+    if len(time) < 2:
         return None
     scan = log.echo_scan
     moves = np.isfinite(log.stamp) & np.isfinite(log.pose).all(axis=1)

@@ -34,9 +34,7 @@ def measured_paths(ring: Ring, log: Log) -> Bool[np.ndarray, "scans paths"]:
         ring: the sensors; sensors and pairs that it does not have are ignored.
         log: the scans.
     """
-    always = np.zeros(len(ring.paths), bool)
-    always[_path_rows(ring, *log.asked.T)] = True
-    repeated = is_repeated(log)
+    always, repeated = _asked_paths(ring, log.asked), is_repeated(log)
     if always.all() and not repeated.any():
         return np.broadcast_to(always, (len(log), len(always)))
     path = _path_rows(ring, log.tx, log.rx, keep=True)
@@ -159,6 +157,17 @@ def equivalent_scans(
     else:
         row = np.arange(len(counts))
     return (np.maximum(full_wall_paths(ring, counts.astype(np.float64)), 1) / whole)[row.ravel()]
+
+
+def _asked_paths(ring: Ring, asked: Int[np.ndarray, "pairs 2"]) -> Bool[np.ndarray, " paths"]:
+    """Mask of the pairs; the latest one is stored in ``Ring.cache``, because all parts of a log have the same pairs."""
+    latest = ring.cache.get("asked_paths")
+    if latest is None or not np.array_equal(latest[0], asked):
+        always = np.zeros(len(ring.paths), bool)
+        always[_path_rows(ring, *asked.T)] = True
+        always.setflags(write=False)
+        ring.cache["asked_paths"] = latest = asked, always
+    return latest[1]
 
 
 def _path_rows(

@@ -85,7 +85,7 @@ def gather_windows(ring: Ring, log: Log, *, length: float) -> tuple[Windows, int
     """
     check_window(length)
     flat, left_out = FlatEchoes.from_log(ring, log)
-    if _lists_measurements(log):
+    if _lists_measurements(log) or log.age.any():
         new = _first_at_place(_measured(ring, flat), log.pose)
         used = new[flat.scan, flat.path]
     else:
@@ -134,14 +134,12 @@ class WindowBuffer:
 
     def add(self, scan: Scan, *, length: float) -> tuple["WindowBuffer", bool]:
         """The buffer with one more scan, and whether a window ends there. A scan without a pose empties the buffer."""
-        log = scan.as_log()
-        has_ages = self.has_ages or bool(log.age.any())
-        heard = np.isfinite(log.range)
-        readings = [*zip(*(column[heard].tolist() for column in (log.tx, log.rx, log.range)), strict=True)]
+        has_ages = self.has_ages or (scan.age is not None and bool(scan.age.any()))
+        readings = [*zip(scan.tx.tolist(), scan.rx.tolist(), scan.range.tolist(), strict=True)]
         runs = {reading: self.runs.get(reading, -1) + 1 for reading in readings}
-        listed = has_ages or not len(log.asked)
+        listed = has_ages or _lists_measurements(scan)
         if not np.isfinite(scan.pose).all():
-            latest = _new_measurements(log, self.latest, -1)[1] if listed else self.latest
+            latest = _new_measurements(scan, self.latest, -1)[1] if listed else self.latest
             latest = {pair: one._replace(place=-1) for pair, one in latest.items()}
             return WindowBuffer(runs=runs, place=self.place, latest=latest, has_ages=has_ages), False
         travelled, place, at_rest = 0.0, self.place, False
@@ -153,7 +151,7 @@ class WindowBuffer:
             at_rest = np.floor(place) == np.floor(self.place)
         fresh, new, latest = frozenset(), frozenset(), self.latest
         if listed:
-            new, latest = _new_measurements(log, self.latest, int(np.floor(place)))
+            new, latest = _new_measurements(scan, self.latest, int(np.floor(place)))
         elif not at_rest:
             fresh = frozenset(r for r, run in runs.items() if run % SETTINGS.renewal_period == 0)
         begin = int(np.searchsorted([*self.travelled, travelled], travelled - length))
@@ -176,7 +174,7 @@ class WindowBuffer:
         flat, _ = FlatEchoes.from_log(ring, log)
         ever = _measured(ring, flat).any(axis=0)
         new = None
-        if self.has_ages or not len(log.asked):
+        if self.has_ages or _lists_measurements(log):
             new = np.zeros((len(log), len(ring.paths)), bool)
             for row, pairs in enumerate(self.new):
                 new[row, _rows_of_paths(ring, pairs)] = True
@@ -246,13 +244,12 @@ def _build_windows(
     return Windows(last, echoes, flat.scan[echo], gap=max(SETTINGS.min_gap, length / 4))
 
 
-def _lists_measurements(log: Log) -> bool:
-    """Whether a log tells which readings are measurements.
+def _lists_measurements(log: Log | Scan) -> bool:
+    """Whether a log holds a reading of all that was measured: ``asked`` is empty.
 
-    It does if it holds a reading of all that was measured (``Log.asked`` is empty), or if its readings have ages. In
-    other logs, readings that were not renewed can only be guessed (``is_fresh_reading``).
+    In other logs without ages, readings that were not renewed can only be guessed (``is_fresh_reading``).
     """
-    return not len(log.asked) or bool(log.age.any())
+    return bool(np.isnan(log.range).any()) if log.asked is None else not len(log.asked)
 
 
 def _measured(ring: Ring, flat: FlatEchoes) -> Bool[np.ndarray, "scans paths"]:
@@ -275,15 +272,16 @@ def _first_at_place(
 
 
 def _new_measurements(
-    log: Log, latest: Mapping[Pair, Measurement], place: int
+    scan: Scan, latest: Mapping[Pair, Measurement], place: int
 ) -> tuple[frozenset[Pair], dict[Pair, Measurement]]:
-    """The pairs of a log of one scan whose measurement counts, and the latest measurements with those of this scan.
+    """The pairs of a scan whose measurement counts, and the latest measurements with those of this scan.
 
     Args:
-        log: the scan.
+        scan: the scan.
         latest: the latest measurement of each pair before it.
         place: the place of the robot.
     """
+    log = scan.as_log()
     columns = (log.tx, log.rx, log.range, measurement_times(log), log.age)
     measured: dict[Pair, tuple[float, set[float]]] = {}
     read: set[Pair] = set()

@@ -17,7 +17,11 @@ from support.rings import bumper_ring
 from jaxsonar import HoughSettings, Ring, Room, kernels, load_ring, random_pose, random_room, simulate
 from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.floor_plans.room import walls_in_robot_frame
-from jaxsonar.scans.echo_batches import SLOW_SCANS
+from jaxsonar.kernels.measurement_model import plane_echo
+from jaxsonar.kernels.ml_detection_likelihood import plane_missed_log_likelihood, refine
+from jaxsonar.kernels.ml_detection_state import ScanData, SceneEstimate
+from jaxsonar.scans.echo_batches import SLOW_SCANS, pack
+from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.simulation.acoustics import Acoustics
 from jaxsonar.simulation.traced_echoes import EchoKind
 
@@ -486,3 +490,47 @@ def test_paths_without_a_detection_range_change_nothing():
     assert float(padded_arcs(ring).full_wall_paths) == pytest.approx(float(alone.full_wall_paths))
     found = detected(scans, 0.001, padded_arcs(ring))
     assert (decided(found) == kernels.PLANE).any(axis=1).mean() > 0.8
+
+
+# paths that were not measured
+
+
+def test_a_path_that_was_not_measured_never_counts_against_a_wall(rng):
+    """Remove silent paths from the measured ones, one after the other."""
+    arcs, scans = arc_tables(RING, SETTINGS).arcs, scans_of_rooms(4, dropout=0.3)
+    scene = SceneEstimate.initial(jnp.float32(0.003), PRIOR)
+    paths = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), arcs.paths)
+
+    @jax.jit
+    def missed(path, ranges, own, line, measured):
+        own_paths = jax.tree.map(lambda leaf: leaf[..., path], paths)
+        scan = ScanData(paths, own_paths, path, ranges, ranges > 0, arcs.max_range, arcs.full_wall_paths, measured)
+        wall = refine(scan, plane_echo, line, scene, jnp.zeros(SLOTS), PRIOR)
+        wall = wall._replace(log_ratio=jnp.where(own, 1.0, -jnp.inf))
+        return plane_missed_log_likelihood(scan, wall, scene, PRIOR)
+
+    found, gains = detected(scans, 0.001), []
+    for row, echoes in enumerate(scans):
+        path, ranges = np.zeros(SLOTS, np.int32), np.zeros(SLOTS, np.float32)
+        path[: len(echoes)], ranges[: len(echoes)] = zip(*echoes, strict=True)
+        args = path, ranges, found.involved[row, 0], found.parameters[row, 0]
+        measured, all_paths = np.ones(PATHS, bool), float(missed(*args, None))
+        costs = [float(missed(*args, measured))]
+        assert costs[0] == pytest.approx(all_paths, abs=1e-4)
+        for silent in np.array_split(rng.permutation(np.setdiff1d(np.arange(PATHS), path)), 8):
+            measured[silent] = False
+            costs.append(float(missed(*args, measured)))
+        assert (np.diff(costs) >= -1e-4).all()
+        gains.append(costs[-1] - costs[0])
+    assert max(gains) > 1
+
+
+def test_scans_with_a_mask_and_with_motion_share_one_program():
+    ring, echoes = RING, FlatEchoes.from_dense(RING, np.full((2, PATHS, 1), np.nan))
+    masks = np.ones((2, PATHS), bool), np.zeros((2, PATHS, 3))
+    shapes = []
+    for name, mask in zip(("measured", "path_pose"), masks, strict=True):
+        flat = FlatEchoes(2, echoes.scan, echoes.path, echoes.reported, **{name: mask})
+        (batch,) = pack(ring, flat, SETTINGS.cells, policy=SLOW_SCANS)
+        shapes.append(jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), batch.packed))
+    assert shapes[0] == shapes[1]
