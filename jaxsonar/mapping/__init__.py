@@ -10,7 +10,7 @@ Design decisions:
   evidence of two halves equals that of the whole, and memory grows with the walls and the floor, not with the scans.
 - **Missing echoes have a direction.** A smooth wall reflects sound back only if it faces the sensor. So a missing echo
   excludes a wall at a position with a normal. Each cell of the floor stores, for 36 directions, the times of the three
-  latest scans that saw through it.
+  latest scans that saw through it. A path that was not measured sees through nothing and confirms nothing.
 - **Fusion instead of clustering by default.** The lines of a long wall differ by centimetres in rho far from the
   cluster's center (3 deg x 3 m), so the paper's cells split it. Segments that agree where they meet are not split. The
   paper's merging can be selected.
