@@ -84,8 +84,14 @@ class McapRecorder(Recorder):
             raise SonarError(f"{shown(self._filename)}: {failure.strerror}; needed is {needed}") from None
 
 
-def read_mcap(filename: str | os.PathLike[str]) -> Iterator[tuple[str, float, bytes]]:
-    """Read a raw recording from its beginning, a truncated one as far as possible.
+def read_mcap(
+    filename: str | os.PathLike[str], *, on_damage: Callable[[], None] | None = None
+) -> Iterator[tuple[str, float, bytes]]:
+    """Read a raw recording from its beginning, a truncated or damaged one as far as possible.
+
+    Args:
+        filename: the file.
+        on_damage: called if the file is truncated or damaged, after everything before was yielded.
 
     Yields:
         Topic, host clock in seconds since 1970, and the frame or the JSON text.
@@ -97,7 +103,7 @@ def read_mcap(filename: str | os.PathLike[str]) -> Iterator[tuple[str, float, by
     try:
         with open(filename, "rb") as file:
             topics: dict[int, str] = {}
-            started = False
+            started, whole = False, False
             try:
                 for record in mcap_records.StreamReader(file, record_size_limit=1 << 28).records:
                     started = True
@@ -105,11 +111,14 @@ def read_mcap(filename: str | os.PathLike[str]) -> Iterator[tuple[str, float, by
                         topics[record.id] = record.topic
                     elif isinstance(record, mcap_records.Message) and record.channel_id in topics:
                         yield topics[record.channel_id], record.log_time * 1e-9, record.data
+                    whole = isinstance(record, mcap_records.Footer)
             except OSError:
                 raise
             except Exception:  # the library raises many types on truncated data
                 if not started:
                     raise SonarError(f"{shown(filename)}: this is no MCAP file; needed is a record (MCAP)") from None
+            if not whole and on_damage is not None:
+                on_damage()
             if topics and MESSAGES not in topics.values():
                 others = shown(", ".join(sorted(topics.values())))
                 raise SonarError(f"{shown(filename)}: topics {others}; needed is {MESSAGES}, which a record has")
@@ -143,6 +152,6 @@ def _mcap(filename: str | os.PathLike[str]) -> tuple[Any, Any]:
 
     class McapRecords:
         StreamReader = mcap.stream_reader.StreamReader
-        Channel, Message = mcap.records.Channel, mcap.records.Message
+        Channel, Message, Footer = mcap.records.Channel, mcap.records.Message, mcap.records.Footer
 
     return McapRecords, mcap.writer

@@ -162,6 +162,36 @@ def test_a_raw_recording_is_a_log(tmp_path):
         load_log(tmp_path / "raw.mcap", ring=Ring.circular(count=2, neighbors=0))
 
 
+def test_a_damaged_raw_recording_gives_what_is_before_the_damage_and_a_warning(tmp_path):
+    pytest.importorskip("mcap")
+    from support.fake_devices import messages
+
+    from jaxsonar.hardware.mcap_recorder import MESSAGES, read_mcap
+    from jaxsonar.hardware.recorder import open_recorder
+
+    recorder = open_recorder(tmp_path / "whole.mcap")
+    for number, message in enumerate(messages(40)):
+        recorder.message(message, 100.0 + number)
+        recorder.tick(100.0 + number)  # a chunk for each message
+    recorder.close()
+    whole, _ = load(tmp_path / "whole.mcap")
+    content = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 3])
+    with pytest.warns(
+        TruncatedRecording, match=r"cut.mcap: the recording is incomplete or damaged: \d+ messages are read"
+    ):
+        part, _ = load(tmp_path / "cut.mcap")
+    assert 3 < len(part) < len(whole)
+    assert part[:-1] == whole[: len(part) - 1]
+    flipped = bytearray(content)
+    frames = [frame for topic, _, frame in read_mcap(tmp_path / "whole.mcap") if topic == MESSAGES]
+    flipped[content.index(frames[62]) + len(frames[62]) // 2] ^= 1
+    (tmp_path / "flipped.mcap").write_bytes(flipped)
+    with pytest.warns(TruncatedRecording, match=r"messages are read, 1 damaged ones are left out"):
+        part, _ = load(tmp_path / "flipped.mcap")
+    assert 0.8 * whole.echo_count < part.echo_count < whole.echo_count
+
+
 def test_a_raw_recording_without_a_message_is_rejected(tmp_path):
     pytest.importorskip("mcap")
     from jaxsonar.hardware.recorder import open_recorder
