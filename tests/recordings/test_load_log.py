@@ -166,7 +166,6 @@ def test_a_damaged_raw_recording_gives_what_is_before_the_damage_and_a_warning(t
     pytest.importorskip("mcap")
     from support.fake_devices import messages
 
-    from jaxsonar.hardware.mcap_recorder import MESSAGES, read_mcap
     from jaxsonar.hardware.recorder import open_recorder
 
     recorder = open_recorder(tmp_path / "whole.mcap")
@@ -176,20 +175,13 @@ def test_a_damaged_raw_recording_gives_what_is_before_the_damage_and_a_warning(t
     recorder.close()
     whole, _ = load(tmp_path / "whole.mcap")
     content = (tmp_path / "whole.mcap").read_bytes()
-    (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 3])
-    with pytest.warns(
-        TruncatedRecording, match=r"cut.mcap: the recording is incomplete or damaged: \d+ messages are read"
-    ):
-        part, _ = load(tmp_path / "cut.mcap")
-    assert 3 < len(part) < len(whole)
-    assert part[:-1] == whole[: len(part) - 1]
-    flipped = bytearray(content)
-    frames = [frame for topic, _, frame in read_mcap(tmp_path / "whole.mcap") if topic == MESSAGES]
-    flipped[content.index(frames[62]) + len(frames[62]) // 2] ^= 1
-    (tmp_path / "flipped.mcap").write_bytes(flipped)
-    with pytest.warns(TruncatedRecording, match=r"messages are read, 1 damaged ones are left out"):
-        part, _ = load(tmp_path / "flipped.mcap")
-    assert 0.8 * whole.echo_count < part.echo_count < whole.echo_count
+    third = len(content) // 3
+    for wrong in (content[:third], content[:third] + bytes(2000) + content[third + 2000 :]):
+        (tmp_path / "wrong.mcap").write_bytes(wrong)
+        with pytest.warns(TruncatedRecording, match="the recording is incomplete or damaged"):
+            part, _ = load(tmp_path / "wrong.mcap")
+        assert 3 < len(part) < len(whole)
+        assert part[:-1] == whole[: len(part) - 1]
 
 
 def test_a_raw_recording_without_a_message_is_rejected(tmp_path):
