@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.firings import fire_in_turn
+from support.slam_scene import ROOM
 
 from jaxsonar import HoughSettings, Ring, SonarError, kernels, random_pose, random_room, simulate
 from jaxsonar.calibration.autofocus import autofocus_ring
@@ -203,6 +205,22 @@ def test_without_poses_the_speed_is_held_and_a_wrong_offset_is_found(rng):
     assert found.speed_of_sound == given.speed_of_sound
     assert abs(relative_error(found, true)[3]) < 0.01
     np.testing.assert_allclose(found.range_offset.mean(), 0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_echoes_of_a_moving_robot_belong_to_the_poses_of_their_times():
+    offset = 0.02 * np.sin(3 * np.arange(RING.count))
+    true = dataclasses.replace(RING, range_offset=offset - offset.mean())
+
+    def drive(time):
+        return np.column_stack([1.0 + 0.5 * time, 1.7 + 0.3 * np.sin(time), 0.8 * time])
+
+    log, _ = fire_in_turn(true, ROOM, drive, 25, sigma=0.002, seed=4)
+    at_once = dataclasses.replace(log, t=np.zeros(len(log.t)), odometry=None)
+    found, ignored = (autofocus_ring(RING, one, poses=True, speed=False) for one in (log, at_once))
+    error, wrong = (np.sqrt(np.mean(relative_error(ring, true) ** 2)) for ring in (found, ignored))
+    assert error < 0.003
+    assert error < wrong / 2
 
 
 def test_invalid_input_is_refused(rng):

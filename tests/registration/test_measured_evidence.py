@@ -35,7 +35,7 @@ def test_a_wall_in_an_unmeasured_direction_is_not_missed(heading):
     every = np.ones(SETTINGS.directions, bool)
     assert against(None, heading) > 0.5
     assert against(every, heading) == against(None, heading)
-    toward = direction_sector(np.array(-heading))
+    toward = direction_sector(np.array([-heading]))[0]
     assert against(np.arange(len(every)) == toward, heading) == against(None, heading)
     assert against(np.arange(len(every)) != toward, heading) == 0
 
