@@ -1,8 +1,8 @@
 """The command line ``jaxsonar``.
 
 Entry point: ``app.main``. Each command is a module with SUMMARY, ``add_arguments`` and ``run``; ``app.COMMANDS`` lists
-them. ``arguments`` holds shared argument types and options, ``inputs`` reads ring and log and prints notes and warnings,
-``console`` holds shared output: status lines, progress, tables, figures and JSON.
+them. ``arguments`` holds shared argument types and options, ``inputs`` reads ring and log and prints notes and
+warnings, ``console`` holds shared output: status lines, progress, tables, figures and JSON.
 
 Design decisions:
 

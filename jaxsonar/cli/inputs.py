@@ -51,9 +51,11 @@ def add_reading_options(parser: argparse.ArgumentParser, metavar: str = "LOG") -
         default=[],
         type=sensor_name,
         metavar="NAME=INDEX",
-        help="bag: the sensor of the ring that a frame or topic belongs to; once for each sensor",
+        help="bag: the sensor of the ring that a frame or topic belongs to; table: that of a column; once for each",
     )
-    reading.add_argument("--odometry-topic", metavar="TOPIC", help="bag: topic of the odometry (default: the only one)")
+    reading.add_argument(
+        "--odometry-topic", metavar="TOPIC", help="bag: topic of the odometry (default: by its name, if that is clear)"
+    )
     reading.add_argument(
         "--no-echo",
         action="append",

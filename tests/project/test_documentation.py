@@ -128,7 +128,8 @@ CHECKS = {
     ("docs/slam.md", "bash", ""): check_errors_of_slam,
     ("docs/recorded-data.md", "bash", "corridor8"): check_corridor_table,
 }
-"""What the output of the first such block of a page must be: page, language, recording. Other builds of JAX may round differently."""
+"""What the output of the first block of a page, language and recording must be. Other builds of JAX may round
+differently."""
 
 
 def test_every_fence_names_its_language():
