@@ -13,8 +13,8 @@ from jaxsonar.sensors.ring import Ring
 class PlausibilitySettings:
     """When a log is implausible. Chosen by hand, such that no sound log of the tests and data sets gets a warning."""
 
-    beyond: float = 0.4
-    """Share of the echoes beyond the maximum range of the ring."""
+    beyond: float = 0.8
+    """Share of the echoes beyond the maximum range of the ring. In a large hall, half of them may be."""
     least_echoes: int = 20
     """Logs with fewer echoes give no warning about their ranges."""
 
@@ -38,5 +38,5 @@ def implausible_input(ring: Ring, log: Log) -> Iterator[str]:
     heard = log.range[np.isfinite(log.range)]
     if len(heard) >= SETTINGS.least_echoes and (share := float(np.mean(heard > ring.max_range))) > SETTINGS.beyond:
         what = f"{share:.0%} of the echoes are beyond the maximum range of the ring, {ring.max_range:g} m"
-        cause = "the ranges are lengths out and back or have another unit, or the ring is another one"
+        cause = "the ranges have another unit, or the ring is another one"
         yield f"{what}; {cause}; give half path lengths in metres"
