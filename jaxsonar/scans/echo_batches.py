@@ -83,7 +83,8 @@ class EchoBatch(NamedTuple):
     def packed(self) -> kernels.PackedEchoes:
         """The arrays as the argument of a kernel; they stay NumPy arrays until the compiled call transfers them."""
         arrays: Any = (self.path, self.reported, self.pose, self.scans_per_row, self.piece, self.owner)
-        return kernels.PackedEchoes(*arrays, measured=self.measured, path_pose=self.path_pose)
+        masks: Any = (self.measured, self.path_pose)
+        return kernels.PackedEchoes(*arrays, *masks)
 
 
 def pack(

@@ -91,7 +91,7 @@ def gather_windows(ring: Ring, log: Log, *, length: float) -> tuple[Windows, int
     else:
         new = None
         used = is_fresh_reading(flat) & has_moved(log.pose)[flat.scan]
-    ever = _measured(ring, flat).any(axis=0)
+    ever = np.any(_measured(ring, flat), axis=0)
     begin, last = _window_bounds(log.pose, length)
     return _build_windows(ring, flat, log.pose, used, new, ever, begin, last, length=length), left_out
 
@@ -157,22 +157,23 @@ class WindowBuffer:
         begin = int(np.searchsorted([*self.travelled, travelled], travelled - length))
         spacing = length / SETTINGS.overlap
         ends = bool(self.scans) and travelled // spacing > self.travelled[-1] // spacing
-        kept = [
-            (*before, one)[begin:]
-            for before, one in (
-                (self.scans, scan),
-                (self.travelled, travelled),
-                (self.fresh, fresh),
-                (self.new, new),
-            )
-        ]
-        return WindowBuffer(*kept, runs, place, latest, has_ages), ends
+        buffer = WindowBuffer(
+            (*self.scans, scan)[begin:],
+            (*self.travelled, travelled)[begin:],
+            (*self.fresh, fresh)[begin:],
+            (*self.new, new)[begin:],
+            runs,
+            place,
+            latest,
+            has_ages,
+        )
+        return buffer, ends
 
     def window(self, ring: Ring, *, length: float) -> tuple[Log, Windows]:
         """The window that ends at the latest scan, and the log to which its rows refer."""
         log = Log.from_scans(self.scans)
         flat, _ = FlatEchoes.from_log(ring, log)
-        ever = _measured(ring, flat).any(axis=0)
+        ever = np.any(_measured(ring, flat), axis=0)
         new = None
         if self.has_ages or _lists_measurements(log):
             new = np.zeros((len(log), len(ring.paths)), bool)
@@ -262,8 +263,9 @@ def _first_at_place(
     measured: Bool[np.ndarray, "scans paths"], pose: Float[np.ndarray, "scans 3"]
 ) -> Bool[np.ndarray, "scans paths"]:
     """The measurements of paths that were not measured before at the same place; none of scans without a pose."""
-    new = measured & np.isfinite(pose).all(axis=1)[:, None]
-    ever = np.flatnonzero(new.any(axis=0))
+    new = measured.copy()
+    new[~np.isfinite(pose).all(axis=1)] = False
+    ever = np.flatnonzero(np.any(new, axis=0))
     here = new[:, ever]
     times = np.cumsum(here, axis=0, dtype=np.int32)
     arrival = np.maximum.accumulate(np.where(has_moved(pose), np.arange(len(pose)), 0))
@@ -288,8 +290,11 @@ def _new_measurements(
     for tx, rx, reported, time, age in zip(*(column.tolist() for column in columns), strict=True):
         before, heard = latest.get((tx, rx)), reported if np.isfinite(reported) else _NOTHING
         read.add((tx, rx))
-        repeated = before is not None and age > 0 and heard in before.ranges
-        if not (repeated and abs(time - before.time) < AGES.same_measurement):
+        if before is None or age == 0 or heard not in before.ranges:
+            repeated = False
+        else:
+            repeated = abs(time - before.time) < AGES.same_measurement
+        if not repeated:
             measured.setdefault((tx, rx), (time, set()))[1].add(heard)
     silent = {(tx, rx) for tx, rx in log.asked.tolist()} - read
     measured |= {pair: (float(log.stamp[0]), {_NOTHING}) for pair in silent}

@@ -6,7 +6,18 @@ import numpy as np
 import pytest
 from support import oracles
 
-from jaxsonar import Log, Ring, SonarError, extract_lines, local_model, local_models, random_pose, random_room, simulate
+from jaxsonar import (
+    Log,
+    Ring,
+    SonarError,
+    build_map,
+    extract_lines,
+    local_model,
+    local_models,
+    random_pose,
+    random_room,
+    simulate,
+)
 from jaxsonar.floor_plans.room import walls_in_robot_frame
 from jaxsonar.geometry.se2 import compose, transform_points
 from jaxsonar.scans.measured_paths import measured_paths
@@ -81,6 +92,15 @@ def test_method_ml_needs_no_list_of_the_paths_that_a_device_has(rooms):
     assert found == pytest.approx(wanted, rel=0.02)
     silent = sum(length(local_models(RING, replace(direct_only(log), asked=RING.paths))) for log in rooms)
     assert silent < 0.9 * wanted, "cross paths that were measured and heard nothing are evidence"
+
+
+@pytest.mark.slow
+@both_methods
+def test_the_map_of_an_office_from_direct_echoes_needs_no_list_of_paths(office, method):
+    log = simulate(RING, office.room, office.poses, sigma=0.003, seed=1).as_log(RING, office.poses)
+    maps = [build_map(ring, direct_only(log), method=method).segments for ring in (RING, DIRECT)]
+    found, wanted = (float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()) for ends in maps)
+    assert found >= 0.95 * wanted > 5
 
 
 @both_methods

@@ -454,7 +454,9 @@ def test_windows_weigh_measurements_and_count_each_path_once_at_a_place(seed, in
     log = listed_log(seed, in_turn=in_turn)
     windows, _ = gather_windows(FOUR, log, length=length)
     wanted = expected_weights(log, oracles.window_spans(log.pose, length))
-    np.testing.assert_allclose(windows.echoes.scans_per_window, wanted, rtol=0.02)
+    weights = windows.echoes.scans_per_window
+    assert weights is not None
+    np.testing.assert_allclose(weights, wanted, rtol=0.02)
     assert_same_windows(FOUR, log, length)
 
 
@@ -477,8 +479,9 @@ def test_silence_that_was_measured_weighs_and_what_was_not_measured_does_not():
     weights = []
     for readings in (heard, silent):
         log = replace(log_of(readings, poses), asked=np.zeros((0, 2), int))
-        (weight,) = gather_windows(FOUR, log, length=50.0)[0].echoes.scans_per_window
-        weights.append(weight * len({tx for tx, _, _ in readings[0]}))  # measurements
+        found = gather_windows(FOUR, log, length=50.0)[0].echoes.scans_per_window
+        assert found is not None
+        weights.append(found[0] * len({tx for tx, _, _ in readings[0]}))  # measurements
     np.testing.assert_allclose(weights, [10, 20], rtol=0.02)
 
 
