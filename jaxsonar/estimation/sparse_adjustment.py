@@ -260,6 +260,7 @@ class _SparseProblem:
             index.append(product.entry.ravel())
             values.append((np.swapaxes(first, 1, 2) @ second).ravel())
         matrix = np.bincount(np.concatenate(index), np.concatenate(values), minlength=structure.nnz)
+        matrix = matrix.astype(np.float64, copy=False)  # whole numbers if there is no product
         # 2. Their gradients.
         gradient = np.zeros(int(structure.begin[-1]))
         for factors, group in zip(evaluation, self.dependencies, strict=True):

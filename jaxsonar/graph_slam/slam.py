@@ -126,9 +126,11 @@ def slam(
     report = progress or (lambda task, done, total: None)
     noise = odometry_noise or OdometryNoise()
     log = estimation_log(log)
-    if window is None and len(log) and _echoes_of_a_long_wall(ring, log) < SETTINGS.sparse_echoes:
-        window = SETTINGS.sparse_window
     has_odometry = np.asarray(np.isfinite(log.pose).all(axis=1))
+    if window is None and len(log) and _echoes_of_a_long_wall(ring, log) < SETTINGS.sparse_echoes:
+        # A robot that drives less than a window stays at one place, as far as windows are concerned.
+        stays = has_odometry.any() and _distance_driven(log.pose[has_odometry]) < SETTINGS.sparse_window
+        window = None if stays else SETTINGS.sparse_window
     _check(log, has_odometry, sigma=sigma, window=window, smooth=smooth, speed=speed, scale=scale)
     # 1. Detect: the local model of every scan, unless maps of windows or the tracker do so.
     scan_by_scan = live and has_odometry.any()
@@ -180,6 +182,11 @@ def _echoes_of_a_long_wall(ring: Ring, log: Log) -> float:
     measured = measured_paths(ring, log)
     whole = measured[:1] if measured.all() else measured
     return float(np.median([width[paths].sum() for paths in whole]) / (2 * np.pi))
+
+
+def _distance_driven(poses: Float[np.ndarray, "scans 3"]) -> float:
+    """Length of a trajectory, metres."""
+    return float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
 
 
 def _explained_share(ring: Ring, log: Log, world: GlobalMap) -> float:

@@ -61,7 +61,7 @@ def directions_of_paths(
     missing = ~(np.mod(angle[:, None] - start, 2 * np.pi) < width).any(axis=1)
     start = start if path_pose is None else start + path_pose[:, 2]
     received = np.mod(angle[:, None] - start[measured], 2 * np.pi) < width[measured]
-    return missing | received.any(axis=1)
+    return np.asarray(missing | received.any(axis=1))
 
 
 def direction_sector(angle: Float[np.ndarray, "*some"]) -> Int[np.ndarray, "*some"]:

@@ -136,7 +136,7 @@ class Smoother:
             data,
             prior_information=prior_information,
             landmark_prior_sd=SETTINGS.free_pose_sd[0],
-            min_echoes_per_landmark=SETTINGS.min_echoes_per_landmark if self.window is None else 1,
+            min_echoes_per_landmark=self._min_echoes_per_landmark,
             cost_tolerance=SETTINGS.cost_tolerance,
             wall_explained=None if self.models is None else wall_explained_mask(self.ring, data, self.models),
             max_iterations=SETTINGS.large_problem_iterations if is_large else data.max_iterations,
@@ -224,6 +224,13 @@ class Smoother:
         lost[rows] = (explained[rows] < least) & ~has_odometry[rows]
         lost[self.fixed_row] = False
         return lost
+
+    @property
+    def _min_echoes_per_landmark(self) -> int:
+        """Least number of echoes of one landmark in a scan; a sparse ring has fewer than usual of a whole wall."""
+        of_a_long_wall = float(np.asarray(self.ring.echo_paths.width).sum() / (2 * np.pi))
+        usual = SETTINGS.min_echoes_per_landmark if self.window is None else 1
+        return min(usual, max(1, int(of_a_long_wall)))
 
     @cached_property
     def _row_of_scan(self) -> dict[int, int]:
