@@ -134,7 +134,8 @@ def test_localize_in_a_floor_plan_with_a_negative_start(here, capsys):
     near = f"{x - 0.2:.2f},{y:.2f},{np.degrees(theta):.1f}"
     arguments = ("localize", "log.csv", "--ring", "faw", "--map", "plan.geojson", "--trajectory")
     assert call(*arguments, "p.tum", "--start", near) == 0
-    np.testing.assert_allclose(load_trajectory(here / "p.tum").poses, truth()[:COUNT], atol=0.06)
+    # A file does not tell that paths without any echo were measured, so their silence does not help.
+    np.testing.assert_allclose(load_trajectory(here / "p.tum").poses, truth()[:COUNT], atol=0.08)
     # A start far below the origin is parsed; there is no map.
     assert call(*arguments, "q.tum", "--start", "-9,-9,0") == 1
     assert "no place" in capsys.readouterr().err
