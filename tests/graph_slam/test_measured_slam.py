@@ -52,6 +52,7 @@ def drifting(poses):
 def in_turn():
     """Full scans with ``t``, single firings, and the same echoes of a robot that stops for every scan."""
     together, alone = fire_in_turn(RING, ROOM, trajectory, SCANS, period=PERIOD, sigma=SIGMA, seed=1)
+    assert together.odometry is not None
     odometry = drifting(np.array(together.odometry)[:, 1:])
     first = odometry[:: RING.count]
     together = replace(together, pose=first, odometry=np.column_stack([together.odometry[:, 0], odometry]))
@@ -128,6 +129,7 @@ def test_a_wall_needs_fewer_echoes_if_fewer_paths_were_measured():
     np.testing.assert_allclose(found.belief.landmarks.parameters, expected.belief.landmarks.parameters, atol=1e-9)
     assert expected.directions == (None,)
     (directions,) = found.directions
+    assert directions is not None
     assert directions.all()  # the direct paths look in all directions
 
 

@@ -23,11 +23,11 @@ def pair():
 
 def evidence(pair, directions=None):
     earlier, newest, poses = pair
-    views = [
+    first, second = (
         SubmapView.of(replace(one, directions=None if directions is None else directions(one)))
         for one in (earlier, newest)
-    ]
-    return submap_negative_evidence(*views, poses, tolerance=0.05, reliable_range=1.7)
+    )
+    return submap_negative_evidence(first, second, poses, tolerance=0.05, reliable_range=1.7)
 
 
 def test_evidence_of_fully_measured_scans_needs_no_directions(pair):

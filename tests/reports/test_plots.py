@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from support.rings import bumper_ring
 
@@ -201,7 +202,7 @@ def test_arcs_show_what_was_measured_and_when():
         odometry=np.column_stack([time, 2 * time, np.zeros((2, 2))]),
     )  # fmt: skip
     axes = plot_scan.arcs_figure(ring, log[0]).axes[0]
-    drawn = [np.array(collection.get_segments()) for collection in axes.collections]
+    drawn = [np.array(arcs.get_segments()) for arcs in axes.collections if isinstance(arcs, LineCollection)]
     silent, direct, old = (segments.mean(axis=1) for segments in drawn if len(segments))
     at_rest = plot_scan.arc_points(ring, np.array([5, 0, 1, 2]), np.array([2.0, 1.0, 1.0, 1.0])).mean(axis=1)
     found = np.concatenate([silent, direct, old])

@@ -55,6 +55,7 @@ def test_scans_that_measured_everything_need_no_directions():
     measured = np.stack([np.ones(len(RING.paths), bool), only(1)])
     found = measured_directions(RING, explicit(RING, log, measured))
     np.testing.assert_array_equal(found, [np.ones(SETTINGS.directions, bool), directions_of_paths(RING, only(1))])
+    assert found is not None
     assert stacked_directions([None, None]) is None
     np.testing.assert_array_equal(stacked_directions([None, found[1]]), found)
 
