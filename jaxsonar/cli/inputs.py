@@ -231,13 +231,13 @@ def _check_names_are_used(name: str, options: argparse.Namespace) -> None:
         raise SonarError(f"{shown(name)}: {option} came with {content.description}; allowed is it with a ROS bag")
 
 
-def nothing_used(ring: "Ring", log: "Log", name: str) -> bool:
-    """Whether no echo of a log can be used; prints the reason."""
+def nothing_used(ring: "Ring", log: "Log", name: str, *, with_poses: bool = False) -> bool:
+    """Whether no echo of a log can be used, or none of a scan with a pose (``with_poses``); prints the reason."""
     from jaxsonar.fileio.atomic_files import shown
     from jaxsonar.plausibility.unused_echoes import EchoCounts
 
     with errors_in(name):
-        reason = EchoCounts.of(ring, log).why_none_is_used(ring)
+        reason = EchoCounts.of(ring, log, with_poses=with_poses).why_none_is_used(ring)
     if reason:
         print_status(f"nothing found: {shown(name)}: {reason}")
     return bool(reason)

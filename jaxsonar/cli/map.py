@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
+    from jaxsonar.detection.local_model import LocalModel
     from jaxsonar.kernels import HoughSettings
+    from jaxsonar.mapping.map_evidence import MapEvidence
 
 from jaxsonar.cli.arguments import (
     add_detection_arguments,
@@ -106,9 +108,12 @@ def run(options: argparse.Namespace) -> int:
     settings = hough_settings(ring, given, window=options.window)
     if nothing_used(ring, log, options.log):
         return 1
-    left_out: list[int] = []
     with errors_in(options.log):
         check_poses(log)
+    if nothing_used(ring, log, options.log, with_poses=True):
+        return 1
+    left_out: list[int] = []
+    with errors_in(options.log):
         models = local_models(
             ring,
             log,
@@ -160,11 +165,39 @@ def run(options: argparse.Namespace) -> int:
         print_left_out(ring.name, left_out[0])
     without_pose = int((~has_pose).sum())
     remark = f"; {plural(without_pose, 'scan')} without a pose left out" if without_pose else ""
+    if not len(world):
+        print_status(f"no wall: {_why_no_wall(models, evidence, options.merging, required_scans(options.window))}")
     print_status(
         f"{plural(len(log), 'scan')}, {plural(len(models), 'local model')}, "
         f"{plural(len(evidence.segments), 'segment')}, {plural(len(world), 'wall')}, {world.length.sum():.1f} m{remark}"
     )
     return 0
+
+
+def _why_no_wall(models: "list[LocalModel]", evidence: "MapEvidence", merging: str, min_scans: int) -> str:
+    """Why local models give a map without walls.
+
+    Args:
+        models: all local models.
+        evidence: theirs.
+        merging: method that merges segments to walls.
+        min_scans: number of scans that must have observed a wall.
+    """
+    from collections import Counter
+
+    from jaxsonar.mapping.build_map import assemble_map
+
+    count = len(evidence.segments)
+    if not count:
+        reasons = Counter(model.empty for model in models if model.empty).most_common()
+        why = "; ".join(f"{number} without: {reason}" for reason, number in reasons)
+        return f"no line in {plural(evidence.models, 'local model')} with a pose{'; ' * bool(why)}{why}"
+    lines = f"{plural(count, 'line')} in {plural(evidence.models, 'local model')}"
+    seen = max(map(len, assemble_map(evidence, merging=merging, min_scans=1).scans), default=0)
+    if 0 < seen < min_scans:
+        few = f"no wall is seen by more than {plural(seen, 'scan')}, and {min_scans} are needed"
+        return f"{lines}, but {few}; are the poses right, with x and y in metres and the heading in radians?"
+    return f"{lines}, but later scans see through them, or they belong to poles and corners; are the poses right?"
 
 
 def _laser_points(recording: str) -> "np.ndarray":

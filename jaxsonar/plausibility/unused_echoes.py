@@ -21,10 +21,17 @@ class EchoCounts:
     """Echoes of pairs of sensors that are paths of the ring; a repeated old reading is not counted again."""
     in_range: int
     """Those of them within the maximum range."""
+    with_pose: int | None = None
+    """Those of them in scans with a pose; None if poses are not needed."""
 
     @classmethod
-    def of(cls, ring: Ring, log: Log) -> "EchoCounts":
+    def of(cls, ring: Ring, log: Log, *, with_poses: bool = False) -> "EchoCounts":
         """Count the echoes of a log.
+
+        Args:
+            ring: the sensors.
+            log: the scans.
+            with_poses: whether only echoes of scans with a pose can be used.
 
         Raises:
             SonarError: the log holds a sensor index that the ring does not have.
@@ -32,7 +39,8 @@ class EchoCounts:
         flat, _ = FlatEchoes.from_log(ring, log)
         distance = np.asarray(ring.corrected(flat.reported, *ring.paths[flat.path].T))
         in_range = (distance > 0) & (distance < ring.max_range)
-        return cls(len(log), log.echo_count, len(flat.path), int(in_range.sum()))
+        posed = int(np.isfinite(log.pose[flat.scan[in_range]]).all(axis=1).sum()) if with_poses else None
+        return cls(len(log), log.echo_count, len(flat.path), int(in_range.sum()), posed)
 
     def why_none_is_used(self, ring: Ring) -> str:
         """Why no echo can be used; empty if one can."""
@@ -47,4 +55,6 @@ class EchoCounts:
         if self.in_range == 0:
             reach = f"the maximum range of {ring.name!r}, {ring.max_range:g} m"
             return f"none of the {self.on_paths} echoes is within {reach}: are ranges half path lengths in metres?"
+        if self.with_pose == 0:
+            return f"none of the {self.in_range} echoes is in a scan with a pose: give x, y and theta"
         return ""

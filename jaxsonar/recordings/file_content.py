@@ -9,6 +9,7 @@ from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.mcap_recorder import PROFILE
 from jaxsonar.scans.csv_log import COLUMNS
+from jaxsonar.scans.scan_log import log_format
 
 HEAD = 1 << 16
 """Bytes of a file that are examined."""
@@ -103,6 +104,17 @@ def file_content(filename: str | os.PathLike[str]) -> FileContent:
     return _text_content(head)
 
 
+def interrupted_content(filename: str | os.PathLike[str]) -> FileContent:
+    """What a scan log holds that is being recorded, or whose recording process was killed.
+
+    A Parquet log is empty until then; its scans are in a journal beside it.
+
+    Raises:
+        SonarError: its suffix is not that of a scan log.
+    """
+    return _known(log_format(filename))
+
+
 def check_suffix(filename: str | os.PathLike[str], content: FileContent) -> str | None:
     """A note if the suffix of a file promises something else than the file holds; None if both agree."""
     suffix = Path(filename).suffix.lower()
@@ -163,7 +175,7 @@ def _text_content(head: bytes) -> FileContent:
 
 
 def _is_log_header(line: str) -> bool:
-    """Whether a line resembles the header of a scan log; what is wrong with it, the CSV reader says."""
+    """Whether a line resembles the header of a scan log. The CSV reader reports what is wrong with it."""
     names = [name.strip(" \"'") for name in re.split(r"[,;\t]", line)]
     return names[0] == "scan" or len(set(names) & set(COLUMNS)) >= 5
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.recorder_base import recording_marker
-from jaxsonar.recordings.file_content import DESCRIPTIONS, FileContent, check_suffix, file_content
+from jaxsonar.recordings.file_content import DESCRIPTIONS, FileContent, check_suffix, file_content, interrupted_content
 from jaxsonar.recordings.input_options import FORMATS, InputOptions
 from jaxsonar.scans.log_file import load_scan_log
 from jaxsonar.scans.no_echo_values import without_no_echo_values
@@ -46,9 +46,8 @@ def load_log(
         raise SonarError(
             f"{shown(filename)}: format '{shown(options.format, 40)}' came; allowed are {', '.join(FORMATS)}"
         )
-    if recording_marker(filename).exists():
-        return load_scan_log(filename)
-    content = file_content(filename)
+    is_interrupted = recording_marker(filename).exists()
+    content = interrupted_content(filename) if is_interrupted else file_content(filename)
     if options.format is not None:
         _check_named_format(filename, options.format, content)
     else:
@@ -107,7 +106,7 @@ def _check_named_format(filename: str | os.PathLike[str], named: str, content: F
         fits |= content.is_text and content.format not in UNMISTAKABLE
     if not fits:
         wanted = DESCRIPTIONS.get(named, "a data set")
-        raise SonarError(f"{shown(filename)}: this is {content.description}, not {wanted} as --from {named} says")
+        raise SonarError(f"{shown(filename)}: this is {content.description}, not {wanted}, which --from {named} needs")
 
 
 def check_content(filename: str | os.PathLike[str], content: FileContent) -> None:

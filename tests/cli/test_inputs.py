@@ -1,15 +1,16 @@
 """Inputs of all commands: every kind of log, notes and warnings, no output over an input, no silent empty result."""
 
+import json
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.bags import KINDS, firing_log, sonar_ring
+from support.bags import firing_log, sonar_ring
 from support.commands import HEADER, OFFICE, PATH, SIMULATE, call, contents
-from support.input_files import WALLS, spinning_bag
+from support.input_files import WALLS
 
-from jaxsonar import Room, load_log, load_ring, save_log, save_ring
+from jaxsonar import Room, load_log, load_ring, save_log, save_ring, simulate
 from jaxsonar.scans.single_firings import group_firings
 
 
@@ -93,31 +94,6 @@ def test_marks_for_no_echo_are_named_and_not_used(here, capsys):
 
 
 # Every kind of log
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_command_reads_bags(tmp_path, kind, capsys):
-    """A bag and the log that convert makes of it give the same map."""
-    bag, ring = spinning_bag(tmp_path / "run", kind, seconds=4.0)
-    assert call("convert", bag, tmp_path / "run.csv") == 0
-    err = capsys.readouterr().err
-    assert "/odom" in err
-    log = load_log(tmp_path / "run.csv")
-    assert err.splitlines()[-1].startswith(f"{len(log)} scans, {log.echo_count} echoes")
-    for source, output in ((bag, "bag"), (tmp_path / "run.csv", "csv")):
-        assert call("map", source, "--ring", ring, "-o", tmp_path / f"{output}.geojson") == 0
-        assert "4 walls" in capsys.readouterr().err.splitlines()[-1]
-
-
-@pytest.mark.slow
-def test_a_bag_gives_a_ring(tmp_path, capsys):
-    """Without transforms, the bag says which are missing; nothing is written."""
-    bag, _ = spinning_bag(tmp_path / "run", "sqlite", seconds=1.0)
-    before = contents(tmp_path)
-    assert call("convert", bag, tmp_path / "out.csv", "--ring-out", tmp_path / "out.toml") == 2
-    assert len(capsys.readouterr().err.splitlines()) >= 1
-    assert contents(tmp_path) == before
 
 
 @pytest.mark.slow
@@ -257,3 +233,34 @@ def test_no_output_replaces_a_file_of_a_recording(tmp_path, capsys):
         (tmp_path / "run" / name).write_text("any")
     assert call("convert", tmp_path / "run", tmp_path / "run" / "run_0.csv") == 2
     assert "this is an input" in capsys.readouterr().err
+
+
+def test_a_map_needs_an_echo_of_a_scan_with_a_pose(tmp_path, monkeypatch, capsys):
+    """The echoes of the scan without a pose do not count."""
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text(HEADER + "0,0,0,0,0,,,\n1,1,,,,3,3,1\n1,1,,,,4,4,1\n")
+    before = contents(tmp_path)
+    assert call(*COMMANDS["map"].format(log="log.csv").split()) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "nothing found: log.csv: none of the 2 echoes is in a scan with a pose: give x, y and theta"
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.slow
+def test_a_map_without_walls_is_explained(tmp_path, monkeypatch, capsys):
+    """No line at all, and lines of which each is seen by one scan."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "log.csv").write_text(HEADER + "0,0,0,0,0,3,3,1\n0,0,0,0,0,9,9,1.3\n")
+    assert call(*COMMANDS["map"].format(log="log.csv").split()) == 0
+    reason, result = capsys.readouterr().err.splitlines()[-2:]
+    assert reason.startswith("no wall: no line in 1 local model with a pose; 1 without: ")
+    assert result.startswith("1 scan, 1 local model, 0 segments, 0 walls")
+    assert json.loads(Path("out.geojson").read_text())["features"] == []
+    room = Room(np.array([[[-1.0, 1.0], [1.0, 1.0]]]))
+    ring = load_ring("faw")
+    true = np.zeros((4, 3))
+    wrong = np.array([[0, 0, 0], [900, 0, 1.0], [0, 900, 2.0], [900, 900, 3.0]])
+    save_log(simulate(ring, room, true, sigma=0.003, seed=1).as_log(ring, wrong), "log.csv")
+    assert call(*COMMANDS["map"].format(log="log.csv").split()) == 0
+    reason, _ = capsys.readouterr().err.splitlines()[-2:]
+    assert "no wall is seen by more than 1 scan, and 2 are needed; are the poses right" in reason

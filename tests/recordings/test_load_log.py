@@ -43,7 +43,7 @@ def test_a_named_format_that_the_content_contradicts_is_rejected(tmp_path):
     save_log(SMALL, tmp_path / "a.parquet.csv")
     for named, what in (("parquet", "a Parquet file"), ("bag", "a ROS bag"), ("beesoft", "a Beesoft log")):
         message = refused(load, tmp_path / "a.parquet.csv", named)
-        assert f"a.parquet.csv: this is a scan log as CSV, not {what} as --from {named} says" in message
+        assert f"a.parquet.csv: this is a scan log as CSV, not {what}, which --from {named} needs" in message
     assert load(tmp_path / "a.parquet.csv", "csv") == (SMALL, [])
 
 
@@ -137,6 +137,28 @@ def test_an_interrupted_recording_gives_its_complete_scans(tmp_path, name):
         with pytest.warns(TruncatedRecording, match="2 scans"):
             log, _ = load(tmp_path / name, named)
         np.testing.assert_array_equal(log.range, [1.5, 1.25])
+
+
+@pytest.mark.parametrize("name", ["cut.csv", "cut.parquet"])
+def test_options_apply_to_an_interrupted_recording(tmp_path, name):
+    """Values that mean no echo, the named format and the numbers of the sensors, as without the marker."""
+    from jaxsonar import Ring
+
+    if name.endswith("parquet"):
+        pytest.importorskip("pyarrow")
+        save_log(SMALL[:0], tmp_path / name)
+    text = f"{HEADER}\n" + "".join(f"0,,,,,{k},{k},{1 + k / 4}\n" for k in range(1, 5))
+    (tmp_path / (f"{name}.recording.csv" if name.endswith("parquet") else name)).write_text(text + "1,,,,,0,0")
+    recording_marker(tmp_path / name).write_text(f"{len(text)}\n")
+    with pytest.warns(TruncatedRecording):
+        log, _ = load(tmp_path / name, no_echo=(1.5,))
+    np.testing.assert_array_equal(log.range, [1.25, np.nan, 1.75, 2.0])
+    assert "not a ROS bag, which --from bag needs" in refused(load, tmp_path / name, "bag")
+    with (
+        pytest.warns(TruncatedRecording),
+        pytest.raises(ValueError, match="the sensors 1 to 4 came, so the log seems to count from 1"),
+    ):
+        load_log(tmp_path / name, ring=Ring.circular(count=4, neighbors=0))
 
 
 def test_a_raw_recording_is_a_log(tmp_path):

@@ -1,5 +1,7 @@
 """Tables with one row per scan: any delimiter, decimal sign, unit and convention of angles gives the same log."""
 
+import time
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -100,6 +102,19 @@ def test_times_can_be_dates(tmp_path):
     assert np.isnan(log.pose).all()
     message = refused(load, tmp_path, text.replace("59.6", "x"), TableFormat(time="1", ranges="5-7"))
     assert "row 2, column 1: '2024-02-29T23:59:x' came; allowed is a number (s), or a date and time" in message
+
+
+@pytest.mark.parametrize("zone", ["UTC", "America/New_York"])
+def test_dates_without_a_zone_are_in_utc(tmp_path, monkeypatch, zone):
+    """Wherever the machine is; there is no jump where its clock changes."""
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    dates = ("2024-03-10 01:59:59", "2024-03-10 03:00:00", "2024-03-10 05:00:00+02:00")
+    text = "".join(f"{date},1.0\n" for date in dates)
+    log, _ = load(tmp_path, text, TableFormat(time="1", ranges="2"))
+    monkeypatch.undo()
+    time.tzset()
+    assert log.stamp.tolist() == [1710035999.0, 1710039600.0, 1710039600.0]
 
 
 ANGLES = {
