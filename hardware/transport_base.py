@@ -37,7 +37,8 @@ class LinkEvent:
     """A change of the state of a link, reported to the user."""
 
     kind: str
-    """``lost`` (the link broke; the source reconnects), ``back`` (data again), ``silent`` (no data for a while)."""
+    """``lost`` (the link broke; the source reconnects), ``back`` (data again), ``silent`` (no data for a while),
+    ``note`` (a choice or a warning about a file that is replayed)."""
     text: str
     """Message for the user, one line."""
     time: float = field(default_factory=time.time)

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,15 @@ from jaxsonar.scans.measured_paths import unique_readings
 from jaxsonar.scans.parquet_log import open_parquet, write_parquet_chunks
 from jaxsonar.scans.recording_journal import TruncatedRecording
 from jaxsonar.sensors.ring import Ring
+
+
+class Staged(NamedTuple):
+    """What a Parquet copy does not hold of its log."""
+
+    odometry: str
+    """NumPy file with the motion of the robot (``Log.motion``), beside the copy; empty if there is none."""
+    asked: tuple[tuple[int, int], ...]
+    """``Log.asked``."""
 
 
 def check_extras(logs: Iterable[Input]) -> None:
@@ -33,7 +43,7 @@ def check_extras(logs: Iterable[Input]) -> None:
 
 def stage_whole(
     log: Input, filename: str, *, ring: Ring, rows: int, options: InputOptions, on_note: Callable[[str], None]
-) -> str:
+) -> Staged:
     """Load and prepare an input, and write it as a Parquet log with small row groups.
 
     Args:
@@ -43,9 +53,6 @@ def stage_whole(
         rows: number of rows in a row group.
         options: how the input is read.
         on_note: as in ``prepared_log``.
-
-    Returns:
-        The NumPy file with the motion of the robot (``Log.motion``), beside the copy; empty if there is none.
 
     Raises:
         SonarError: the input cannot be read, or an extra is missing.
@@ -57,11 +64,12 @@ def stage_whole(
         on_note(f"warning: {one.message}; the recording was interrupted; its complete scans are used")
     whole = unique_readings(prepared_log(ring, whole, on_note=on_note))
     write_parquet_chunks((whole[k : k + rows] for k in range(0, len(whole), rows)), filename)
+    asked = tuple((tx, rx) for tx, rx in whole.asked.tolist())
     if whole.motion is None:
-        return ""
+        return Staged("", asked)
     odometry = f"{filename}.odometry.npy"
     np.save(odometry, whole.motion)
-    return odometry
+    return Staged(odometry, asked)
 
 
 def regroup(log: Input, filename: str, *, rows: int) -> None:

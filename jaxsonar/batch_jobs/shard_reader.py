@@ -1,7 +1,6 @@
 """Reads the scans of a shard. Scans that cannot be read or used are left out and reported."""
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +10,7 @@ from jaxsonar.batch_jobs.shard import Shard
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.log_chunks import csv_chunk_reader, parquet_chunk_reader
+from jaxsonar.scans.log_parts import concatenate, readable_runs
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -37,7 +37,7 @@ def read_shard(shard: Shard, ring: Ring) -> tuple[Log, Int[np.ndarray, " scans"]
     reader = csv_chunk_reader if shard.format == "csv" else parquet_chunk_reader
     read = reader(shard.filename, shard.chunk, name=shard.source)
 
-    runs, reasons = _readable_runs(read, shard.chunk.scans)
+    runs, reasons = readable_runs(read, shard.chunk.scans)
     logs, rows = [], [np.zeros(0, np.int64)]
     for first_row, log in runs:
         unusable = _unusable_scans(shard, ring, first_row, log)
@@ -49,27 +49,6 @@ def read_shard(shard: Shard, ring: Ring) -> tuple[Log, Int[np.ndarray, " scans"]
     if shard.odometry:
         log = replace(log, odometry=np.load(shard.odometry, mmap_mode="r"))
     return log, np.concatenate(rows), reasons
-
-
-def _readable_runs(read: Callable[[int, int], Log], scans: int) -> tuple[list[tuple[int, Log]], dict[int, str]]:
-    """Find the readable runs of scans by bisection.
-
-    Returns:
-        First row and scans of each run, and for each unreadable scan the reason.
-    """
-    runs, reasons = [], {}
-    pending = [(0, scans)]
-    while pending:
-        begin, end = pending.pop()
-        try:
-            runs.append((begin, read(begin, end)))
-        except SonarError as error:
-            if end - begin == 1:
-                reasons[begin] = str(error)
-            else:
-                middle = (begin + end) // 2
-                pending += [(middle, end), (begin, middle)]
-    return runs, reasons
 
 
 def _unusable_scans(shard: Shard, ring: Ring, first_row: int, log: Log) -> dict[int, str]:
@@ -88,18 +67,3 @@ def _unusable_scans(shard: Shard, ring: Ring, first_row: int, log: Log) -> dict[
             number = log.scan[row - first_row]
             reasons[row - first_row] = f"{name}: scan {number} came again; allowed is each scan number once"
     return reasons
-
-
-def concatenate(logs: list[Log]) -> Log:
-    """One log from consecutive parts of a log."""
-    if len(logs) == 1:
-        return logs[0]
-    names = ("scan", "stamp", "pose", "tx", "rx", "range", "amplitude", "t", "age")
-    empty = Log.from_scans([])
-    columns = {name: np.concatenate([getattr(log, name) for log in (empty, *logs)]) for name in names}
-    echoes = np.concatenate([np.zeros(1, np.int64), *(np.diff(log.start) for log in logs)])
-    if not logs:
-        return empty
-    motion = [log.motion for log in logs if log.motion is not None]
-    odometry = np.unique(np.concatenate(motion), axis=0) if motion else None
-    return Log(start=np.cumsum(echoes), **columns, asked=logs[0].asked, odometry=odometry)

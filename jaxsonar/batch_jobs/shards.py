@@ -8,12 +8,13 @@ from pathlib import Path
 from jaxsonar.batch_jobs.inputs import Input
 from jaxsonar.batch_jobs.parquet_staging import regroup, stage_whole
 from jaxsonar.batch_jobs.shard import Shard
-from jaxsonar.batch_jobs.shard_reader import concatenate, read_shard
+from jaxsonar.batch_jobs.shard_reader import read_shard
 from jaxsonar.fileio.atomic_files import reason, shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.plausibility.prepared_log import prepared_log
 from jaxsonar.recordings.input_options import InputOptions
 from jaxsonar.scans.log_chunks import csv_chunks, parquet_chunks
+from jaxsonar.scans.log_parts import concatenate
 from jaxsonar.sensors.ring import Ring
 
 SHARD_SCANS = 2048
@@ -63,8 +64,11 @@ def split_input(
         shards = _split(log, filename, log.format, scans)
         if not options.no_echo and _head_is_prepared(shards, ring, on_note):
             return shards
-    odometry = stage_whole(log, filename := copy(), ring=ring, rows=scans, options=options, on_note=on_note)
-    return [replace(shard, odometry=odometry) for shard in _split(log, filename, "parquet", scans)]
+    staged = stage_whole(log, filename := copy(), ring=ring, rows=scans, options=options, on_note=on_note)
+    shards = _split(log, filename, "parquet", scans)
+    return [
+        replace(shard, odometry=staged.odometry, chunk=replace(shard.chunk, asked=staged.asked)) for shard in shards
+    ]
 
 
 def _split(log: Input, filename: str, format_: str, scans: int) -> list[Shard]:

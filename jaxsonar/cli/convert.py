@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run ``jaxsonar convert``. Returns 1 if there is no scan."""
     from jaxsonar.fileio.atomic_files import check_outputs, shown
-    from jaxsonar.scans.log_file import save_log
+    from jaxsonar.scans.log_file import save_log, unmarked_paths, unmarked_warning
     from jaxsonar.sensors.ring_toml import load_ring, save_ring
 
     check_outputs({"OUT": options.destination, "--ring-out": options.ring_out}, [options.source, options.ring])
@@ -43,6 +43,8 @@ def run(options: argparse.Namespace) -> int:
     if options.ring_out is not None:
         ring = _ring_of_bag(options, messages)
     log = read_log(options.source, options, messages, ring=ring)
+    if count := unmarked_paths(log):
+        messages.warn(_without_ring(count) if ring is None and _is_raw(options) else unmarked_warning(count))
     messages.check()
     if not len(log):
         print_status(f"nothing converted: {shown(options.source)}: no scan: the log is empty")
@@ -52,8 +54,22 @@ def run(options: argparse.Namespace) -> int:
         save_ring(ring, options.ring_out)
     silent, old = len(log.tx) - log.echo_count, int((log.age > 0).sum())
     more = [plural(silent, "silent reading")] * (silent > 0) + [f"{plural(old, 'reading')} not renewed"] * (old > 0)
-    print_status(", ".join([plural(len(log), "scan"), f"{log.echo_count} echoes", *more]))
+    echoes = f"{log.echo_count} echo{'es' * (log.echo_count != 1)}"
+    print_status(", ".join([plural(len(log), "scan"), echoes, *more]))
     return 0
+
+
+def _is_raw(options: argparse.Namespace) -> bool:
+    """Whether IN is a raw recording."""
+    from jaxsonar.recordings.file_content import file_content
+
+    return options.from_ == "record" or file_content(options.source).format == "record"
+
+
+def _without_ring(count: int) -> str:
+    """A warning about a raw recording that is converted without its ring: what, likely cause, what to do."""
+    what = f"{count} paths of scans without an echo count as silent, whether or not they were measured"
+    return f"{what}; --ring is missing, which tells the paths of each firing group; give --ring RING"
 
 
 def _ring_of_bag(options: argparse.Namespace, messages: InputMessages) -> "Ring":

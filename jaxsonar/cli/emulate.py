@@ -108,14 +108,14 @@ def _messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
 def _log_messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
     """The messages of a device that would give a log; those of a raw record as they were received."""
     from jaxsonar.cli.console import errors_in
-    from jaxsonar.live.replay import messages_of
+    from jaxsonar.live.replay import messages_of, messages_of_log
     from jaxsonar.recordings.file_content import file_content
-    from jaxsonar.simulation.device_messages import log_messages
 
     if options.from_ in (None, "record") and file_content(options.log).format == "record":
         return messages_of(options.log, ring)
     messages = InputMessages(strict=options.strict)
     log = read_log(options.log, options, messages, ring=ring)
-    messages.check()
     with errors_in(options.log):
-        return log_messages(log, ring)
+        sent = messages_of_log(log, ring, on_note=messages.note)
+    messages.check()
+    return sent

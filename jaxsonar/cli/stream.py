@@ -19,6 +19,7 @@ from jaxsonar.cli.arguments import (
     ODOMETRY_HELP,
     add_detection_arguments,
     filename_ending_in,
+    finite,
     number,
     odometry_error,
     odometry_noise,
@@ -64,6 +65,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="stop after N scans (default: at the end of the stream)",
     )
+    parser.add_argument(
+        "--no-echo",
+        action="append",
+        default=[],
+        type=finite(-1e9),
+        metavar="METRES",
+        help="file:LOG: a range that means no echo; can be repeated",
+    )
     parser.add_argument("--view", action="store_true", help="show the stream (extra viz), on this machine only")
     parser.add_argument(
         "--rrd", type=filename_ending_in(".rrd"), metavar="FILE", help="the view as a file for rerun (extra viz)"
@@ -84,6 +93,8 @@ def run(options: argparse.Namespace) -> int:
     replayed = url.path if url.scheme == "file" else None
     if (options.trajectory or options.odometry) and not options.slam:
         raise SonarError("--trajectory or --odometry came without --slam; allowed are they with --slam")
+    if options.no_echo and replayed is None:
+        raise SonarError("--no-echo came with a device; allowed is it with file:LOG")
     outputs = {
         "--record": options.record,
         "--map": options.map,
@@ -113,6 +124,7 @@ def run(options: argparse.Namespace) -> int:
                 odometry_noise=odometry_noise(options.odometry) if options.slam else None,
                 trajectory=options.trajectory,
                 scans=options.scans,
+                no_echo=options.no_echo,
                 view=view,
                 on_status=status_line.status,
                 on_event=status_line.event,

@@ -33,7 +33,7 @@ class MeasuredSensors(NamedTuple):
         tx, rx = ring.paths.T
         measured, offset = np.any(measured_paths(ring, log), axis=0), neighbor_offsets(ring)
         audible = np.greater(ring.exact_paths.width, 0)
-        missing = [k for k in unheard_offsets(ring, log) if not measured[offset == k].any()]
+        missing = unheard_offsets(ring, log)
         kinds = ["direct echoes"] if 0 in missing else []
         if neighbors := [k for k in missing if k]:
             kinds.append(f"echoes from neighbor{'s' * (len(neighbors) > 1)} {_listed(neighbors)}")

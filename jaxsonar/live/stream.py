@@ -3,7 +3,7 @@
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from jaxsonar import kernels
@@ -17,6 +17,7 @@ from jaxsonar.live.live_map import LiveMap, LiveScan
 from jaxsonar.live.replay import file_opener
 from jaxsonar.live.status import Status
 from jaxsonar.live.stream_loop import SETTINGS, StreamLoop, Viewer
+from jaxsonar.recordings.input_options import InputOptions
 from jaxsonar.scans.raw_scans import group_paths
 from jaxsonar.scans.recording_journal import open_log_recorder
 from jaxsonar.sensors.ring import Ring
@@ -35,6 +36,7 @@ def stream(
     odometry_noise: OdometryNoise | None = None,
     trajectory: str | os.PathLike[str] | None = None,
     scans: int | None = None,
+    no_echo: Sequence[float] = (),
     view: Viewer | None = None,
     on_scan: Callable[[LiveScan], None] | None = None,
     on_status: Callable[[Status], None] | None = None,
@@ -58,6 +60,7 @@ def stream(
             estimated (``slam``). By default the device's poses are exact.
         trajectory: TUM file of the estimated poses, written at the end; needs ``odometry_noise``.
         scans: stop after this many scans.
+        no_echo: ranges of a replayed log that mean no echo, metres (``InputOptions.no_echo``).
         view: viewer of the stream.
         on_scan: called for every scan with its local model.
         on_status: called several times per second with the status.
@@ -81,7 +84,7 @@ def stream(
     mapping = bool(map_filename) or view is not None
     live = LiveMap(ring, method=method, settings=settings, sigma=sigma, mapping=mapping, odometry_noise=odometry_noise)
     queue = DropOldestQueue[RawScan](SETTINGS.warm_up_capacity, size_of=lambda scan: len(scan.echoes))
-    reader = _open_reader(url, ring, queue, record=record, scans=scans, on_event=on_event)
+    reader = _open_reader(url, ring, queue, record=record, scans=scans, no_echo=no_echo, on_event=on_event)
     # 2. The loop; it starts to compile in the background.
     loop = StreamLoop(
         live,
@@ -118,10 +121,11 @@ def _open_reader(
     *,
     record: str | os.PathLike[str] | None,
     scans: int | None,
+    no_echo: Sequence[float],
     on_event: Callable[[LinkEvent], None] | None,
 ) -> ReaderThread:
     """Open the device and the recording."""
-    register_transport("file", file_opener(ring))
+    register_transport("file", file_opener(ring, InputOptions(no_echo=tuple(no_echo))))
     readers: list[ReaderThread] = []
 
     def on_link_event(event: LinkEvent) -> None:

@@ -1,10 +1,11 @@
-"""Kinds of echo paths that a ring lists and that a log never heard."""
+"""Kinds of echo paths that a ring lists and that a log neither heard nor measured."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int
 
+from jaxsonar.scans.measured_paths import measured_paths
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -14,7 +15,7 @@ class UnheardPathSettings:
     """When a kind of paths counts as never heard. Chosen by hand."""
 
     min_expected: float = 50.0
-    """Least number of echoes of some unheard kind that the echoes of the other kinds let expect."""
+    """Least expected number of echoes of an unheard kind, from the number of echoes of the other kinds."""
 
 
 SETTINGS = UnheardPathSettings()
@@ -28,10 +29,11 @@ def neighbor_offsets(ring: Ring) -> Int[np.ndarray, " paths"]:
 
 
 def unheard_offsets(ring: Ring, log: Log) -> list[int]:
-    """Neighbor offsets (0: direct echoes) of which the log holds no echo, although the ring lists such paths.
+    """Neighbor offsets (0: direct echoes) whose paths the ring lists, but the log never measured.
 
-    They count only if the echoes of the other kinds let expect ``SETTINGS.min_expected`` echoes or more of one of them,
-    where the number of echoes is proportional to the width of the directions in which paths detect a wall.
+    Paths with silent readings were measured. The offsets count only if ``SETTINGS.min_expected`` echoes or more of one
+    of them are expected. The expectation is the number of echoes of the other kinds, scaled by the width of the
+    directions in which the paths detect a wall.
     """
     known = (log.tx < ring.count) & (log.rx < ring.count) & np.isfinite(log.range)
     path = ring.path_index[log.tx[known], log.rx[known]]
@@ -42,7 +44,10 @@ def unheard_offsets(ring: Ring, log: Log) -> list[int]:
     if not is_heard.any() or width[is_heard].sum() == 0:
         return []
     expected = heard.sum() * width / width[is_heard].sum()
-    return np.flatnonzero(~is_heard).tolist() if (expected[~is_heard] >= SETTINGS.min_expected).any() else []
+    if not (expected[~is_heard] >= SETTINGS.min_expected).any():
+        return []
+    is_measured = np.bincount(offset, weights=measured_paths(ring, log).any(axis=0), minlength=len(heard)) > 0
+    return np.flatnonzero(~is_heard & ~is_measured).tolist()
 
 
 def unheard_warning(ring: Ring, log: Log) -> str | None:

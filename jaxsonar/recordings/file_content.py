@@ -39,6 +39,9 @@ SUFFIXES = {
 }
 """Formats that fit each suffix; any format fits another suffix."""
 
+SEPARATOR_LINE = re.compile(r'\s*"?sep=(.)"?\s*', re.IGNORECASE)
+"""First line of a table that tells a spreadsheet the delimiter."""
+
 _BINARY = {
     b"\x89PNG": "a picture (PNG)",
     b"\xff\xd8\xff": "a picture (JPEG)",
@@ -157,11 +160,15 @@ def _text_content(head: bytes) -> FileContent:
     if "\0" in text or text.count("\ufffd") > 0.01 * len(text) + 1:
         return FileContent(None, "a binary file")
     lines = [line.strip() for line in text.splitlines()]
+    if lines and SEPARATOR_LINE.fullmatch(lines[0]):  # of a table written by a spreadsheet
+        lines.pop(0)
     first = next((line for line in lines if line), "")
     if re.search(r"^(#(ROBOT|SONAR \d+:)|begin\(pattern)", text, re.MULTILINE):
         return _known("beesoft")
     if re.search(r"^## *Player version", text, re.MULTILINE) or _is_player_line(lines):
         return _known("player")
+    if any(re.match(r"\d+\.\d+ \S+ \d+ (sonar|position) \d+ \d+\.\d+ ", line) for line in lines[:200]):
+        return FileContent(None, "a log of Player 1.x (versions 2 and 3 are read)", is_text=True)
     if re.match(r"S1,S2,.*,S24,OUTPUT$", first):
         return _known("scitos24")
     if _is_log_header(first):

@@ -56,7 +56,13 @@ def load_log(
             note(text)
     log = _read(filename, options.format or str(content.format), ring, options, note)
     _check_numbering(filename, log, ring)
-    return log if options.format == "table" else without_no_echo_values(log, options.no_echo)
+    if options.format == "table":
+        return log
+    for value in options.no_echo:
+        if (marked := without_no_echo_values(log, [value])) is log:
+            note(f"--no-echo {value:g}: no range has this value")
+        log = marked
+    return log
 
 
 def _read(

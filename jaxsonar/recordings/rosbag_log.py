@@ -197,7 +197,7 @@ def _odometry(chosen: Messages, time: Float[np.ndarray, " messages"], tree: Fram
     if chosen.child and not chosen.child.split("/")[-1].startswith("base"):
         matrix = tree.lookup(base, chosen.child) if base else None
         if matrix is None:
-            note(f"odometry: its frame '{chosen.child}' is taken for the robot frame, as no transform says otherwise")
+            note(f"odometry: its frame '{chosen.child}' is taken for the robot frame, as no transform relates them")
         else:
             note(f"odometry: moved from '{chosen.child}' to '{base}' by the transforms")
             pose = compose(pose, inverse(planar_pose(matrix)))
@@ -258,7 +258,7 @@ def _cloud_log(bag: Bag, poses: _Poses, ring: Ring | None, options: InputOptions
         raise _nothing(bag)
     if ring is None:
         raise SonarError(
-            f"{shown(bag.name)}: sonar points came; needed is the ring, which tells the sensor of each point"
+            f"{shown(bag.name)}: sonar points came; needed is the ring, which tells the sensor of each point (--ring)"
         )
     streams = _of_types(bag.read(sonar_topics(clouds, name=bag.name)), CLOUD)
     chosen = choose_odometry(

@@ -17,9 +17,10 @@ class OdometrySettings:
     """Constants of the interpolation of odometry. Chosen by hand for robots that drive on a floor."""
 
     max_gap: float = 1.0
-    """Poses are interpolated over at most this time, seconds, or ``max_gap_periods``; unless the robot stood still."""
+    """Poses are interpolated over at most this time, seconds, or ``max_gap_periods`` if that is longer; over any time if
+    the robot stood still."""
     max_gap_periods: float = 2.5
-    """The same in median periods of the odometry."""
+    """The same in median periods of the odometry. Over more than ``max_gap``, a warning says how far the robot moved."""
     still: tuple[float, float] = (0.05, 0.05)
     """A robot that moved less in a gap stood still, metres and radians: some drivers send nothing then."""
     jump: tuple[float, float] = (0.2, 0.35)
@@ -71,7 +72,7 @@ def choose_odometry(
         return None
     ranks = [_rank(one, sensor_topics) for one in candidates]
     best = [one for one, rank in zip(candidates, ranks, strict=True) if rank == max(ranks)]
-    why = "as --odometry-topic says" if wanted else "the only one"
+    why = "chosen by --odometry-topic" if wanted else "the only one"
     if wanted is None and len(candidates) > 1:
         by_namespace = len({rank[0] for rank in ranks}) > 1
         why = f"chosen of {len(candidates)} by {'its namespace, that of the sensors' if by_namespace else 'its frames'}"
@@ -137,13 +138,47 @@ class Odometry:
             k = rows[np.argmax(step[rows])]
             largest = f"{step[k]:.2f} m and {np.degrees(turn[k]):.0f} deg at {time[k + 1]:.3f} s"
             cause = "it began again or was corrected, and walls seen before and after do not fit together"
-            note(f"warning: the odometry jumps {len(rows)} times, by {largest}; {cause}; map the parts separately")
+            times = "once" if len(rows) == 1 else f"{len(rows)} times"
+            note(f"warning: the odometry jumps {times}, by {largest}; {cause}; map the parts separately")
         # The pose is held until just before the jump, so that nothing is interpolated across it.
         held = np.column_stack([np.nextafter(time[rows + 1], -np.inf), pose[rows]])
         samples = np.insert(np.column_stack([time, pose]), rows + 1, held, axis=0)
         part = np.append(0, np.cumsum(jump))[: len(time)].astype(np.int64)
         part = np.insert(part, rows + 1, part[rows])
-        return cls(samples, part)
+        odometry = cls(samples, part)
+        odometry._warn_if_slow(note)
+        return odometry
+
+    def _warn_if_slow(self, note: Callable[[str], None]) -> None:
+        """Report poses that are interpolated over a long time in which the robot moved."""
+        if len(self.samples) < 2:
+            return
+        gap, step, turn, still = self._steps()
+        slow = (gap > SETTINGS.max_gap) & (gap <= self._longest_gap) & ~still
+        if slow.any():
+            motion = f"{step[slow].max():.2f} m and {np.degrees(turn[slow].max()):.0f} deg"
+            what = f"the odometry has a pose only every {np.median(gap[slow]):.1f} s, and the robot moves by up to {motion}"
+            note(f"warning: {what} in between; interpolated poses and walls may be off; record the odometry more often")
+
+    @property
+    def _longest_gap(self) -> float:
+        """Time over which poses of a moving robot are interpolated, seconds."""
+        return max(SETTINGS.max_gap, SETTINGS.max_gap_periods * float(np.median(np.diff(self.samples[:, 0]))))
+
+    def _steps(
+        self,
+    ) -> tuple[
+        Float[np.ndarray, " steps"],
+        Float[np.ndarray, " steps"],
+        Float[np.ndarray, " steps"],
+        Bool[np.ndarray, " steps"],
+    ]:
+        """Seconds, metres and radians between samples, and whether the robot stood still."""
+        gap, pose = np.diff(self.samples[:, 0]), self.samples[:, 1:]
+        step, turn = np.hypot(*np.diff(pose[:, :2], axis=0).T), np.abs(wrap_angle(np.diff(pose[:, 2])))
+        still = (step <= SETTINGS.still[0]) & (turn <= SETTINGS.still[1])
+        still &= np.append(gap[1:] >= SETTINGS.hold, True)  # not if the pose is only held
+        return gap, step, turn, still
 
     def poses(self, time: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 3"]:
         """world_from_robot at some times; NaN where the odometry has a gap, and before and after it."""
@@ -156,12 +191,8 @@ class Odometry:
         """Whether the pose is known at some times."""
         if len(self.samples) < 2:
             return np.zeros(len(time), bool)
-        stamp, pose = self.samples[:, 0], self.samples[:, 1:]
-        gap = np.diff(stamp)
-        longest = max(SETTINGS.max_gap, SETTINGS.max_gap_periods * float(np.median(gap)))
-        moved = np.hypot(*np.diff(pose[:, :2], axis=0).T), np.abs(wrap_angle(np.diff(pose[:, 2])))
-        still = (moved[0] <= SETTINGS.still[0]) & (moved[1] <= SETTINGS.still[1])
-        still &= np.append(gap[1:] >= SETTINGS.hold, True)  # not if the pose is only held
+        stamp, longest = self.samples[:, 0], self._longest_gap
+        gap, _, _, still = self._steps()
         closed = (gap <= longest) | still
         before = np.searchsorted(stamp, time, side="right") - 1
         inside = (before >= 0) & (before < len(stamp) - 1)

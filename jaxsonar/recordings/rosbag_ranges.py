@@ -41,8 +41,8 @@ def reading_kinds(
     - +inf, and ranges of at least the maximum, mean that nothing was heard.
     - NaN, -inf, and positive ranges below the minimum measured nothing: the object is too close, or the reading is
       invalid.
-    - 0, negative ranges, and the minimum itself mean that nothing was heard, in bags in which no reading says so
-      otherwise. In the others, they measured nothing.
+    - 0, negative ranges, and the minimum itself measured nothing if the bag marks silence in one of the ways above.
+      Otherwise they mean that nothing was heard.
     - Without a maximum, a range that is repeated exactly and is beyond the ring's maximum means that nothing was heard.
 
     Limits that are not set (0, not finite) or that contradict the echoes are no limits.
@@ -66,9 +66,9 @@ def reading_kinds(
     infinite, zero = np.isposinf(reported), np.isfinite(reported) & (reported <= 0)
     kind = np.full(len(reported), ECHO)
     kind[at_high | infinite | beyond] = SILENT
-    says_so = bool((kind == SILENT).any())
-    kind[zero] = NOT_MEASURED if says_so else SILENT
-    kind[at_low] = NOT_MEASURED if says_so or zero.any() else SILENT
+    marks_silence = bool((kind == SILENT).any())
+    kind[zero] = NOT_MEASURED if marks_silence else SILENT
+    kind[at_low] = NOT_MEASURED if marks_silence or zero.any() else SILENT
     kind[below | np.isnan(reported) | np.isneginf(reported)] = NOT_MEASURED
     names = {
         "+inf": infinite,

@@ -25,6 +25,7 @@ from jaxsonar.scans.csv_log import (
     is_scan_number,
     read_csv_rows,
 )
+from jaxsonar.scans.log_parts import concatenate, readable_runs
 from jaxsonar.scans.log_survey import LogSurvey
 from jaxsonar.scans.parquet_log import open_parquet, read_batch
 from jaxsonar.scans.scan_log import Log
@@ -64,7 +65,7 @@ class LogChunk:
     asked: tuple[tuple[int, int], ...] = ()
     """``Log.asked`` of the whole file."""
     in_turn: bool = False
-    """Every scan of the file holds the firings of one transmitter; ``firing_poses.group_firings`` merges them."""
+    """Every scan of the file holds the firings of one transmitter; ``single_firings.group_firings`` merges them."""
     around: tuple[int, int, int, int] | None = None
     """First scan, scans, CSV: begin and end in bytes, of this chunk with the scans around it that it needs; None: it
     needs none."""
@@ -150,18 +151,46 @@ def _with_surroundings(
     chunk: LogChunk,
     name: str,
 ) -> Callable[[int, int], Log]:
-    """Reader of a chunk; its scans come from a log that also holds the scans around it, if these are readable."""
+    """Reader of a chunk; its scans come from a log that also holds the readable scans around it."""
     plain, wider = reader(filename, chunk, name), chunk.with_surroundings
     if wider is None:
         return plain
     from jaxsonar.scans.measured_paths import unique_readings
 
-    try:
-        log = unique_readings(reader(filename, wider, name)(0, wider.scans))
-    except SonarError:
-        return plain
     before = chunk.first - wider.first
-    return lambda begin, end: log[before + begin : before + end]
+    runs, _ = readable_runs(reader(filename, wider, name), wider.scans)
+    runs = _without_repeated_scans(runs, {before + row for row in chunk.repeated})
+    log = unique_readings(concatenate([run for _, run in runs]))
+    place = np.full(wider.scans, -1)
+    place[_rows(runs)] = np.arange(len(log))
+    place = place[before : before + chunk.scans]
+
+    def read(begin: int, end: int) -> Log:
+        if (place[begin:end] >= 0).all():
+            return log[place[begin] : place[begin] + end - begin]
+        alone = plain(begin, end)  # reports unreadable scans
+        if end - begin == 1:
+            return replace(alone, asked=log.asked)
+        middle = (begin + end) // 2
+        return concatenate([read(begin, middle), read(middle, end)])
+
+    return read
+
+
+def _rows(runs: list[tuple[int, Log]]) -> Int[np.ndarray, " scans"]:
+    """Rows of the scans of runs that begin at these rows."""
+    return np.concatenate([np.zeros(0, np.int64), *(first + np.arange(len(run)) for first, run in runs)])
+
+
+def _without_repeated_scans(runs: list[tuple[int, Log]], repeated: set[int]) -> list[tuple[int, Log]]:
+    """Runs of scans with different numbers: the first scan of each number, without the rows ``repeated``."""
+    row = _rows(runs)
+    number = np.concatenate([np.zeros(0, np.int64), *(run.scan for _, run in runs)])
+    known = np.flatnonzero(~np.isin(row, list(repeated)))
+    kept = set(row[known[np.unique(number[known], return_index=True)[1]]].tolist())
+    if len(kept) == len(row):
+        return runs
+    return [(first + k, run[k : k + 1]) for first, run in runs for k in range(len(run)) if first + k in kept]
 
 
 def _csv_reader(filename: str | os.PathLike[str], chunk: LogChunk, name: str) -> Callable[[int, int], Log]:

@@ -1,8 +1,13 @@
 """Reading and writing of scan logs as CSV and Parquet."""
 
 import os
+from collections.abc import Callable
+from dataclasses import fields
+
+import numpy as np
 
 from jaxsonar.hardware.recorder_base import recording_marker
+from jaxsonar.scans.measured_paths import explicit_log
 from jaxsonar.scans.scan_log import Log, log_format
 
 PARQUET_MAGIC = b"PAR1"
@@ -32,17 +37,20 @@ def load_scan_log(filename: str | os.PathLike[str]) -> Log:
     return read_csv(filename)
 
 
-def save_log(log: Log, filename: str | os.PathLike[str]) -> None:
+def save_log(log: Log, filename: str | os.PathLike[str], *, on_note: Callable[[str], None] | None = None) -> None:
     """Write a scan log as ``.csv`` or ``.parquet``; both formats are lossless.
 
     Args:
         log: the scans.
         filename: the file; its suffix, in either case, determines the format. An existing file is replaced only after
             the new one is complete.
+        on_note: called with a warning if the file cannot hold what the log measured (``unmarked_paths``).
 
     Raises:
         SonarError: another suffix, or the file cannot be written.
     """
+    if on_note is not None and (count := unmarked_paths(log)):
+        on_note(f"warning: {unmarked_warning(count)}")
     if log_format(filename) == "csv":
         from jaxsonar.scans.csv_log import write_csv
 
@@ -51,6 +59,25 @@ def save_log(log: Log, filename: str | os.PathLike[str]) -> None:
         from jaxsonar.scans.parquet_log import write_parquet
 
         write_parquet(log, filename)
+
+
+def unmarked_paths(log: Log) -> int:
+    """Number of paths, counted in every scan, that the log did not measure but that are silent in its file.
+
+    A file without any silent reading is implicit: all pairs heard anywhere in it count as measured by every scan. So
+    an explicit log that holds echoes only is another one after it is saved and loaded.
+    """
+    if len(log.asked) or np.isnan(log.range).any():
+        return 0
+    loaded = Log(**{field.name: getattr(log, field.name) for field in fields(Log) if field.name != "asked"})
+    return len(explicit_log(loaded).tx) - len(log.tx)
+
+
+def unmarked_warning(count: int) -> str:
+    """A warning about paths that are silent in a file: what, likely cause, what to do."""
+    what = f"{count} paths of scans were not measured, but count as silent in the file, which holds echoes only"
+    cause = "the device probably does not report what it measured without hearing anything"
+    return f"{what}; {cause}; use the recording itself, or record silent readings, too"
 
 
 def _is_parquet(filename: str | os.PathLike[str]) -> bool:

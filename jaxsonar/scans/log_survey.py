@@ -74,7 +74,7 @@ class LogSurvey:
 
 
 def _sensors(text: np.ndarray) -> Int[np.ndarray, " texts"]:
-    """Sensor indices; -1 for fields that are none."""
+    """Sensor indices; -1 for fields that hold no sensor index."""
     given = text != b""
     try:
         number = integers_of(text[given])
@@ -87,7 +87,7 @@ def _sensors(text: np.ndarray) -> Int[np.ndarray, " texts"]:
 
 
 def _numbers_of(text: np.ndarray, *, missing: float = 0.0) -> Float[np.ndarray, " texts"]:
-    """Numbers of fields; ``missing`` for those that are none."""
+    """Numbers of fields; ``missing`` for fields that hold no number."""
     return np.array([float(one) if NUMBER.fullmatch(one) else missing for one in text.tolist()])
 
 

@@ -1,6 +1,7 @@
 """Shards: chunks of logs give the same rows as the whole log, in bounded memory."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,12 @@ from support.batches import JOB, RING, office_scans, one_shard
 from jaxsonar import Log, load_log, save_log
 from jaxsonar.batch_jobs.inputs import Input, find_inputs
 from jaxsonar.batch_jobs.parquet_tables import TABLES
+from jaxsonar.batch_jobs.shard_reader import read_shard
 from jaxsonar.batch_jobs.shards import split_input
 from jaxsonar.batch_jobs.worker import run_shard
 from jaxsonar.scans.log_chunks import csv_chunk_reader, csv_chunks, parquet_chunk_reader, parquet_chunks
+from jaxsonar.scans.log_parts import concatenate
+from jaxsonar.scans.measured_paths import measured_paths
 
 pa = pytest.importorskip("pyarrow")
 
@@ -91,6 +95,20 @@ def test_large_row_groups_are_staged(tmp_path, monkeypatch):
     assert parts[0].filename == str(tmp_path / "copies" / "log.parquet.parquet")
     assert pq.ParquetFile(parts[0].filename).metadata.num_row_groups == 5
     assert load_log(parts[0].filename) == load_log(tmp_path / "log.parquet")
+
+
+def test_a_staged_copy_keeps_what_the_log_measured(tmp_path, monkeypatch):
+    """An explicit log without a silent reading, as of a device that only reports echoes and names what it measured."""
+    whole = office_scans(20)
+    explicit = Log.from_scans([replace(scan, asked=np.zeros((0, 2), np.int64)) for scan in whole])
+    assert not measured_paths(RING, explicit).all()
+    monkeypatch.setattr("jaxsonar.batch_jobs.parquet_staging.load_log", lambda *_, **more: explicit)
+    (tmp_path / "run.mcap").write_bytes(b"")
+    log = Input("run.mcap", str(tmp_path / "run.mcap"), "record")
+    for scans in (7, 20):
+        parts = split_input(log, staging=tmp_path / "copies", ring=RING, scans=scans)
+        read = concatenate([read_shard(part, RING)[0] for part in parts])
+        assert np.array_equal(measured_paths(RING, read), measured_paths(RING, explicit))
 
 
 def test_keys_are_valid_filenames_and_distinct():

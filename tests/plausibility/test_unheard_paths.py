@@ -9,6 +9,7 @@ from jaxsonar import Log, Ring, Room, random_pose, random_room, simulate
 from jaxsonar.plausibility.prepared_log import prepared_log
 from jaxsonar.plausibility.unheard_paths import neighbor_offsets, unheard_offsets, unheard_warning
 from jaxsonar.plausibility.unused_echoes import EchoCounts
+from jaxsonar.scans.measured_paths import explicit_log, measured_paths
 
 RING = Ring.circular()
 POSES = {"stamp": np.arange(8.0), "pose": np.zeros((8, 3))}
@@ -36,6 +37,21 @@ def test_the_kinds_that_were_left_out_are_found(heard):
     assert text is not None
     assert text.count("; ") >= 2
     assert ("set neighbors = " in text) == (missing[-1] == 3 and missing == list(range(missing[0], 4)))
+
+
+def test_paths_with_silent_readings_were_measured():
+    """Direct echoes only, with a silent reading of every other path: nothing is missing."""
+    direct = with_offsets(scanned(RING), RING, [0])
+    assert unheard_offsets(RING, direct) == [1, 2, 3]
+    everything = explicit_log(replace(direct, asked=RING.paths))
+    assert measured_paths(RING, everything).all()
+    assert unheard_offsets(RING, everything) == []
+    some = RING.paths[neighbor_offsets(RING) < 2]
+    listed = explicit_log(replace(direct, asked=some))
+    assert unheard_offsets(RING, listed) == [2, 3]
+    text = unheard_warning(RING, listed)
+    assert "neighbor 2 or 3" in text
+    assert "set neighbors = 1" in text
 
 
 def test_the_offsets_are_those_of_the_nearer_side():

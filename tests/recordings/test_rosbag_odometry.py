@@ -51,7 +51,7 @@ def test_an_unclear_choice_is_a_question():
         chosen(stream("/a"), stream("/b"))
     assert chosen(stream("/a"), stream("/b"), wanted="b") == (
         "/b",
-        "odometry: /b (odom -> base_link), as --odometry-topic says",
+        "odometry: /b (odom -> base_link), chosen by --odometry-topic",
     )
     with pytest.raises(SonarError, match="--odometry-topic c: no such odometry; /a, /b came"):
         chosen(stream("/a"), stream("/b"), wanted="c")
@@ -79,6 +79,25 @@ def test_a_robot_at_rest_may_send_nothing():
     assert not Odometry.of(time, pose, print).known(np.array([15.0])).any()
 
 
+def test_slow_odometry_of_a_moving_robot_gives_a_warning():
+    time = np.arange(0.0, 20.0, 2.0)
+    pose = np.stack([0.2 * time, np.zeros_like(time), 0.5 * time], axis=-1)
+    notes = []
+    assert Odometry.of(time, pose, notes.append).known(np.array([3.0])).all()
+    (note,) = notes
+    assert note.startswith(
+        "warning: the odometry has a pose only every 2.0 s, and the robot moves by up to 0.40 m and 57"
+    )
+    for quiet in (np.zeros_like(pose), pose[:1].repeat(len(time), axis=0)):  # a robot at rest
+        Odometry.of(time, quiet, lambda text: pytest.fail(text))
+    Odometry.of(time / 4, pose, lambda text: pytest.fail(text))
+    # Gaps of odometry at a usual rate are not interpolated, and need no warning.
+    gap = Odometry.of(
+        np.append(np.arange(10) * 0.1, 4.0), np.append(pose[:9], pose[-2:], axis=0)[:11], lambda text: None
+    )
+    assert not gap.known(np.array([2.5])).any()
+
+
 def test_messages_in_any_order_and_without_orientation(rng):
     time = np.arange(0, 3, 0.05)
     pose = np.stack([0.2 * time, -0.1 * time, 0.3 * time], axis=-1)
@@ -96,7 +115,7 @@ def test_nothing_is_interpolated_across_a_jump():
     notes = []
     odometry = Odometry.of(time, pose, notes.append)
     assert len(notes) == 1
-    assert notes[0].startswith("warning: the odometry jumps 1 times, by 0.57 m and 115 deg at 2.000 s; ")
+    assert notes[0].startswith("warning: the odometry jumps once, by 0.57 m and 115 deg at 2.000 s; ")
     at = np.array([1.89, 1.93, 1.99, 2.0, 2.01])
     np.testing.assert_allclose(odometry.poses(at)[:, 2], [0, 0, 0, 2, 2], atol=1e-12)
     np.testing.assert_allclose(odometry.poses(at)[1:3, 0], 0.57, atol=1e-12)

@@ -1,6 +1,7 @@
 """Chunks of a log: every split gives what the whole log measured, and the poses of its readings."""
 
 import tempfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.firing_poses import reading_poses
 from jaxsonar.scans.log_chunks import csv_chunk_reader, csv_chunks, parquet_chunk_reader, parquet_chunks
 from jaxsonar.scans.log_file import load_scan_log, save_log
+from jaxsonar.scans.log_parts import concatenate, readable_runs
 from jaxsonar.scans.measured_paths import measured_paths, unique_readings
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -50,6 +52,16 @@ def chunks(path, scans):
     plan, reader = (csv_chunks, csv_chunk_reader) if path.endswith("csv") else (parquet_chunks, parquet_chunk_reader)
     parts = plan(path, name="log", scans=scans)
     return parts, [reader(path, part, name="log")(0, part.scans) for part in parts]
+
+
+def good_scans(path, scans):
+    """The readable scans of a file with different numbers, from chunks of this size, without repeated readings."""
+    plan, reader = (csv_chunks, csv_chunk_reader) if path.endswith("csv") else (parquet_chunks, parquet_chunk_reader)
+    good = []
+    for part in plan(path, name="log", scans=scans):
+        runs, _ = readable_runs(reader(path, part, name="log"), part.scans)
+        good += [run[k : k + 1] for first, run in runs for k in range(len(run)) if first + k not in part.repeated]
+    return unique_readings(concatenate(good))
 
 
 def assert_same_evidence(found, log):
@@ -114,3 +126,23 @@ def test_unreadable_surroundings_do_not_make_a_chunk_unreadable(tmp_path):
     assert len(csv_chunk_reader(path, first, name="log")(0, 3).tx) == 9
     with pytest.raises(SonarError, match="row 28, column range: 'wall'"):
         csv_chunk_reader(path, last, name="log")(0, 3)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("bad", [9, 13, 14])
+def test_one_bad_scan_does_not_change_the_evidence_of_the_others(tmp_path, monkeypatch, suffix, bad):
+    """A bad range, or a number that came before, near a chunk or in it: every split gives the same other scans."""
+    if suffix == "parquet":
+        pytest.importorskip("pyarrow")
+    log, path = some_log("ages"), tmp_path / f"log.{suffix}"
+    for damage in ("range", "scan"):
+        column = getattr(log, damage).copy()
+        column[log.start[bad] if damage == "range" else bad] = -1 if damage == "range" else 3
+        with monkeypatch.context() as unchecked:
+            unchecked.setattr(Log, "_check", lambda self: None)
+            save_log(replace(log, **{damage: column}), path)
+        whole, *others = (good_scans(str(path), scans) for scans in (40, 7, 3))
+        assert len(whole) == 39
+        for one in others:
+            assert np.array_equal(one.scan, whole.scan)
+            assert_same_evidence(one, whole)
