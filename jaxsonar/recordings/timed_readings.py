@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from jaxsonar.geometry.se2 import interpolate
+from jaxsonar.scans.firing_poses import poses_at
 from jaxsonar.scans.scan_log import Log
 
 MAX_EXTRAPOLATION = 1.0
@@ -86,11 +86,6 @@ def _ascending(samples: Float[np.ndarray, "samples 4"]) -> Float[np.ndarray, "_ 
 def _poses_at(samples: Float[np.ndarray, "samples 4"], stamp: Float[np.ndarray, " scans"]) -> Float[np.ndarray, "_ 3"]:
     """Poses at some times, interpolated; the first and the last pose slightly beyond; NaN farther away."""
     time, pose = samples[:, 0], samples[:, 1:]
-    if len(time) == 1:
-        at = np.repeat(pose, len(stamp), axis=0)
-    else:
-        before = np.clip(np.searchsorted(time, stamp, side="right") - 1, 0, len(time) - 2)
-        fraction = (stamp - time[before]) / (time[before + 1] - time[before])
-        at = interpolate(pose[before], pose[before + 1], np.clip(fraction, 0, 1))
+    at = np.repeat(pose, len(stamp), axis=0) if len(time) == 1 else poses_at(time, pose, stamp, extrapolation=0.0)
     at[(stamp < time[0] - MAX_EXTRAPOLATION) | (stamp > time[-1] + MAX_EXTRAPOLATION)] = np.nan
     return at

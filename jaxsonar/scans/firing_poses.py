@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar.geometry.se2 import compose, interpolate, relative
-from jaxsonar.scans.measured_paths import measurement_times
+from jaxsonar.scans.measured_paths import explicit_log, measurement_times, path_rows
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -53,17 +53,18 @@ def reading_poses(log: Log) -> Float[np.ndarray, "readings 3"]:
 
 
 def path_poses(ring: Ring, log: Log) -> Float[np.ndarray, "scans paths 3"] | None:
-    """scan_from_robot of each path of each scan, as ``reading_motion``; zero for paths without a reading.
+    """scan_from_robot of each path of each scan, as ``reading_motion``; zero for paths that were not measured.
+
+    A path that heard nothing has the time of its transmitter (``explicit_log``), also without a silent reading.
 
     Returns:
         The poses; None if every reading belongs to the pose of its scan.
     """
+    log = explicit_log(log) if log.t.any() else log
     motion = reading_motion(log)
     if motion is None:
         return None
-    known = (log.tx < ring.count) & (log.rx < ring.count)
-    path = np.full(len(log.tx), -1)
-    path[known] = ring.path_index[log.tx[known], log.rx[known]]
+    path = path_rows(ring, log.tx, log.rx)
     known = path >= 0
     poses = np.zeros((len(log), len(ring.paths), 3))
     poses[log.echo_scan[known], path[known]] = motion[known]
@@ -90,10 +91,17 @@ def _known_poses(log: Log) -> tuple[Float[np.ndarray, " samples"], Float[np.ndar
 
 
 def poses_at(
-    time: Float[np.ndarray, " samples"], pose: Float[np.ndarray, "samples 3"], at: Float[np.ndarray, " times"]
+    time: Float[np.ndarray, " samples"],
+    pose: Float[np.ndarray, "samples 3"],
+    at: Float[np.ndarray, " times"],
+    *,
+    extrapolation: float = SETTINGS.max_extrapolation,
 ) -> Float[np.ndarray, "times 3"]:
-    """Poses at some times, interpolated; slightly beyond the first and the last one extrapolated."""
+    """Poses at some times, interpolated between two or more samples.
+
+    Before the first and after the last sample they are extrapolated by up to ``extrapolation`` intervals.
+    """
     before = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(time) - 2)
     fraction = (at - time[before]) / (time[before + 1] - time[before])
-    fraction = np.clip(fraction, -SETTINGS.max_extrapolation, 1 + SETTINGS.max_extrapolation)
+    fraction = np.clip(fraction, -extrapolation, 1 + extrapolation)
     return interpolate(pose[before], pose[before + 1], fraction)

@@ -116,7 +116,9 @@ class Log:
     """Scans in chronological order, one read-only array per column.
 
     The constructor checks every value against ``ALLOWED``. Therefore every log can be written and read again.
-    ``len(log)`` is the number of scans, ``log[i]`` is a ``Scan``, and ``log[a:b]`` is a shorter ``Log``.
+    ``len(log)`` is the number of scans, ``log[i]`` is a ``Scan``, and ``log[a:b]`` is a shorter ``Log``. A single scan
+    leaves out readings that only repeat an older one of the log (``measured_paths.is_repeated``), because it does not
+    know that they were counted before; a shorter log keeps them.
     """
 
     scan: Int[np.ndarray, " scans"]
@@ -334,6 +336,15 @@ class Log:
         known = np.isfinite(self.stamp) & np.isfinite(self.pose).all(axis=1)
         return np.column_stack([self.stamp, self.pose])[known]
 
+    @cached_property
+    def _unique(self) -> "Log":
+        """The log without repeated old readings, of which its single scans are parts."""
+        if not self.age.any():
+            return self
+        from jaxsonar.scans.measured_paths import unique_readings
+
+        return unique_readings(self)
+
     def __len__(self) -> int:
         return len(self.scan)
 
@@ -348,18 +359,19 @@ class Log:
         if not -len(self) <= i < len(self):
             raise IndexError(f"scan {i} of a log with {len(self)} scans")
         i %= len(self)
-        echoes = slice(self.start[i], self.start[i + 1])
+        log = self._unique
+        echoes = slice(log.start[i], log.start[i + 1])
         return Scan(
-            scan=int(self.scan[i]),
-            stamp=float(self.stamp[i]),
-            pose=self.pose[i],
-            tx=self.tx[echoes],
-            rx=self.rx[echoes],
-            range=self.range[echoes],
-            amplitude=self.amplitude[echoes],
-            t=self.t[echoes],
-            age=self.age[echoes],
-            asked=self.asked,
+            scan=int(log.scan[i]),
+            stamp=float(log.stamp[i]),
+            pose=log.pose[i],
+            tx=log.tx[echoes],
+            rx=log.rx[echoes],
+            range=log.range[echoes],
+            amplitude=log.amplitude[echoes],
+            t=log.t[echoes],
+            age=log.age[echoes],
+            asked=log.asked,
             odometry=self.motion,
         )
 

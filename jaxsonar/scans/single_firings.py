@@ -3,8 +3,10 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
+from jaxsonar.scans.asked_pairs import firing_period
+from jaxsonar.scans.measured_paths import with_silent_readings
 from jaxsonar.scans.scan_log import Log
 
 
@@ -14,8 +16,6 @@ class SingleFiringSettings:
 
     max_scan_duration: float = 2.0
     """Longest time between the first and the last firing of a scan, seconds."""
-    max_period: int = 256
-    """Longest firing order that is looked for, firings."""
     min_repetitions: float = 3.0
     """Echoes for each transmitter of a firing order, at least. With fewer, an order may appear by chance."""
 
@@ -72,17 +72,15 @@ def _complete_by_order(transmitter: Int[np.ndarray, " scans"]) -> Int[np.ndarray
     """Transmitters with those of silent firings (-1) by the shortest period that all others agree with, if any."""
     heard = np.flatnonzero(transmitter >= 0)
     tx = transmitter[heard]
-    sensors = len(np.unique(tx))
-    if len(tx) < SETTINGS.min_repetitions * sensors:
+    _, first, row = np.unique(tx, return_index=True, return_inverse=True)
+    if len(tx) < SETTINGS.min_repetitions * len(first):
         return transmitter
-    for period in range(sensors, min(SETTINGS.max_period, len(transmitter) // 2) + 1):
-        place = heard % period
-        order = np.full(period, -1)
-        order[place] = tx
-        listed = order[order >= 0]
-        if (order[place] == tx).all() and len(np.unique(listed)) == len(listed):
-            return np.where(transmitter >= 0, transmitter, order[np.arange(len(transmitter)) % period])
-    return transmitter
+    period = firing_period(heard[first], int(np.gcd.reduce(heard - heard[first][row.ravel()])))
+    if period is None or period > len(transmitter) // 2:
+        return transmitter
+    order = np.full(period, -1)
+    order[heard % period] = tx
+    return np.where(transmitter >= 0, transmitter, order[np.arange(len(transmitter)) % period])
 
 
 def _with_silent_paths(log: Log, transmitter: Int[np.ndarray, " scans"]) -> Log:
@@ -93,23 +91,7 @@ def _with_silent_paths(log: Log, transmitter: Int[np.ndarray, " scans"]) -> Log:
     scan = np.repeat(np.arange(len(log)), counts)
     row = np.repeat(first - np.cumsum(counts) + counts, counts) + np.arange(len(scan))
     tx, rx = pairs[row].T
-    silent = ~_is_in((scan, rx), (log.echo_scan, log.rx))
-    scan, tx, rx = scan[silent], tx[silent], rx[silent]
-    nothing, zero = np.full(len(scan), np.nan), np.zeros(len(scan))
-    added = {"tx": tx, "rx": rx, "range": nothing, "amplitude": nothing, "t": zero, "age": zero}
-    scan = np.concatenate([log.echo_scan, scan])
-    order = np.argsort(scan, kind="stable")
-    columns = {name: np.concatenate([getattr(log, name), column])[order] for name, column in added.items()}
-    return replace(log, start=np.searchsorted(scan[order], np.arange(len(log) + 1)), **columns)
-
-
-def _is_in(
-    rows: tuple[Int[np.ndarray, " some"], Int[np.ndarray, " some"]],
-    others: tuple[Int[np.ndarray, " others"], Int[np.ndarray, " others"]],
-) -> Bool[np.ndarray, " some"]:
-    """Which pairs of numbers occur among other pairs."""
-    width = int(max(rows[1].max(initial=0), others[1].max(initial=0))) + 1
-    return np.isin(rows[0] * width + rows[1], others[0] * width + others[1])
+    return with_silent_readings(log, scan, tx, rx)
 
 
 def _groups(log: Log, transmitter: Int[np.ndarray, " scans"]) -> Int[np.ndarray, " scans"]:

@@ -11,7 +11,7 @@ from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.measured_paths import SETTINGS as AGES
-from jaxsonar.scans.measured_paths import equivalent_scans, measurement_times
+from jaxsonar.scans.measured_paths import equivalent_scans, measurement_times, path_rows
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -120,26 +120,27 @@ class WindowBuffer:
     travelled: tuple[float, ...] = ()
     """Length of the trajectory up to each of them, metres."""
     fresh: tuple[frozenset[Reading], ...] = ()
-    """The readings of each scan that count, if the log does not list its measurements (``_lists_measurements``)."""
+    """The readings of each scan that count, if the log does not list its measurements (``_lists_measurements``) and
+    holds no ages."""
     new: tuple[frozenset[Pair], ...] = ()
-    """The pairs of each scan whose measurement counts, if the log lists its measurements."""
+    """The pairs of each scan whose measurement counts otherwise. Both are kept, because ages may appear later."""
     runs: Mapping[Reading, int] = field(default_factory=dict)
     """Number of earlier consecutive scans that contain each reading of the latest scan."""
     place: float = 0.0
     """Cumulative motion in units of one place (``has_moved``)."""
     latest: Mapping[Pair, Measurement] = field(default_factory=dict)
-    """The latest measurement of each pair, if the log lists its measurements."""
+    """The latest measurement of each pair."""
     has_ages: bool = False
     """Whether any reading so far had an age."""
 
     def add(self, scan: Scan, *, length: float) -> tuple["WindowBuffer", bool]:
         """The buffer with one more scan, and whether a window ends there. A scan without a pose empties the buffer."""
         has_ages = self.has_ages or (scan.age is not None and bool(scan.age.any()))
-        readings = [*zip(scan.tx.tolist(), scan.rx.tolist(), scan.range.tolist(), strict=True)]
+        heard = np.where(np.isnan(scan.range), _NOTHING, scan.range)
+        readings = [*zip(scan.tx.tolist(), scan.rx.tolist(), heard.tolist(), strict=True)]
         runs = {reading: self.runs.get(reading, -1) + 1 for reading in readings}
-        listed = has_ages or _lists_measurements(scan)
         if not np.isfinite(scan.pose).all():
-            latest = _new_measurements(scan, self.latest, -1)[1] if listed else self.latest
+            latest = _new_measurements(scan, self.latest, self.runs, -1)[1]
             latest = {pair: one._replace(place=-1) for pair, one in latest.items()}
             return WindowBuffer(runs=runs, place=self.place, latest=latest, has_ages=has_ages), False
         travelled, place, at_rest = 0.0, self.place, False
@@ -149,10 +150,9 @@ class WindowBuffer:
             travelled = self.travelled[-1] + distance
             place += distance / SETTINGS.place_distance + abs(float(wrap_angle(step[2]))) / SETTINGS.place_rotation
             at_rest = np.floor(place) == np.floor(self.place)
-        fresh, new, latest = frozenset(), frozenset(), self.latest
-        if listed:
-            new, latest = _new_measurements(scan, self.latest, int(np.floor(place)))
-        elif not at_rest:
+        new, latest = _new_measurements(scan, self.latest, self.runs, int(np.floor(place)))
+        fresh = frozenset()
+        if not at_rest:
             fresh = frozenset(r for r, run in runs.items() if run % SETTINGS.renewal_period == 0)
         begin = int(np.searchsorted([*self.travelled, travelled], travelled - length))
         spacing = length / SETTINGS.overlap
@@ -274,13 +274,14 @@ def _first_at_place(
 
 
 def _new_measurements(
-    scan: Scan, latest: Mapping[Pair, Measurement], place: int
+    scan: Scan, latest: Mapping[Pair, Measurement], before: Mapping[Reading, int], place: int
 ) -> tuple[frozenset[Pair], dict[Pair, Measurement]]:
     """The pairs of a scan whose measurement counts, and the latest measurements with those of this scan.
 
     Args:
         scan: the scan.
         latest: the latest measurement of each pair before it.
+        before: the readings of the scan before it.
         place: the place of the robot.
     """
     log = scan.as_log()
@@ -288,12 +289,16 @@ def _new_measurements(
     measured: dict[Pair, tuple[float, set[float]]] = {}
     read: set[Pair] = set()
     for tx, rx, reported, time, age in zip(*(column.tolist() for column in columns), strict=True):
-        before, heard = latest.get((tx, rx)), reported if np.isfinite(reported) else _NOTHING
+        measurement, heard = latest.get((tx, rx)), reported if np.isfinite(reported) else _NOTHING
         read.add((tx, rx))
-        if before is None or age == 0 or heard not in before.ranges:
+        if age == 0:
+            repeated = False
+        elif not np.isfinite(scan.stamp):
+            repeated = (tx, rx, heard) in before
+        elif measurement is None or heard not in measurement.ranges:
             repeated = False
         else:
-            repeated = abs(time - before.time) < AGES.same_measurement
+            repeated = abs(time - measurement.time) < AGES.same_measurement
         if not repeated:
             measured.setdefault((tx, rx), (time, set()))[1].add(heard)
     silent = {(tx, rx) for tx, rx in log.asked.tolist()} - read
@@ -306,7 +311,7 @@ def _new_measurements(
 def _rows_of_paths(ring: Ring, pairs: Iterable[Pair]) -> Int[np.ndarray, " rows"]:
     """Rows of ``Ring.paths``; other pairs are omitted."""
     tx, rx = np.array([*pairs], np.int64).reshape(-1, 2).T
-    rows = ring.path_index[tx, rx]
+    rows = path_rows(ring, tx, rx)
     return rows[rows >= 0]
 
 

@@ -12,7 +12,7 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.messages import ECHO, REFERENCE_SPEED_OF_SOUND, Group, Message, Pose
 from jaxsonar.hardware.protocol import MAX_ANGLE, MAX_POSITION, MAX_TIME_OF_FLIGHT_US
 from jaxsonar.scans.firing_poses import poses_at
-from jaxsonar.scans.measured_paths import unique_readings
+from jaxsonar.scans.measured_paths import firing_times, unique_readings
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.simulator import simulate
@@ -55,11 +55,7 @@ def log_messages(log: Log, ring: Ring, *, moving: bool = False, temperature: flo
     if moving and not log.t.any():
         time = _following_times(ring, stamps, groups)
     else:
-        late = np.zeros(groups)
-        late[plan[log.tx]] = log.t  # of groups without any reading in a scan: as in other scans
-        late = np.tile(late, (len(log), 1))
-        late[log.echo_scan, plan[log.tx]] = log.t
-        time = stamps[:, None] + late
+        time = stamps[:, None] + firing_times(log, plan[log.tx], groups)
     pose = _group_poses(log.pose, stamps, time, log.odometry)
     return _messages(log, plan, fired, time, pose, temperature)
 

@@ -7,6 +7,7 @@ import pytest
 
 from jaxsonar.geometry.se2 import compose, subtract_poses
 from jaxsonar.scans.firing_poses import path_poses, reading_motion, reading_poses
+from jaxsonar.scans.measured_paths import explicit_log, measured_paths
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -90,6 +91,24 @@ def test_paths_have_the_pose_of_their_readings():
     direct = RING.path_index[np.arange(4), np.arange(4)]
     assert_same_poses(poses[:, direct].reshape(-1, 3), reading_motion(log))
     assert not np.delete(poses, direct, axis=1).any()
+
+
+@pytest.mark.parametrize("whole_transmitter", [False, True])
+def test_a_silent_path_of_an_implicit_log_has_the_time_of_its_transmitter(whole_transmitter):
+    """All paths of a circle of four sensors; one path, or all of one transmitter, without a reading in scan 1."""
+    stamps, (tx, rx) = np.array([3.0, 3.4, 3.8]), np.tile(RING.paths, (3, 1)).T
+    scan = np.repeat(np.arange(3), len(RING.paths))
+    columns = (scan, tx, rx, np.ones(len(scan)), 0.1 * tx)
+    kept = ~((scan == 1) & (tx == 3) & (whole_transmitter | (rx == 3)))
+    scan, tx, rx, heard, t = (column[kept] for column in columns)
+    log = Log.from_echoes(scan, tx, rx, heard, t=t, stamp=stamps, pose=arc(stamps))
+    poses = path_poses(RING, log)
+    assert poses is not None
+    assert measured_paths(RING, log).all()
+    fired = stamps[:, None] + 0.1 * RING.paths[:, 0]
+    assert_same_poses(compose(log.pose[:, None], poses), arc(fired))
+    listed = explicit_log(log)
+    np.testing.assert_allclose(listed.t, 0.1 * listed.tx)
 
 
 def test_scans_of_a_robot_that_fires_at_once_are_not_changed():

@@ -1,5 +1,7 @@
 """What a scan measured, against the rules of the file format written out in plain loops."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -67,6 +69,27 @@ def test_sensors_that_fire_in_turn_measure_only_what_their_scan_lists():
     np.testing.assert_array_equal(measured_paths(RING, log_of(scans)).sum(axis=1), np.ones(10))
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("sensors", [2, 4, 5])
+def test_sparse_full_scans_are_no_firings_in_turn(sensors, seed):
+    """In a large hall, each scan of all sensors holds one echo at most."""
+    rng = np.random.default_rng(seed)
+    ring = Ring.circular(count=sensors, neighbors=0)
+    log = log_of([{(k, k): 1.0} if rng.random() < 0.7 else {} for k in rng.integers(0, sensors, 200).tolist()])
+    assert measured_paths(ring, log).all()
+
+
+@pytest.mark.parametrize(("heard", "kept"), [(0.3, 1.0), (0.8, 0.9)])
+def test_sensors_that_fire_in_turn_are_known_by_their_order(heard, kept):
+    """Most firings hear nothing and have a scan without a reading, or some scans are missing in the log."""
+    rng = np.random.default_rng(0)
+    order, log = rng.permutation(5).tolist(), []
+    for k in range(300):
+        if rng.random() < kept:
+            log.append({(order[k % 5], order[k % 5]): 1.0} if rng.random() < heard else {})
+    assert not len(log_of(log).asked)
+
+
 def test_one_sensor_alone_does_not_fire_in_turn():
     scans = [{(3, 3): 1.0}, {}, {(3, 3): 1.1}]
     np.testing.assert_array_equal(measured_paths(RING, log_of(scans)).sum(axis=1), np.ones(3))
@@ -107,6 +130,62 @@ def test_an_unrenewed_reading_without_its_original_is_kept():
     log = log_of([{(0, 0): 1.0, (1, 1): 2.0}, {(0, 0): 1.5, (1, 1): 2.0}], age=np.array([0.05, 0, 0.03, 0]))
     assert not is_repeated(log).any()
     assert unique_readings(log) is log
+
+
+def repeated_in(stamp, age, scan=None):
+    """Rows of repeated readings among equal readings of one path, one in each scan."""
+    count = len(stamp)
+    log = Log.from_echoes(
+        np.arange(count) if scan is None else np.array(scan),
+        np.zeros(count, int),
+        np.zeros(count, int),
+        np.ones(count),
+        age=np.array(age),
+        stamp=np.array(stamp),
+        pose=np.zeros((count, 3)),
+    )
+    return np.flatnonzero(is_repeated(log)).tolist()
+
+
+@pytest.mark.parametrize("digits", [1, 2, 3, 4])
+@pytest.mark.parametrize("rounded", ["age", "stamp", "both"])
+def test_rounded_ages_and_stamps_are_recognized(digits, rounded):
+    """A sensor renews its reading with every third scan; equal ranges all the time."""
+    period = 4.3 * 10.0**-digits
+    time = 1.7e9 + period * np.arange(30)
+    age = period * (np.arange(30) % 3)
+    stamp = np.round(time, digits) if rounded != "age" else time
+    age = np.round(age, digits) if rounded != "stamp" else age
+    assert repeated_in(stamp, age) == [k for k in range(30) if k % 3]
+
+
+def test_readings_that_were_measured_between_scans_are_not_repeated():
+    """Each scan holds a new reading, 30 ms old."""
+    assert repeated_in(0.1 * np.arange(20), np.full(20, 0.03)) == []
+
+
+def test_without_stamps_an_old_reading_repeats_an_equal_one_of_the_scan_before():
+    stamp = np.full(5, np.nan)
+    assert repeated_in(stamp, [0, 0.04, 0.07, 0, 0.04]) == [1, 2, 4]
+    log = log_of([{(0, 0): 1.0}, {(0, 0): 1.5}, {(0, 0): 1.0}, {(0, 0): 1.0}], age=np.array([0, 0.1, 0.2, 0.3]))
+    assert np.flatnonzero(is_repeated(replace(log, stamp=np.full(4, np.nan)))).tolist() == [3]
+
+
+@pytest.mark.parametrize("is_explicit", [False, True])
+def test_a_single_scan_does_not_hold_what_an_earlier_scan_counted(is_explicit):
+    listed = {(2, 2): NAN} if is_explicit else {}
+    scans = [{(0, 0): 1.0, (1, 1): 2.0, **listed}, {(0, 0): 1.0, **listed}, {(1, 1): 2.5, **listed}]
+    age = np.concatenate([np.zeros(len(scans[0])), [0.1], np.zeros(len(listed)), np.zeros(len(scans[2]))])
+    log = log_of(scans, age=age)
+    flat, _ = FlatEchoes.from_log(RING, log)
+    assert np.diff(flat.start).tolist() == [2, 0, 1]
+    for k, scan in enumerate(log):
+        one, _ = FlatEchoes.from_log(RING, scan.as_log())
+        np.testing.assert_array_equal(one.path, flat.path[flat.scan == k])
+        np.testing.assert_array_equal(measured_paths(RING, scan.as_log())[0], measured_paths(RING, log)[k])
+    again = Log.from_scans(list(log))
+    np.testing.assert_array_equal(measured_paths(RING, again), measured_paths(RING, log))
+    assert len(log[1:2].tx) == 1 + len(listed)
 
 
 def test_removing_repetitions_from_an_implicit_log_keeps_the_silence_of_other_paths():

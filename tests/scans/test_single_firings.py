@@ -48,12 +48,13 @@ def test_grouped_firings_keep_every_reading_time_and_pose(silent):
 
 def test_a_group_of_firings_ends_before_the_second_firing_of_a_transmitter():
     log = single_firings(7)
-    log = replace(log, tx=np.array([0, 1, 0, 2, 3, 3, 1]), rx=np.array([0, 1, 0, 2, 3, 3, 1]))
+    asked = np.zeros((0, 2), int)  # one transmitter in each scan, in no order
+    log = replace(log, tx=np.array([0, 1, 0, 2, 3, 3, 1]), rx=np.array([0, 1, 0, 2, 3, 3, 1]), asked=asked)
     np.testing.assert_array_equal(group_firings(log).start, [0, 2, 5, 7])
 
 
 def test_firings_without_stamps_or_after_a_pause_are_not_merged():
-    log = single_firings(4)
+    log = replace(single_firings(4), asked=np.zeros((0, 2), int))
     assert len(group_firings(replace(log, stamp=np.full(4, np.nan)))) == 4
     pause = replace(log, stamp=log.stamp + np.array([0, 0, 30, 30]))
     np.testing.assert_array_equal(group_firings(pause).start, [0, 2, 4])
@@ -101,13 +102,13 @@ def test_silent_firings_without_an_order_stay_unknown():
 
 def test_a_firing_with_an_echo_is_silent_on_the_other_paths_of_its_transmitter():
     # Neighbors listen, too: in the first round everybody hears, later only the transmitter itself.
-    tx = np.array([0, 0, 1, 1, 0, 1, 0, 1])
-    rx = np.array([0, 1, 1, 0, 0, 1, 0, 1])
-    scan = np.array([0, 0, 1, 1, 2, 3, 4, 5])
-    stamp = 0.025 * np.arange(6)
-    log = Log.from_echoes(scan, tx, rx, np.ones(8), stamp=stamp, pose=arc(stamp))
+    tx = np.array([0, 0, 1, 1, *[0, 1] * 4])
+    rx = np.array([0, 1, 1, 0, *[0, 1] * 4])
+    scan = np.array([0, 0, 1, 1, *range(2, 10)])
+    stamp = 0.025 * np.arange(10)
+    log = Log.from_echoes(scan, tx, rx, np.ones(12), stamp=stamp, pose=arc(stamp))
     grouped = group_firings(log)
-    assert len(grouped) == 3
+    assert len(grouped) == 5
     later = grouped[1]
     heard = {(int(a), int(b)): bool(np.isfinite(r)) for a, b, r in zip(later.tx, later.rx, later.range, strict=True)}
     assert heard == {(0, 0): True, (0, 1): False, (1, 1): True, (1, 0): False}

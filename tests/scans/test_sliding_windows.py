@@ -424,6 +424,39 @@ def listed_log(seed, *, scans=40, in_turn=False, ages=True):
     )
 
 
+@pytest.mark.parametrize("is_explicit", [False, True])
+@pytest.mark.parametrize("first", [0, 7, 12])
+def test_ages_may_begin_anywhere(first, is_explicit):
+    """Readings before the first age, or with ages themselves, have the same weight in incremental windows."""
+    readings = [[(s, s, 1.0 + (k // 2 + s) / 100) for s in range(4)] for k in range(40)]
+    log = log_of(readings, straight([0.05] * 39))
+    age = np.where((log.echo_scan % 2 == 1) & (log.echo_scan > first) & (log.tx < 3), 0.1, 0.0)
+    asked = np.zeros((0, 2), int) if is_explicit else log.asked
+    still = np.array([[-10.0, 0, 0, 0], [10, 0, 0, 0]])
+    log = replace(log, age=age, stamp=0.1 * np.arange(40), asked=asked, odometry=still)
+    last, ends = WindowBuffer(), []
+    for k in range(len(log)):  # scans as a device reports them, with the repeated readings
+        part = slice(log.start[k], log.start[k + 1])
+        columns = {name: getattr(log, name)[part] for name in ("tx", "rx", "range", "amplitude", "t", "age")}
+        scan = replace(log[k], **columns, asked=log.asked)
+        last, is_end = last.add(scan, length=1.0)
+        ends += [(k, last)] if is_end else []
+    whole, _ = gather_windows(FOUR, log, length=1.0)
+    assert whole.echoes.scans_per_window is not None
+    compared = 0
+    for k, buffer in ends:
+        if k <= first + 1:
+            continue  # no age so far
+        _, windows = buffer.window(FOUR, length=1.0)
+        row = whole.last.tolist().index(k)
+        np.testing.assert_array_equal(
+            windows.echoes.reported, whole.echoes.reported[whole.echoes.start[row] : whole.echoes.start[row + 1]]
+        )
+        np.testing.assert_allclose(windows.echoes.scans_per_window, whole.echoes.scans_per_window[row])
+        compared += 1
+    assert compared > 1
+
+
 def expected_weights(log, spans):
     """Number of scans of all four sensors to which the measurements of each window amount, by a loop."""
     seen, place, new, ever = {}, -1, [], set()
