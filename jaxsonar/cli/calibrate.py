@@ -4,7 +4,7 @@ import argparse
 
 from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, finite
 from jaxsonar.cli.console import ascii_name, errors_in, print_status, step_status, write_figure
-from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_all_inputs
+from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_all_inputs, nothing_used
 
 SUMMARY = "Calibrate a ring from ordinary scans of an unknown room."
 
@@ -49,14 +49,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--figure", type=figure_filename, metavar="FIG", help="draw the results, .svg, .png or .pdf")
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run ``jaxsonar calibrate``."""
+def run(options: argparse.Namespace) -> int:
+    """Run ``jaxsonar calibrate``. Returns 1 if no echo could be used."""
     from jaxsonar.calibration.calibrate import calibrate as calibrate_ring
     from jaxsonar.calibration.calibration_toml import save_calibration
     from jaxsonar.fileio.atomic_files import check_outputs
 
     check_outputs({"-o": options.output, "--figure": options.figure}, [*options.logs, options.ring])
     ring, logs = load_all_inputs(options, options.logs)
+    unused = [nothing_used(ring, log, name) for log, name in zip(logs, options.logs, strict=True)]
+    if all(unused):
+        return 1
     choices = {key: getattr(options, key) for key in ("free", "poses", "odometry", "temperature", "sigma", "window")}
     with errors_in(", ".join(ascii_name(log) for log in options.logs)), step_status() as step:
         calibration = calibrate_ring(ring, logs, **choices, on_step=step)
@@ -69,3 +72,4 @@ def run(options: argparse.Namespace) -> None:
     write_figure(figure, options.figure)
     for line in calibration.summary():
         print_status(line)
+    return 0

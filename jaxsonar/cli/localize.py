@@ -8,7 +8,7 @@ if TYPE_CHECKING:
 
 from jaxsonar.cli.arguments import add_slam_arguments, figure_filename, filename, odometry_noise
 from jaxsonar.cli.console import ascii_name, errors_in, print_status, stage_status, write_figure
-from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs
+from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Localize the robot in a known map."
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run ``jaxsonar localize``. Returns 1 if the pose is not certain."""
+    """Run ``jaxsonar localize``. Returns 1 if the pose is not certain, or no echo could be used."""
     from jaxsonar.estimation.trajectory import save_trajectory
     from jaxsonar.fileio.atomic_files import check_outputs
     from jaxsonar.localization.localize import localize as run_localize
@@ -44,6 +44,8 @@ def run(options: argparse.Namespace) -> int:
     )
     world = _load_known_map(options.map)
     ring, log = load_inputs(options)
+    if nothing_used(ring, log, options.log):
+        return 1
     with errors_in(options.log), stage_status() as progress:
         result = run_localize(
             ring,

@@ -190,8 +190,10 @@ def _why_no_wall(models: "list[LocalModel]", evidence: "MapEvidence", merging: s
     count = len(evidence.segments)
     if not count:
         reasons = Counter(model.empty for model in models if model.empty).most_common()
-        why = "; ".join(f"{number} without: {reason}" for reason, number in reasons)
-        return f"no line in {plural(evidence.models, 'local model')} with a pose{'; ' * bool(why)}{why}"
+        why = [f"{number} without: {reason}" for reason, number in reasons]
+        if min_scans > 1:
+            why.append("try --window 1.5 if the ring has few sensors")
+        return "; ".join([f"no line in {plural(evidence.models, 'local model')} with a pose", *why])
     lines = f"{plural(count, 'line')} in {plural(evidence.models, 'local model')}"
     seen = max(map(len, assemble_map(evidence, merging=merging, min_scans=1).scans), default=0)
     if 0 < seen < min_scans:

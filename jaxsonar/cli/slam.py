@@ -12,7 +12,7 @@ from jaxsonar.cli.console import (
     write_figure,
     write_json,
 )
-from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs
+from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Trajectory and map, from echoes and odometry, or from echoes alone."
@@ -50,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run ``jaxsonar slam``."""
+def run(options: argparse.Namespace) -> int:
+    """Run ``jaxsonar slam``. Returns 1 if no echo could be used."""
     import numpy as np
 
     from jaxsonar.cli.slam_summary import (
@@ -74,6 +74,8 @@ def run(options: argparse.Namespace) -> None:
         [options.log, options.ring, options.truth],
     )
     ring, log = load_inputs(options)
+    if nothing_used(ring, log, options.log):
+        return 1
     truth = None if options.truth is None else load_trajectory(options.truth)
     if truth is not None:
         check_truth(truth, log, truth_name=str(options.truth), log_name=options.log)
@@ -122,3 +124,4 @@ def run(options: argparse.Namespace) -> None:
         print_left_out(ring.name, left_out)
     for line in summary_lines(result, errors):
         print_status(line)
+    return 0

@@ -128,8 +128,11 @@ def slam(
     log = estimation_log(log)
     has_odometry = np.asarray(np.isfinite(log.pose).all(axis=1))
     if window is None and len(log) and _echoes_of_a_long_wall(ring, log) < SETTINGS.sparse_echoes:
+        if not has_odometry.any():
+            paths = f"fewer than {SETTINGS.sparse_echoes:g} paths of {ring.name!r} receive a long wall in one scan"
+            raise SonarError(f"slam: no scan has odometry, and {paths}; allowed is a log with odometry for such a ring")
         # A robot that drives less than a window stays at one place, as far as windows are concerned.
-        stays = has_odometry.any() and _distance_driven(log.pose[has_odometry]) < SETTINGS.sparse_window
+        stays = _distance_driven(log.pose[has_odometry]) < SETTINGS.sparse_window
         window = None if stays else SETTINGS.sparse_window
     _check(log, has_odometry, sigma=sigma, window=window, smooth=smooth, speed=speed, scale=scale)
     # 1. Detect: the local model of every scan, unless maps of windows or the tracker do so.

@@ -37,7 +37,8 @@ def prepared_log(ring: Ring, log: Log, *, on_note: Callable[[str], None]) -> Log
         on_note(f"warning: {text}")
     grouped = group_firings(log)
     if grouped is not log:
-        on_note(f"{len(log)} scans with one firing each are merged into {len(grouped)} scans")
+        scans = f"{len(grouped)} scan{'s' * (len(grouped) != 1)}"
+        on_note(f"{len(log)} scans with one firing each are merged into {scans}")
     if held := find_held_readings(ring, grouped):
         on_note(f"warning: {held.describe()}; each range counts once; let the driver report nothing instead")
     return with_ages(grouped, held)

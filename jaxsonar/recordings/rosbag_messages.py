@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -81,7 +82,8 @@ def open_bag(filename: str | os.PathLike[str], name: str) -> Iterator["Bag"]:
         except SonarError:
             raise
         except Exception as failure:  # the library and its databases raise many types for invalid bags
-            raise SonarError(f"{shown(name)}: {reason(failure)}; needed is a whole bag") from None
+            why = re.sub(r"\('(.*?)',\)", r"\1", reason(failure)).rstrip(". ")  # some texts are tuples of one
+            raise SonarError(f"{shown(name)}: {why}; needed is a whole bag") from None
 
 
 class Bag:

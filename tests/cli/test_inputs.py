@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -264,3 +266,45 @@ def test_a_map_without_walls_is_explained(tmp_path, monkeypatch, capsys):
     assert call(*COMMANDS["map"].format(log="log.csv").split()) == 0
     reason, _ = capsys.readouterr().err.splitlines()[-2:]
     assert "no wall is seen by more than 1 scan, and 2 are needed; are the poses right" in reason
+
+
+SILENT = HEADER + "0,0,0,0,0,3,3,\n1,1,1,0,0,3,3,\n2,2,2,0,0,3,3,\n"
+ESTIMATES = {
+    "slam": "slam log.csv --ring faw -o out.geojson",
+    "localize": "localize log.csv --ring faw --map room.geojson --trajectory out.tum",
+    "calibrate": "calibrate log.csv --ring faw -o out.toml",
+}
+
+
+@pytest.mark.parametrize("command", ESTIMATES)
+def test_a_log_without_an_echo_gives_no_poses_and_no_parameters(tmp_path, monkeypatch, capsys, command):
+    """The reason is that there is no echo, not what follows from that."""
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text(SILENT)
+    Path("room.geojson").write_bytes(Path(OFFICE).read_bytes())
+    before = contents(tmp_path)
+    assert call(*ESTIMATES[command].split()) == 1
+    *_, line = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"nothing found: log.csv: no echo in \d scans?: every range is empty or means no echo", line)
+    assert contents(tmp_path) == before
+
+
+def test_slam_of_a_sparse_ring_names_the_odometry(tmp_path, capsys):
+    """A window is nothing that the person asked for."""
+    ring = sonar_ring(16)
+    log = firing_log(ring, Room(WALLS), lambda time: np.array([1.7, 1.3, 0.1]), np.arange(64) * 0.04)
+    save_ring(ring, tmp_path / "ring.toml")
+    save_log(replace(log, pose=np.full((len(log), 3), np.nan)), tmp_path / "log.csv")
+    assert call("slam", tmp_path / "log.csv", "--ring", tmp_path / "ring.toml", "-o", tmp_path / "out.geojson") == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert "no scan has odometry, and fewer than 4 paths" in line
+    assert "window" not in line
+
+
+def test_a_mark_that_no_range_has_is_a_note(here, capsys):
+    Path("one.csv").write_text(HEADER + "0,0,0,0,0,3,3,1.0\n")
+    assert call("convert", "one.csv", "out.csv", "--no-echo", "2.5", "--no-echo", "1") == 0
+    assert capsys.readouterr().err.splitlines() == [
+        "--no-echo 2.5: no range has this value",
+        "1 scan, 0 echoes, 1 silent reading",
+    ]

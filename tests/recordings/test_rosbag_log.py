@@ -238,7 +238,7 @@ def test_a_scan_does_not_cross_a_jump_of_the_odometry(firings, tmp_path):
     for time in np.arange(-0.01, 6.1, 0.02):
         bag.odometry(time, drive(time) if time < 3 else drive(time) - drive(3.0))
     log, notes = read(bag, tmp_path)
-    assert sum(one.startswith("warning: the odometry jumps 1 times, by ") for one in notes) == 1
+    assert sum(one.startswith("warning: the odometry jumps once, by ") for one in notes) == 1
     time = log.stamp[log.echo_scan] + log.t - START
     for scan in range(len(log)):
         here = time[log.echo_scan == scan]
