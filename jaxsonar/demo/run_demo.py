@@ -33,6 +33,7 @@ from jaxsonar.occupancy.nav2_map import save_nav2
 from jaxsonar.occupancy.occupancy_grid import occupancy
 from jaxsonar.reports.plot_style import save_figure
 from jaxsonar.scans.log_file import save_log
+from jaxsonar.scans.measured_paths import explicit_log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_toml import save_ring
 from jaxsonar.simulation.office import load_office
@@ -115,7 +116,7 @@ def run_demo(
     save_ring(ring, output / "ring.toml")
     save_room(office.room, output / "office.geojson")
     save_poses(office.poses, office.stamps, output / "path.csv")
-    save_log(log, output / "office.csv")
+    save_log(explicit_log(log), output / "office.csv")  # the file tells what was measured
     save_models(models, output / "lines.jsonl")
     save_settings(hough_settings(ring, None), output / "lines.settings.toml")
     save_map(world, output / "map.geojson")
