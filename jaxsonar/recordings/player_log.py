@@ -57,7 +57,7 @@ def load_player(filename: str | os.PathLike[str], *, options: InputOptions, on_n
 
 def _messages(filename: str | os.PathLike[str]) -> list[tuple[int, float, str, list[float]]]:
     """Line number, time, device and content of the sonar ranges and poses; an incomplete last line is skipped."""
-    found = []
+    found: list[tuple[int, float, str, list[float]]] = []
     lines = text_lines(Path(filename))
     for number, line in enumerate(lines, 1):
         fields = line.split()
@@ -71,14 +71,22 @@ def _messages(filename: str | os.PathLike[str]) -> list[tuple[int, float, str, l
                 break
             raise _fault(filename, number, f"'{shown(line, 40)}'", "a message of numbers") from None
         if (kind, subtype) == (1, 1):
-            is_cut = fields[3] == "sonar" and len(values) != (values[0] if values else 0) + 1
-            if is_cut and number == len(lines):
+            device = f"{fields[3]}:{index}"
+            if number == len(lines) and _is_cut(device, values, found):
                 break
-            found.append((number, time, f"{fields[3]}:{index}", [v if math.isfinite(v) else math.nan for v in values]))
+            found.append((number, time, device, [v if math.isfinite(v) else math.nan for v in values]))
     if not any(_is(device, "sonar") for _, _, device, _ in found):
         needed = "messages 'sonar' of type 1, subtype 1"
         raise SonarError(f"{shown(filename)}: no sonar ranges came; needed is a Player log with {needed}")
     return found
+
+
+def _is_cut(device: str, values: list[float], before: list[tuple[int, float, str, list[float]]]) -> bool:
+    """Whether the last message of a log is shorter than it says, or than the others of its device."""
+    if _is(device, "sonar"):
+        return len(values) != (values[0] if values else 0) + 1
+    usual = next((len(one) for _, _, other, one in reversed(before) if other == device), 3)
+    return len(values) < usual
 
 
 def _is(device: str, *interfaces: str) -> bool:

@@ -17,10 +17,10 @@ class OdometrySettings:
     """Constants of the interpolation of odometry. Chosen by hand for robots that drive on a floor."""
 
     max_gap: float = 1.0
-    """Poses are interpolated over at most this time, seconds, or ``max_gap_periods`` if that is longer; over any time if
-    the robot stood still."""
+    """Poses are interpolated over at most this time, seconds, or ``max_gap_periods`` if that is longer; or over any
+    time if the robot stood still."""
     max_gap_periods: float = 2.5
-    """The same in median periods of the odometry. Over more than ``max_gap``, a warning says how far the robot moved."""
+    """The same in median periods of the odometry. If it is the longer one, a warning says how far the robot moves."""
     still: tuple[float, float] = (0.05, 0.05)
     """A robot that moved less in a gap stood still, metres and radians: some drivers send nothing then."""
     jump: tuple[float, float] = (0.2, 0.35)
@@ -157,8 +157,9 @@ class Odometry:
         slow = (gap > SETTINGS.max_gap) & (gap <= self._longest_gap) & ~still
         if slow.any():
             motion = f"{step[slow].max():.2f} m and {np.degrees(turn[slow].max()):.0f} deg"
-            what = f"the odometry has a pose only every {np.median(gap[slow]):.1f} s, and the robot moves by up to {motion}"
-            note(f"warning: {what} in between; interpolated poses and walls may be off; record the odometry more often")
+            what = f"the odometry has a pose only every {np.median(gap[slow]):.1f} s"
+            moves = f"the robot moves by up to {motion} in between"
+            note(f"warning: {what}, and {moves}; interpolated poses may be wrong; record the odometry more often")
 
     @property
     def _longest_gap(self) -> float:

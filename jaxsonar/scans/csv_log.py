@@ -77,9 +77,8 @@ def read_csv_text(filename: str | os.PathLike[str], text: bytes) -> Log:
     if b"\r" in text:
         text = text.replace(b"\r\n", b"\n")
     header, _, body = text.partition(b"\n")
-    if body and not body.endswith(b"\n"):
-        body += b"\n"
-    return read_csv_rows(filename, csv_header(filename, header), body)
+    is_cut = bool(body) and not body.endswith(b"\n")
+    return read_csv_rows(filename, csv_header(filename, header), body + b"\n" * is_cut, is_cut=is_cut)
 
 
 def read_csv_rows(
@@ -89,6 +88,7 @@ def read_csv_rows(
     *,
     first: int = 2,
     asked: Int[np.ndarray, "pairs 2"] | None = None,
+    is_cut: bool = False,
 ) -> Log:
     """As ``read_csv``, from complete rows of a file.
 
@@ -98,8 +98,9 @@ def read_csv_rows(
         body: rows, each with its LF.
         first: row number of the first of them in the file; the header is row 1.
         asked: ``Log.asked`` of the whole file; derived from these rows if omitted.
+        is_cut: the last row had no line end in the file, so that it may be incomplete.
     """
-    source = _CsvBody(filename, columns, body, first)
+    source = _CsvBody(filename, columns, body, first, is_cut=is_cut)
     return source.log(source.rows(), asked)
 
 
@@ -138,7 +139,10 @@ def csv_header(filename: str | os.PathLike[str], line: bytes) -> tuple[str, ...]
 class _CsvBody:
     """The rows of one file: parsing, grouping into scans, and error messages."""
 
-    def __init__(self, filename: str | os.PathLike[str], columns: tuple[str, ...], body: bytes, first: int):
+    def __init__(
+        self, filename: str | os.PathLike[str], columns: tuple[str, ...], body: bytes, first: int, *, is_cut: bool
+    ):
+        self.is_cut = is_cut
         self.filename, self.columns, self.body, self.first = filename, columns, body, first
 
     def rows(self) -> _Rows:
@@ -232,7 +236,9 @@ class _CsvBody:
                 raise SonarError(f"{place}: this is no text; allowed are {len(self.columns)} numbers")
             if len(fields) != len(self.columns):
                 wanted = f"{len(self.columns)}, {','.join(self.columns)}"
-                raise SonarError(f"{place}: {len(fields) if line else 'no'} columns came; allowed are {wanted}")
+                last = self.is_cut and row == first + len(lines) - 1 and len(fields) < len(self.columns)
+                cure = "; the file ends within this row: delete the rows of its last scan" if last else ""
+                raise SonarError(f"{place}: {len(fields) if line else 'no'} columns came; allowed are {wanted}{cure}")
             for column, field in zip(self.columns, fields, strict=True):
                 if column == "scan" and not is_scan_number(field):
                     self.fail(row, column, "a whole number of 64 bits")

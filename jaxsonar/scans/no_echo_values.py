@@ -44,6 +44,12 @@ class NoEchoSettings:
     """Share of the other echoes that have a value in common, from which on ranges have a coarse resolution."""
     paths_of_fine_ranges: float = 0.3
     """Share of the paths that read an exact value, if the resolution is so fine that no other value is repeated."""
+    paths_of_isolated_value: float = 0.5
+    """Share of the paths that read an isolated exact value: the largest one, far above all others."""
+    isolation: float = 0.25
+    """Nothing is read between this share of an isolated value below it and the value itself."""
+    at_once: float = 0.2
+    """Mean share of the paths that read an isolated value in one scan; more than face one wall."""
     min_paths: int = 4
     """Smallest number of paths that read a noisy value, ..."""
     min_paths_exact: int = 2
@@ -108,6 +114,7 @@ def find_no_echo_values(log: Log) -> tuple[NoEchoValue, ...]:
     - An exact value is repeated by most paths at different places, far more often than the values near it.
     - A noisy value is a mode of the histogram of most paths, at many places of the robot, in a log that has an echo for
       nearly every measurement.
+    - Fewer paths are enough for the largest range if it is far above all others and many paths read it in one scan.
     - Hardly any reading is beyond the value: it is the smallest or the largest range that the device reports, and the
       largest one if it is noisy.
 
@@ -256,9 +263,18 @@ def _exact(sample: _Sample, value: float) -> NoEchoValue | None:
         shared = counted & (places >= least)
     else:
         shared = counted & (sample.run_counts(has_it) >= SETTINGS.places)
-    paths = SETTINGS.paths_of_fine_ranges if is_fine else SETTINGS.paths
+    paths = SETTINGS.paths_of_isolated_value if _is_isolated(sample, value, has_it) else SETTINGS.paths
+    paths = SETTINGS.paths_of_fine_ranges if is_fine else paths
     enough = shared.sum() >= max(SETTINGS.min_paths_exact, paths * counted.sum())
     return NoEchoValue(float(value), 0.0, int(has_it.sum()), share) if enough else None
+
+
+def _is_isolated(sample: _Sample, value: float, has_it: Bool[np.ndarray, " echoes"]) -> bool:
+    """Whether a value is far above all others, and more paths read it in one scan than face one wall."""
+    nearest = float(np.max(sample.range[~has_it], initial=0))
+    at_once = has_it.sum() / max(len(np.unique(sample.scan[has_it])), 1)
+    enough = max(SETTINGS.min_paths_exact, SETTINGS.at_once * sample.measured.shape[1])
+    return nearest < (1 - SETTINGS.isolation) * value and at_once >= enough
 
 
 def _noisy(sample: _Sample, value: float, sigma: float) -> NoEchoValue | None:

@@ -67,7 +67,7 @@ def open_log_recorder(filename: str | os.PathLike[str]) -> Recorder:
 def recover_recording(filename: str | os.PathLike[str]) -> Log:
     """The complete scans of a log that is being recorded, or whose recording process was killed.
 
-    Warns with ``TruncatedRecording`` if a scan was dropped or the journal was used.
+    Warns with ``TruncatedRecording``, unless a Parquet log is complete.
 
     Raises:
         SonarError: as ``load_log``.
@@ -84,10 +84,10 @@ def recover_recording(filename: str | os.PathLike[str]) -> Log:
     size = int(marker or b"0") if len(marker) < MAX_MARKER_DIGITS and (marker or b"0").isdigit() else len(text) + 1
     complete = text[:size] if len(text) >= size else _without_last_scan(text)
     log = read_csv_text(source, complete) if b"\n" in complete else Log.from_scans([])
-    if parquet or len(complete) < len(text):
-        detail = f" recovered from {shown(source)}" if parquet else " recovered, the last one is truncated"
-        message = f"{shown(filename)}: the recording is incomplete: {len(log)} scans{detail}"
-        warnings.warn(message, TruncatedRecording, stacklevel=3)
+    cut = ", the last one is truncated" if len(complete) < len(text) else ""
+    detail = f" recovered from {shown(source)}" if parquet else f" recovered{cut}"
+    message = f"{shown(filename)}: the recording is incomplete: {len(log)} scans{detail}"
+    warnings.warn(message, TruncatedRecording, stacklevel=3)
     return log
 
 

@@ -91,6 +91,18 @@ def test_a_last_line_that_was_cut_off_is_left_out(tmp_path):
     text = HEADER + sonar(1, [1.0, 2.0]) + sonar(2, [1.0, 2.0])
     for cut in (7, 8, 14):
         assert len(load(tmp_path, text[:-cut])[0]) == 1
+    text = HEADER + position(1, 1, 2, 0.5) + sonar(1, [1.0, 2.0]) + position(2, 1, 2, 0.5)
+    for cut in (3, 10, 24, 30, 38, 44):
+        log, _ = load(tmp_path, text[:-cut])
+        np.testing.assert_array_equal(log.pose, [[1, 2, 0.5]])
+
+
+@pytest.mark.parametrize("format", [None, "player", "table"])
+def test_logs_of_player_1_are_named(tmp_path, format):
+    poses = "0.1 0.2 0.0 " * 16
+    text = f"1106955333.287 rossum 6665 sonar 00 1106955333.276 16 {poses}{'1.500 ' * 16}\n" * 3
+    if format != "table":
+        assert "this is a log of Player 1.x (versions 2 and 3 are read)" in refused(load, tmp_path, text, format=format)
 
 
 @pytest.mark.parametrize(

@@ -188,7 +188,7 @@ def test_columns_are_named_in_any_order(tmp_path):
         ((), TableFormat(ranges="s*", clockwise=True, compass=True), {}, "--clockwise and --compass came"),
         ((), COLUMNS, {"sensors": {"s_a": 0}}, "column 's_b' has no sensor; allowed is --sensor for all or none"),
         ((), TableFormat(), {"sensors": {"s_a": 1, "s_b": 1}}, "--sensor: two columns of one sensor came"),
-        (("1.5", "far"), COLUMNS, {}, "row 3, column 's_a': 'far' came; allowed is a number with a decimal point"),
+        (("1.5", "far 9"), COLUMNS, {}, "row 3, column 's_a': 'far 9' came; allowed is a number with a decimal point"),
         ((",0.75\n", ",0.75,9\n"), COLUMNS, {}, "row 3: 8 columns came; allowed are 7"),
     ],
 )
@@ -210,3 +210,71 @@ def test_a_table_needs_rows_and_a_ring_with_enough_sensors(tmp_path):
         options=InputOptions(format="table", table=COLUMNS),
     )
     assert "3 columns with ranges came, up to sensor 2; the ring has the sensors 0 to 1" in message
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "expected"),
+    [
+        ('a,b\n"1,5","2,25"\n"1,6","2,35"\n', "a,b", [[1.5, 2.25], [1.6, 2.35]]),
+        ('a,b,note\n1.5,2,"x, y"\n1.25,3,"a ""b"" c"\n', "a,b", [[1.5, 2.0], [1.25, 3.0]]),
+        ('a;b;note\n1,5;2;"x; y\nz"\n1,25;3;\n', "1-2", [[1.5, 2.0], [1.25, 3.0]]),
+        ('"s 1" "s 2"\n1.5 2\n1.25 3\n', "s*", [[1.5, 2.0], [1.25, 3.0]]),
+        ("sep=;\na;b\n1,5;2\n1,25;3\n", "a,b", [[1.5, 2.0], [1.25, 3.0]]),
+        ('"SEP=|"\r\n1.5|2\r\n1.25|3\r\n', "1-2", [[1.5, 2.0], [1.25, 3.0]]),
+        ("1.5,out of range\n#N/A,2\nno echo,out of range\n", "1-2", [[1.5, np.nan], [np.nan, 2.0], [np.nan, np.nan]]),
+        ("a,b\n#DIV/0!,--\nout of range,Error!\n1,2\n", "a,b", [[np.nan, np.nan], [np.nan, np.nan], [1.0, 2.0]]),
+    ],
+)
+def test_quotes_texts_and_separator_lines_are_those_of_spreadsheets(tmp_path, text, columns, expected):
+    log, notes = load(tmp_path, text, TableFormat(ranges=columns))
+    np.testing.assert_array_equal(log.range.reshape(len(log), -1), expected)
+    assert any("fields with a text ('" in note for note in notes) == ("out of" in text)
+
+
+@pytest.mark.parametrize("field", ["1.2.3", "12cm", ">400", "1,5"])
+def test_a_text_with_digits_is_not_silence(tmp_path, field):
+    text = f'a,b\n1.5,"{field}"\n1.25,2.5\n'
+    assert f"row 2, column 'b': '{field}' came" in refused(load, tmp_path, text, TableFormat(ranges="a,b"))
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        (
+            TableFormat(ranges="*", time="time"),
+            "column 'time' came in --range-columns or --sensor and in --time-column",
+        ),
+        (TableFormat(ranges="s*,4", pose="x,y,heading"), "column 'heading' came in --range-columns or --sensor and in"),
+        (TableFormat(ranges="s*", time="x", pose="x,y,heading"), "column 'x' came in --time-column and in --pose-col"),
+        (TableFormat(ranges=""), "--range-columns '': no column came"),
+        (TableFormat(ranges=" , "), "--range-columns ' , ': no column came"),
+        (TableFormat(ranges="s*", unit="us", round_trip=True), "--unit us and --round-trip came; allowed is one of"),
+        (TableFormat(ranges="s*", delimiter="::"), "--delimiter '::' came; allowed is one character"),
+    ],
+)
+def test_options_that_contradict_are_rejected(tmp_path, form, message):
+    assert message in refused(load, tmp_path, table(), form)
+
+
+def test_columns_with_one_name_are_told_apart_by_number(tmp_path):
+    text = "a,a,b\n1.0,2.0,3.0\n"
+    for wanted in ("a", "a,b", "*"):
+        assert "2 columns have the name 'a'; use their numbers 1, 2" in refused(
+            load, tmp_path, text, TableFormat(ranges=wanted)
+        )
+    np.testing.assert_array_equal(load(tmp_path, text, TableFormat(ranges="1-3"))[0].range, [1, 2, 3])
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1.0, ""), (100.0, "above 50 m"), (1e-3, "below 5 mm")])
+def test_a_wrong_unit_gives_a_warning(tmp_path, factor, said):
+    ranges = factor * np.linspace(0.8, 4, 30).reshape(10, 3)
+    text = "s_a,s_b,s_c\n" + "".join(",".join(map(repr, row)) + "\n" for row in ranges.tolist())
+    _, notes = load(tmp_path, text, TableFormat(ranges="s*"))
+    warned = [note for note in notes if note.startswith("warning: ")]
+    assert len(warned) == bool(said)
+    assert all(f"100% of the ranges are {said}" in note and "--unit" in note for note in warned)
+
+
+def test_a_value_for_no_echo_that_never_came_is_reported(tmp_path):
+    _, notes = load(tmp_path, table(), no_echo=(4.0,))
+    assert notes[0] == "--no-echo 4: no range has this value"

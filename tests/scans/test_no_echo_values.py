@@ -73,6 +73,19 @@ def test_a_coarse_resolution_hides_no_exact_value(resolution):
     assert found.value == 5.0
 
 
+@pytest.mark.parametrize(("resolution", "value"), [(1e-4, 4.0), (0.01, 4.0), (0.01, 3.0)])
+def test_a_value_far_above_all_others_is_found_in_a_short_log(resolution, value):
+    """Some sensors always hear something, and rounded ranges are equal by chance."""
+    pose = trajectory()[:60]
+    heard = ranges(pose, resolution=resolution)
+    heard[:, ::3] = np.where(np.isfinite(heard[:, ::3]), heard[:, ::3], 1.0 + 0.01 * np.arange(60)[:, None])
+    heard = np.where(heard < 2.0, heard, np.nan)
+    log = log_of(filled(heard, value), pose)
+    (found,) = find_no_echo_values(log)
+    assert found.value == value
+    assert without_no_echo_values(log, [found]).echo_count == np.isfinite(heard).sum()
+
+
 def test_an_exact_maximum_is_found_without_poses():
     heard = np.where(HEARD < 4.0, HEARD, np.nan)
     log = replace(log_of(filled(heard, 5.0), POSES), pose=np.full((len(POSES), 3), np.nan))
@@ -174,7 +187,7 @@ def test_amplitudes_times_and_ages_of_other_readings_are_kept():
     clean = without_no_echo_values(log, [5.0])
     np.testing.assert_array_equal(clean.range, [1.5, np.nan, np.nan, np.nan])
     np.testing.assert_array_equal(clean.amplitude, [7.0, np.nan, np.nan, np.nan])
-    np.testing.assert_array_equal(clean.t, [0.1, 0.2, 0.3, 0.0])
+    np.testing.assert_array_equal(clean.t, [0.1, 0.2, 0.3, 0.2])  # that of its transmitter
     np.testing.assert_array_equal(clean.age, [0.0, 0.5, 0.0, 0.0])
 
 
