@@ -274,7 +274,7 @@ def _is_isolated(sample: _Sample, value: float, has_it: Bool[np.ndarray, " echoe
     nearest = float(np.max(sample.range[~has_it], initial=0))
     at_once = has_it.sum() / max(len(np.unique(sample.scan[has_it])), 1)
     enough = max(SETTINGS.min_paths_exact, SETTINGS.at_once * sample.measured.shape[1])
-    return nearest < (1 - SETTINGS.isolation) * value and at_once >= enough
+    return bool(nearest < (1 - SETTINGS.isolation) * value and at_once >= enough)
 
 
 def _noisy(sample: _Sample, value: float, sigma: float) -> NoEchoValue | None:

@@ -192,9 +192,7 @@ def test_a_truncated_log_can_be_recovered(suffix, tmp_path):
     if suffix == ".csv":
         path.write_bytes(text[:-20])
         # No marker: the file was not being recorded.
-        with pytest.raises(
-            SonarError, match=r"columns came; .*; the file ends within this row: delete the rows of its"
-        ):
+        with pytest.raises(SonarError, match=r"columns came; .*; the file ends within this row: delete the rows of"):
             load_log(path)
 
 
