@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.se2 import transform_points, unit, wrap_angle
 from jaxsonar.scans.firing_poses import reading_poses
-from jaxsonar.scans.measured_paths import measurement_times
+from jaxsonar.scans.measured_paths import measurement_times, path_rows
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -155,10 +155,9 @@ def with_ages(log: Log, found: HeldReadings) -> Log:
 
 def _complete_paths(ring: Ring, log: Log) -> Int[np.ndarray, " rows"]:
     """Readings of the paths with one reading in every scan since their first one, sorted by path and scan."""
-    known = np.flatnonzero((log.tx < ring.count) & (log.rx < ring.count))
-    path, scan = ring.path_index[log.tx[known], log.rx[known]], log.echo_scan[known]
-    order = np.lexsort((scan, path))
-    row, path, scan = known[order], path[order], scan[order]
+    path, scan = path_rows(ring, log.tx, log.rx), log.echo_scan
+    row = np.lexsort((scan, path))
+    path, scan = path[row], scan[row]
     row, scan, path = row[path >= 0], scan[path >= 0], path[path >= 0]
     count = np.bincount(path, minlength=len(ring.paths))
     since = np.full(len(ring.paths), len(log))

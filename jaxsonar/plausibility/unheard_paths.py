@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
-from jaxsonar.scans.measured_paths import measured_paths
+from jaxsonar.scans.measured_paths import measured_paths, path_rows
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -35,8 +35,7 @@ def unheard_offsets(ring: Ring, log: Log) -> list[int]:
     of them are expected. The expectation is the number of echoes of the other kinds, scaled by the width of the
     directions in which the paths detect a wall.
     """
-    known = (log.tx < ring.count) & (log.rx < ring.count) & np.isfinite(log.range)
-    path = ring.path_index[log.tx[known], log.rx[known]]
+    path = path_rows(ring, log.tx, log.rx)[np.isfinite(log.range)]
     offset, width = neighbor_offsets(ring), ring.exact_paths.width
     heard = np.bincount(offset[path[path >= 0]], minlength=int(offset.max()) + 1)
     width = np.bincount(offset, weights=width, minlength=len(heard))

@@ -7,7 +7,6 @@ from dataclasses import fields
 import numpy as np
 
 from jaxsonar.hardware.recorder_base import recording_marker
-from jaxsonar.scans.measured_paths import explicit_log
 from jaxsonar.scans.scan_log import Log, log_format
 
 PARQUET_MAGIC = b"PAR1"
@@ -69,6 +68,8 @@ def unmarked_paths(log: Log) -> int:
     """
     if len(log.asked) or np.isnan(log.range).any():
         return 0
+    from jaxsonar.scans.measured_paths import explicit_log
+
     loaded = Log(**{field.name: getattr(log, field.name) for field in fields(Log) if field.name != "asked"})
     return len(explicit_log(loaded).tx) - len(log.tx)
 
