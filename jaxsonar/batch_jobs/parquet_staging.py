@@ -13,8 +13,8 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.plausibility.prepared_log import prepared_log
 from jaxsonar.recordings.input_options import InputOptions
 from jaxsonar.recordings.load_log import load_log
-from jaxsonar.scans.measured_paths import unique_readings
 from jaxsonar.scans.parquet_log import open_parquet, write_parquet_chunks
+from jaxsonar.scans.readings import unique_readings
 from jaxsonar.scans.recording_journal import TruncatedRecording
 from jaxsonar.sensors.ring import Ring
 

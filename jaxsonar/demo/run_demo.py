@@ -33,7 +33,7 @@ from jaxsonar.occupancy.nav2_map import save_nav2
 from jaxsonar.occupancy.occupancy_grid import occupancy
 from jaxsonar.reports.plot_style import save_figure
 from jaxsonar.scans.log_file import save_log
-from jaxsonar.scans.measured_paths import explicit_log
+from jaxsonar.scans.readings import explicit_log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_toml import save_ring
 from jaxsonar.simulation.office import load_office

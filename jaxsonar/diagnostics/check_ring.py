@@ -27,8 +27,8 @@ from jaxsonar.diagnostics.swapped_sensors import find_exchanged_sensors
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
 from jaxsonar.scans.flat_echoes import FlatEchoes
-from jaxsonar.scans.measured_paths import is_repeated
 from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
+from jaxsonar.scans.readings import is_repeated
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.sensors.ring import Ring

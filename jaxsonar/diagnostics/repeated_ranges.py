@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.diagnostics.settings import SETTINGS
-from jaxsonar.scans.measured_paths import is_repeated
+from jaxsonar.scans.readings import is_repeated
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import has_moved
 

@@ -19,7 +19,7 @@ from jaxsonar.diagnostics.reference_scene import (
 )
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.scans.firing_poses import reading_motion
-from jaxsonar.scans.measured_paths import is_repeated
+from jaxsonar.scans.readings import is_repeated
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from jaxsonar.scans.measured_paths import unique_readings
+from jaxsonar.scans.readings import unique_readings
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import group_firings
 

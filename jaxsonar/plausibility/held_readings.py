@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.se2 import transform_points, unit, wrap_angle
 from jaxsonar.scans.firing_poses import reading_poses
-from jaxsonar.scans.measured_paths import measurement_times, path_rows
+from jaxsonar.scans.measured_paths import path_rows
+from jaxsonar.scans.readings import measurement_times
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar.geometry.se2 import compose, interpolate, relative
-from jaxsonar.scans.measured_paths import explicit_log, measurement_times, path_rows
+from jaxsonar.scans.measured_paths import path_rows
+from jaxsonar.scans.readings import explicit_log, measurement_times
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 

@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.firing_poses import path_poses
-from jaxsonar.scans.measured_paths import is_repeated, measured_paths
+from jaxsonar.scans.measured_paths import measured_paths
+from jaxsonar.scans.readings import is_repeated
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 

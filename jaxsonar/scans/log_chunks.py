@@ -155,7 +155,7 @@ def _with_surroundings(
     plain, wider = reader(filename, chunk, name), chunk.with_surroundings
     if wider is None:
         return plain
-    from jaxsonar.scans.measured_paths import unique_readings
+    from jaxsonar.scans.readings import unique_readings
 
     before = chunk.first - wider.first
     runs, _ = readable_runs(reader(filename, wider, name), wider.scans)

@@ -68,7 +68,7 @@ def unmarked_paths(log: Log) -> int:
     """
     if len(log.asked) or np.isnan(log.range).any():
         return 0
-    from jaxsonar.scans.measured_paths import explicit_log
+    from jaxsonar.scans.readings import explicit_log
 
     loaded = Log(**{field.name: getattr(log, field.name) for field in fields(Log) if field.name != "asked"})
     return len(explicit_log(loaded).tx) - len(log.tx)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.scans.measured_paths import explicit_log, without_readings
+from jaxsonar.scans.readings import explicit_log, without_readings
 from jaxsonar.scans.scan_log import Log
 
 

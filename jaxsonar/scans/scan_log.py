@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.asked_pairs import AskedPairs
+from jaxsonar.scans.readings import unique_readings
 
 LARGEST_SENSOR = 2**31 - 1
 """Largest sensor index; sensor indices have 32 bits in Parquet."""
@@ -117,7 +118,7 @@ class Log:
 
     The constructor checks every value against ``ALLOWED``. Therefore every log can be written and read again.
     ``len(log)`` is the number of scans, ``log[i]`` is a ``Scan``, and ``log[a:b]`` is a shorter ``Log``. A single scan
-    leaves out readings that only repeat an older one of the log (``measured_paths.is_repeated``), because it does not
+    leaves out readings that only repeat an older one of the log (``readings.is_repeated``), because it does not
     know that they were counted before; a shorter log keeps them.
     """
 
@@ -341,8 +342,6 @@ class Log:
         """The log without repeated old readings, of which its single scans are parts."""
         if not self.age.any():
             return self
-        from jaxsonar.scans.measured_paths import unique_readings
-
         return unique_readings(self)
 
     def __len__(self) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxsonar.scans.asked_pairs import firing_period
-from jaxsonar.scans.measured_paths import with_silent_readings
+from jaxsonar.scans.readings import with_silent_readings
 from jaxsonar.scans.scan_log import Log
 
 

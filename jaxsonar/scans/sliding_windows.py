@@ -10,8 +10,9 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.flat_echoes import FlatEchoes
-from jaxsonar.scans.measured_paths import SETTINGS as AGES
-from jaxsonar.scans.measured_paths import equivalent_scans, measurement_times, path_rows
+from jaxsonar.scans.measured_paths import equivalent_scans, path_rows
+from jaxsonar.scans.readings import SETTINGS as AGES
+from jaxsonar.scans.readings import measurement_times
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 

@@ -12,7 +12,7 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.messages import ECHO, REFERENCE_SPEED_OF_SOUND, Group, Message, Pose
 from jaxsonar.hardware.protocol import MAX_ANGLE, MAX_POSITION, MAX_TIME_OF_FLIGHT_US
 from jaxsonar.scans.firing_poses import poses_at
-from jaxsonar.scans.measured_paths import firing_times, unique_readings
+from jaxsonar.scans.readings import firing_times, unique_readings
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.simulator import simulate

@@ -7,7 +7,7 @@ import pytest
 from support.wandering_robot import RING, along_a_wall, held, log_of, ranges, trajectory
 
 from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
-from jaxsonar.scans.measured_paths import unique_readings
+from jaxsonar.scans.readings import unique_readings
 
 POSE = trajectory()
 

@@ -9,7 +9,8 @@ from jaxsonar import Log, Ring, Room, random_pose, random_room, simulate
 from jaxsonar.plausibility.prepared_log import prepared_log
 from jaxsonar.plausibility.unheard_paths import neighbor_offsets, unheard_offsets, unheard_warning
 from jaxsonar.plausibility.unused_echoes import EchoCounts
-from jaxsonar.scans.measured_paths import explicit_log, measured_paths
+from jaxsonar.scans.measured_paths import measured_paths
+from jaxsonar.scans.readings import explicit_log
 
 RING = Ring.circular()
 POSES = {"stamp": np.arange(8.0), "pose": np.zeros((8, 3))}

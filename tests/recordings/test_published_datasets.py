@@ -8,8 +8,9 @@ from jaxsonar import load_log, load_ring, save_log
 from jaxsonar.hardware.datasets import read_corridor8, read_scitos24
 from jaxsonar.recordings.input_options import InputOptions
 from jaxsonar.scans.flat_echoes import FlatEchoes
-from jaxsonar.scans.measured_paths import is_repeated, measured_paths, unique_readings
+from jaxsonar.scans.measured_paths import measured_paths
 from jaxsonar.scans.no_echo_values import find_no_echo_values
+from jaxsonar.scans.readings import is_repeated, unique_readings
 from jaxsonar.scans.sliding_windows import is_fresh_reading
 
 READERS = {"corridor8": read_corridor8, "slip8": read_corridor8, "scitos24": read_scitos24}

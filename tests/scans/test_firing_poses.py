@@ -7,7 +7,8 @@ import pytest
 
 from jaxsonar.geometry.se2 import compose, subtract_poses
 from jaxsonar.scans.firing_poses import path_poses, reading_motion, reading_poses
-from jaxsonar.scans.measured_paths import explicit_log, measured_paths
+from jaxsonar.scans.measured_paths import measured_paths
+from jaxsonar.scans.readings import explicit_log
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 

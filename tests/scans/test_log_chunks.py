@@ -15,7 +15,8 @@ from jaxsonar.scans.firing_poses import reading_poses
 from jaxsonar.scans.log_chunks import csv_chunk_reader, csv_chunks, parquet_chunk_reader, parquet_chunks
 from jaxsonar.scans.log_file import load_scan_log, save_log
 from jaxsonar.scans.log_parts import concatenate, readable_runs
-from jaxsonar.scans.measured_paths import measured_paths, unique_readings
+from jaxsonar.scans.measured_paths import measured_paths
+from jaxsonar.scans.readings import unique_readings
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from jaxsonar import kernels
 from jaxsonar.scans.flat_echoes import FlatEchoes
-from jaxsonar.scans.measured_paths import full_wall_paths, is_repeated, measured_paths, unique_readings
+from jaxsonar.scans.measured_paths import full_wall_paths, measured_paths
+from jaxsonar.scans.readings import is_repeated, unique_readings
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 

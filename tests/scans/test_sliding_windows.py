@@ -13,7 +13,7 @@ from support import oracles
 from jaxsonar import HoughSettings, Log, Ring, SonarError, local_models
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.scans.flat_echoes import FlatEchoes
-from jaxsonar.scans.measured_paths import is_repeated
+from jaxsonar.scans.readings import is_repeated
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.scans.sliding_windows import SETTINGS as WINDOWS
