@@ -24,9 +24,9 @@ def explicit(log, silent):
     new = np.array([key not in heard for key in zip(scan.tolist(), tx.tolist(), rx.tolist(), strict=True)])
     scan = np.concatenate([log.echo_scan, scan[new]])
     order = np.argsort(scan, kind="stable")
-    columns = (np.concatenate(pair)[order] for pair in ((log.tx, tx[new]), (log.rx, rx[new])))
-    reported = np.concatenate([log.range, np.full(int(new.sum()), np.nan)])[order]
-    return Log.from_echoes(scan[order], *columns, reported, stamp=log.stamp, pose=log.pose)
+    tx, rx = np.concatenate([log.tx, tx[new]]), np.concatenate([log.rx, rx[new]])
+    reported = np.concatenate([log.range, np.full(int(new.sum()), np.nan)])
+    return Log.from_echoes(scan[order], tx[order], rx[order], reported[order], stamp=log.stamp, pose=log.pose)
 
 
 @pytest.mark.slow

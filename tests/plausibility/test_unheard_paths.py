@@ -51,6 +51,7 @@ def test_paths_with_silent_readings_were_measured():
     listed = explicit_log(replace(direct, asked=some))
     assert unheard_offsets(RING, listed) == [2, 3]
     text = unheard_warning(RING, listed)
+    assert text is not None
     assert "neighbor 2 or 3" in text
     assert "set neighbors = 1" in text
 
