@@ -63,6 +63,7 @@ AnyLog = TypeVar("AnyLog", bound=_LogColumns)
 """A ``Log``."""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # stamps and ages may have any finite value
 def is_repeated(log: _LogColumns) -> Bool[np.ndarray, " readings"]:
     """Readings that were not renewed and whose original the log also holds, in an earlier scan.
 
@@ -116,6 +117,7 @@ def _unit(seconds: Float[np.ndarray, " values"]) -> float:
     return 0.0
 
 
+@np.errstate(over="ignore")
 def measurement_times(log: _LogColumns) -> Float[np.ndarray, " readings"]:
     """When each reading was measured: stamp + t - age, seconds. A scan without a stamp has its number as stamp."""
     stamp = np.where(np.isnan(log.stamp), log.scan, log.stamp)

@@ -1,6 +1,7 @@
 """Scan logs as CSV and in memory: lossless round trips, and errors that name file, row and column."""
 
 import csv
+import itertools
 import math
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans import csv_log as logs_csv
 from jaxsonar.scans.asked_pairs import AskedPairs
 from jaxsonar.scans.log_file import load_scan_log, save_log
+from jaxsonar.scans.readings import is_repeated, unique_readings
 from jaxsonar.scans.scan_log import Log
 
 
@@ -45,16 +47,28 @@ def test_scans_can_be_indexed_like_a_list():
             SMALL[i]
 
 
+def rows_of(log, column):
+    """The recorded readings of each scan."""
+    return [getattr(log, column)[begin:end] for begin, end in itertools.pairwise(log.start.tolist())]
+
+
+@given(any_scans)
+def test_repetitions_are_found_in_stamps_and_ages_of_any_size(scans):
+    log = log_of(scans)
+    assert not is_repeated(log)[log.age == 0].any()
+    once = np.isfinite(log.range) & ~is_repeated(log)
+    assert unique_readings(log).echo_count == sum(scan.echo_count for scan in log) == once.sum()
+
+
 @pytest.mark.slow
 @given(any_scans, st.slices(5))
 def test_a_slice_of_a_log_contains_the_scans_of_the_slice(scans, part):
     log = log_of(scans)
     cut = log[part]
     assert cut.scan.tolist() == log.scan[part].tolist()
-    assert [s.range.tobytes() for s in cut] == [s.range.tobytes() for s in list(log)[part]]
-    assert [s.age.tobytes() for s in cut] == [s.age.tobytes() for s in list(log)[part]]
+    for name in ("range", "age", "t", "tx", "rx"):
+        assert [row.tobytes() for row in rows_of(cut, name)] == [row.tobytes() for row in rows_of(log, name)[part]]
     assert np.array_equal(cut.asked, log.asked)  # what a scan measured does not depend on the part
-    assert [s.tx.tolist() for s in cut] == [s.tx.tolist() for s in list(log)[part]]
 
 
 @given(any_scans)
