@@ -170,7 +170,9 @@ def stopped_by_signals() -> Iterator[threading.Event]:
 
     def on_signal(number: int, _: object) -> None:
         stop.set()
-        signal.signal(number, before[number])
+        # A shell starts background jobs with Ctrl-C ignored; a second signal must end them, too.
+        ends = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        signal.signal(number, ends if before[number] == signal.SIG_IGN else before[number])
 
     for number in (signal.SIGINT, signal.SIGTERM):
         before[number] = signal.getsignal(number)
