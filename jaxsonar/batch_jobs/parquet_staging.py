@@ -1,6 +1,5 @@
 """Staging: Parquet copies of inputs that cannot be read in parts."""
 
-import warnings
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from typing import NamedTuple
@@ -12,10 +11,9 @@ from jaxsonar.fileio.atomic_files import atomic_write, reason, shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.plausibility.prepared_log import prepared_log
 from jaxsonar.recordings.input_options import InputOptions
-from jaxsonar.recordings.load_log import load_log
+from jaxsonar.recordings.load_log import load_log_with_warnings
 from jaxsonar.scans.parquet_log import open_parquet, write_parquet_chunks
 from jaxsonar.scans.readings import unique_readings
-from jaxsonar.scans.recording_journal import TruncatedRecording
 from jaxsonar.sensors.ring import Ring
 
 
@@ -57,11 +55,7 @@ def stage_whole(
     Raises:
         SonarError: the input cannot be read, or an extra is missing.
     """
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", TruncatedRecording)
-        whole = load_log(log.filename, ring=ring, options=options, on_note=on_note)
-    for one in caught:
-        on_note(f"warning: {one.message}; the recording was interrupted; its complete scans are used")
+    whole = load_log_with_warnings(log.filename, ring=ring, options=options, on_note=on_note)
     whole = unique_readings(prepared_log(ring, whole, on_note=on_note))
     write_parquet_chunks((whole[k : k + rows] for k in range(0, len(whole), rows)), filename)
     asked = tuple((tx, rx) for tx, rx in whole.asked.tolist())

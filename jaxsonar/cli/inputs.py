@@ -4,7 +4,6 @@ Nothing heavy is imported with this module, so that ``--help`` is fast.
 """
 
 import argparse
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -249,17 +248,8 @@ def read_log(name: str, options: argparse.Namespace, messages: InputMessages, *,
     Raises:
         SonarError: it cannot be read, or an option does not belong to its format.
     """
-    from jaxsonar.recordings.load_log import load_log
-    from jaxsonar.scans.recording_journal import TruncatedRecording
+    from jaxsonar.recordings.load_log import load_log_with_warnings
 
     reading = input_options(options)
     _check_names_are_used(name, options)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", TruncatedRecording)
-        log = load_log(name, ring=ring, options=reading, on_note=messages.note)
-    for one in caught:
-        if issubclass(one.category, TruncatedRecording):
-            messages.warn(f"{one.message}; the recording was interrupted; its complete scans are used")
-        else:
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
-    return log
+    return load_log_with_warnings(name, ring=ring, options=reading, on_note=messages.note)

@@ -1,6 +1,7 @@
 """Loading of recordings of any kind as a log: the content of the file decides how it is read."""
 
 import os
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from jaxsonar.recordings.file_content import DESCRIPTIONS, FileContent, check_su
 from jaxsonar.recordings.input_options import FORMATS, InputOptions
 from jaxsonar.scans.log_file import load_scan_log
 from jaxsonar.scans.no_echo_values import without_no_echo_values
+from jaxsonar.scans.recording_journal import TruncatedRecording
 from jaxsonar.scans.scan_log import Log
 
 if TYPE_CHECKING:
@@ -62,6 +64,21 @@ def load_log(
         if (marked := without_no_echo_values(log, [value])) is log:
             note(f"--no-echo {value:g}: no range has this value")
         log = marked
+    return log
+
+
+def load_log_with_warnings(
+    filename: str | os.PathLike[str], *, ring: "Ring | None", options: InputOptions, on_note: Callable[[str], None]
+) -> Log:
+    """As ``load_log`` for a command: an interrupted or damaged recording is a note, not a Python warning."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", TruncatedRecording)
+        log = load_log(filename, ring=ring, options=options, on_note=on_note)
+    for one in caught:
+        if issubclass(one.category, TruncatedRecording):
+            on_note(f"warning: {one.message}; the recording was interrupted; its complete scans are used")
+        else:
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     return log
 
 

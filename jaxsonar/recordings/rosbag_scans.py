@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.recordings.rosbag_odometry import Odometry
+from jaxsonar.scans.asked_pairs import NO_PAIRS
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import SETTINGS
 
@@ -45,7 +46,7 @@ def log_from_readings(
         t=time - stamp[scan],
         stamp=stamp,
         pose=pose,
-        asked=np.zeros((0, 2), np.int64),
+        asked=NO_PAIRS,
         odometry=None if odometry is None or not np.isfinite(pose).any() else odometry.samples,
     )
 

@@ -12,14 +12,17 @@ MAX_PERIOD = 256
 SUCCESSOR_SHARE = 0.5
 """Sensors fire in an order, too, if more than this share of echoes follow the echo of their usual predecessor, although
 some firings or scans are missing. Chosen by hand."""
+NO_PAIRS = np.zeros((0, 2), np.int64)
+"""``Log.asked`` of a log in which only the readings were measured."""
+NO_PAIRS.setflags(write=False)
 
 
 class AskedPairs:
     """Derives ``Log.asked`` from the readings of a log, part by part, in memory bounded by the number of pairs.
 
-    - None, if the log is explicit: it holds a reading without a range, so all that was measured has a reading.
-    - None, if sensors fire in turn: every scan holds one transmitter at most, and the transmitters follow an order.
-    - Otherwise all pairs that are heard anywhere in the log. A pair that is never heard was not measured.
+    - No pairs, if the log is explicit: it holds a reading without a range, so all that was measured has a reading.
+    - No pairs, if sensors fire in turn: every scan holds one transmitter at most, and the transmitters follow an order.
+    - Otherwise, all pairs that are heard anywhere in the log. A pair that is never heard was not measured.
     """
 
     def __init__(self):
@@ -108,7 +111,7 @@ class AskedPairs:
     def pairs(self) -> Int[np.ndarray, "pairs 2"]:
         """The (tx, rx) pairs, in ascending order."""
         if self._explicit or self.in_turn:
-            return np.zeros((0, 2), np.int64)
+            return NO_PAIRS
         return np.stack([self._codes >> 32, self._codes & 0xFFFFFFFF], axis=-1)
 
 

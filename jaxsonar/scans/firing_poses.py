@@ -82,13 +82,10 @@ def path_poses_of_scan(ring: Ring, scan: Scan) -> Float[np.ndarray, "paths 3"] |
 
 def _known_poses(log: Log) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 3"]]:
     """Times, ascending, and poses between which motion is interpolated."""
-    if log.odometry is not None:
-        time, pose = log.odometry[:, 0], log.odometry[:, 1:]
-    else:
-        time, pose = log.stamp, log.pose
-    known = np.isfinite(time) & np.isfinite(pose).all(axis=1)
-    time, first = np.unique(time[known], return_index=True)
-    return time, pose[known][first]
+    samples = log.pose_samples
+    samples = samples[np.isfinite(samples).all(axis=1)]
+    time, first = np.unique(samples[:, 0], return_index=True)
+    return time, samples[first, 1:]
 
 
 def poses_at(

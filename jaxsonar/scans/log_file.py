@@ -2,11 +2,11 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import fields
 
 import numpy as np
 
 from jaxsonar.hardware.recorder_base import recording_marker
+from jaxsonar.scans.readings import explicit_log
 from jaxsonar.scans.scan_log import Log, log_format
 
 PARQUET_MAGIC = b"PAR1"
@@ -68,9 +68,7 @@ def unmarked_paths(log: Log) -> int:
     """
     if len(log.asked) or np.isnan(log.range).any():
         return 0
-    from jaxsonar.scans.readings import explicit_log
-
-    loaded = Log(**{field.name: getattr(log, field.name) for field in fields(Log) if field.name != "asked"})
+    loaded = Log.from_echoes(log.echo_scan, log.tx, log.rx, log.range, stamp=log.stamp, pose=log.pose)
     return len(explicit_log(loaded).tx) - len(log.tx)
 
 

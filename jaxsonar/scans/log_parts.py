@@ -3,9 +3,9 @@
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.scans.readings import READING_COLUMNS
 from jaxsonar.scans.scan_log import Log
 
 
@@ -38,7 +38,7 @@ def concatenate(logs: list[Log]) -> Log:
     """One log from consecutive parts of a log."""
     if len(logs) == 1:
         return logs[0]
-    names = ("scan", "stamp", "pose", "tx", "rx", "range", "amplitude", "t", "age")
+    names = ("scan", "stamp", "pose", *READING_COLUMNS)
     empty = Log.from_scans([])
     columns = {name: np.concatenate([getattr(log, name) for log in (empty, *logs)]) for name in names}
     echoes = np.concatenate([np.zeros(1, np.int64), *(np.diff(log.start) for log in logs)])
@@ -46,13 +46,5 @@ def concatenate(logs: list[Log]) -> Log:
         return empty
     odometry = None
     if any(log.odometry is not None for log in logs):
-        odometry = np.unique(np.concatenate([_samples(log) for log in logs]), axis=0)
+        odometry = np.unique(np.concatenate([log.pose_samples for log in logs]), axis=0)
     return Log(start=np.cumsum(echoes), **columns, asked=logs[0].asked, odometry=odometry)
-
-
-def _samples(log: Log) -> Float[np.ndarray, "samples 4"]:
-    """``Log.odometry``, or else the known stamps and poses of the scans."""
-    if log.odometry is not None:
-        return log.odometry
-    known = np.isfinite(log.stamp) & np.isfinite(log.pose).all(axis=1)
-    return np.column_stack([log.stamp, log.pose])[known]

@@ -4,18 +4,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.hardware.scan_assembler import RawScan
+from jaxsonar.scans.asked_pairs import NO_PAIRS
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.sensors.ring import Ring
-
-_NOTHING_ASKED = np.zeros((0, 2), np.int64)
 
 
 def group_paths(ring: Ring) -> Int[np.ndarray, "paths 3"]:
     """Firing group, transmitter and receiver of every path of a ring, for ``ScanAssembler`` and ``ReaderThread``."""
-    group_of = np.empty(ring.count, dtype=np.int64)
-    for group, sensors in enumerate(ring.firing_groups):
-        group_of[sensors] = group
-    return np.column_stack([group_of[ring.paths[:, 0]], ring.paths])
+    return np.column_stack([ring.firing_group_of_sensor[ring.paths[:, 0]], ring.paths])
 
 
 def scan_from_raw(raw: RawScan) -> Scan:
@@ -35,7 +31,7 @@ def scan_from_raw(raw: RawScan) -> Scan:
         range=np.concatenate([raw.ranges, nothing]),
         amplitude=np.concatenate([echoes["amplitude"].astype(np.float64), nothing]),
         t=raw.group_time[np.concatenate([raw.group, silent[:, 0]])],
-        asked=_NOTHING_ASKED,
+        asked=NO_PAIRS,
         odometry=group_odometry(raw),
     )
 

@@ -9,6 +9,11 @@ from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxsonar.scans.asked_pairs import NO_PAIRS
+
+READING_COLUMNS = ("tx", "rx", "range", "amplitude", "t", "age")
+"""Columns of a log with one entry per reading."""
+
 
 @dataclass(frozen=True)
 class ReadingAgeSettings:
@@ -193,13 +198,13 @@ def with_silent_readings(
     order = np.argsort(rows, kind="stable")
     columns = {name: np.concatenate([getattr(log, name), column])[order] for name, column in added.items()}
     start = np.searchsorted(rows[order], np.arange(len(log) + 1))
-    return replace(log, start=start, **columns, asked=np.zeros((0, 2), np.int64))
+    return replace(log, start=start, **columns, asked=NO_PAIRS)
 
 
 def without_readings(log: AnyLog, removed: Bool[np.ndarray, " readings"]) -> AnyLog:
     """The log without some readings; what its scans measured stays as it is (``Log.asked``)."""
     start = np.searchsorted(log.echo_scan[~removed], np.arange(len(log) + 1))
-    columns = {name: getattr(log, name)[~removed] for name in ("tx", "rx", "range", "amplitude", "t", "age")}
+    columns = {name: getattr(log, name)[~removed] for name in READING_COLUMNS}
     return replace(log, start=start, **columns)
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.asked_pairs import AskedPairs
-from jaxsonar.scans.readings import unique_readings
+from jaxsonar.scans.readings import READING_COLUMNS, unique_readings
 
 LARGEST_SENSOR = 2**31 - 1
 """Largest sensor index; sensor indices have 32 bits in Parquet."""
@@ -297,8 +297,7 @@ class Log:
     def from_scans(cls, scans: Sequence[Scan]) -> "Log":
         """A log of these scans, in this order, with all of their odometry."""
         columns = {
-            name: np.concatenate([np.zeros(0), *(_column(scan, name) for scan in scans)])
-            for name in ("tx", "rx", "range", "amplitude", "t", "age")
+            name: np.concatenate([np.zeros(0), *(_column(scan, name) for scan in scans)]) for name in READING_COLUMNS
         }
         asked = [scan.asked for scan in scans if scan.asked is not None]
         return cls.from_echoes(
@@ -334,6 +333,13 @@ class Log:
         """
         if self.odometry is not None or not (self.t.any() or self.age.any()):
             return self.odometry
+        return self.pose_samples
+
+    @property
+    def pose_samples(self) -> Float[np.ndarray, "samples 4"]:
+        """``odometry``, or else stamp (s) and pose (m, m, rad) of the scans that have both."""
+        if self.odometry is not None:
+            return self.odometry
         known = np.isfinite(self.stamp) & np.isfinite(self.pose).all(axis=1)
         return np.column_stack([self.stamp, self.pose])[known]
 
@@ -364,12 +370,7 @@ class Log:
             scan=int(log.scan[i]),
             stamp=float(log.stamp[i]),
             pose=log.pose[i],
-            tx=log.tx[echoes],
-            rx=log.rx[echoes],
-            range=log.range[echoes],
-            amplitude=log.amplitude[echoes],
-            t=log.t[echoes],
-            age=log.age[echoes],
+            **{name: getattr(log, name)[echoes] for name in READING_COLUMNS},
             asked=log.asked,
             odometry=self.motion,
         )
@@ -383,12 +384,7 @@ class Log:
             stamp=self.stamp[rows],
             pose=self.pose[rows],
             start=start,
-            tx=self.tx[echoes],
-            rx=self.rx[echoes],
-            range=self.range[echoes],
-            amplitude=self.amplitude[echoes],
-            t=self.t[echoes],
-            age=self.age[echoes],
+            **{name: getattr(self, name)[echoes] for name in READING_COLUMNS},
             asked=self.asked,
             odometry=self.motion,
         )

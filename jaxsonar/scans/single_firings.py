@@ -43,8 +43,6 @@ def group_firings(log: Log) -> Log:
     group = _groups(log, transmitter)
     first, scan = np.flatnonzero(np.diff(group, prepend=-1)), log.echo_scan
     t = log.t + np.where(np.isnan(log.stamp), 0, log.stamp - log.stamp[first[group]])[scan]
-    known = np.isfinite(log.stamp) & np.isfinite(log.pose).all(axis=1)
-    odometry = np.column_stack([log.stamp, log.pose])[known]
     return replace(
         log,
         scan=log.scan[first],
@@ -52,7 +50,7 @@ def group_firings(log: Log) -> Log:
         pose=log.pose[first],
         start=np.append(log.start[first], len(log.tx)),
         t=t,
-        odometry=odometry if log.odometry is None else log.odometry,
+        odometry=log.pose_samples,
     )
 
 

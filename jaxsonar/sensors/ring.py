@@ -258,6 +258,14 @@ class Ring(eqx.Module):
         longest = max(len(block) for block in blocks)
         return tuple(np.array([block[k] for block in blocks if k < len(block)]) for k in range(longest))
 
+    @property
+    def firing_group_of_sensor(self) -> Int[np.ndarray, " sensors"]:
+        """Index of each sensor's group in ``firing_groups``."""
+        group = np.empty(self.count, dtype=np.int64)
+        for k, sensors in enumerate(self.firing_groups):
+            group[sensors] = k
+        return group
+
     def corrected(
         self, reported: Float[AnyArray, "*echoes"], tx: Int[AnyArray, "*echoes"], rx: Int[AnyArray, "*echoes"]
     ) -> Float[AnyArray, "*echoes"]:

@@ -45,7 +45,7 @@ def log_messages(log: Log, ring: Ring, *, moving: bool = False, temperature: flo
     _check_log(log, ring)
     log = unique_readings(log)
     all_fire = bool(len(log.asked)) or not len(log.tx)
-    plan = _ring_groups(ring)
+    plan = ring.firing_group_of_sensor
     if not _fire_together(log, plan, all_fire) and ring.count <= MAX_GROUPS:
         plan = np.arange(ring.count)
     groups = int(plan.max()) + 1
@@ -84,7 +84,7 @@ def room_messages(
     Raises:
         SonarError: a value out of range; the message names it and the allowed range.
     """
-    plan = _ring_groups(ring)
+    plan = ring.firing_group_of_sensor
     groups = int(plan.max()) + 1
     stamps = _stamps(ring, np.asarray(stamps), groups)
     time = _following_times(ring, stamps, groups)
@@ -103,14 +103,6 @@ def room_messages(
     )
     _check_log(part, ring)
     return _messages(part, plan, np.ones(time.shape, bool), time, pose, temperature)
-
-
-def _ring_groups(ring: Ring) -> Int[np.ndarray, " sensors"]:
-    """Firing group of every sensor."""
-    group_of = np.empty(ring.count, dtype=np.int64)
-    for k, sensors in enumerate(ring.firing_groups):
-        group_of[sensors] = k
-    return group_of
 
 
 def _fire_together(log: Log, plan: Int[np.ndarray, " sensors"], all_fire: bool) -> bool:

@@ -102,7 +102,7 @@ def test_a_staged_copy_keeps_what_the_log_measured(tmp_path, monkeypatch):
     whole = office_scans(20)
     explicit = Log.from_scans([replace(scan, asked=np.zeros((0, 2), np.int64)) for scan in whole])
     assert not measured_paths(RING, explicit).all()
-    monkeypatch.setattr("jaxsonar.batch_jobs.parquet_staging.load_log", lambda *_, **more: explicit)
+    monkeypatch.setattr("jaxsonar.batch_jobs.parquet_staging.load_log_with_warnings", lambda *_, **more: explicit)
     (tmp_path / "run.mcap").write_bytes(b"")
     log = Input("run.mcap", str(tmp_path / "run.mcap"), "record")
     for scans in (7, 20):
