@@ -207,7 +207,7 @@ def load_all_inputs(
             else:
                 for text in (*implausible_input(ring, log), unheard_warning(ring, log)):
                     if text is not None:
-                        messages.warn(text)
+                        messages.warn(str(text))
         logs.append(log)
     messages.check()
     return ring, logs

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -22,8 +23,8 @@ class PlausibilitySettings:
 SETTINGS = PlausibilitySettings()
 
 
-def implausible_input(ring: Ring, log: Log) -> Iterator[str]:
-    """Probable mistakes of a log, each in one line: what; likely cause; what to do.
+def implausible_input(ring: Ring, log: Log) -> Iterator[Implausibility]:
+    """Probable mistakes of a log.
 
     Args:
         ring: the sensors.
@@ -34,9 +35,10 @@ def implausible_input(ring: Ring, log: Log) -> Iterator[str]:
         before, after = log.stamp[fall[0] : fall[0] + 2]
         times = "once" if len(fall) == 1 else f"{len(fall)} times, first"
         what = f"the stamps fall {times} from {before:.3f} s to {after:.3f} s"
-        yield f"{what}; the clock was set, or logs were joined; give the scans the times at which they were taken"
+        cause = "the clock was set, or logs were joined"
+        yield Implausibility("stamps", what, cause, "give the scans the times at which they were taken")
     heard = log.range[np.isfinite(log.range)]
     if len(heard) >= SETTINGS.least_echoes and (share := float(np.mean(heard > ring.max_range))) > SETTINGS.beyond:
         what = f"{share:.0%} of the echoes are beyond the maximum range of the ring, {ring.max_range:g} m"
         cause = "the ranges have another unit, or the ring is another one"
-        yield f"{what}; {cause}; give half path lengths in metres"
+        yield Implausibility("range unit", what, cause, "give half path lengths in metres")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
+from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.scans.measured_paths import measured_paths, path_rows
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -49,8 +50,8 @@ def unheard_offsets(ring: Ring, log: Log) -> list[int]:
     return np.flatnonzero(~is_heard & ~is_measured).tolist()
 
 
-def unheard_warning(ring: Ring, log: Log) -> str | None:
-    """A warning about kinds of paths that were never heard: what, likely cause, what to do; None if there is none."""
+def unheard_warning(ring: Ring, log: Log) -> Implausibility | None:
+    """A warning about kinds of paths that were never heard; None if there is none."""
     offsets = unheard_offsets(ring, log)
     if not offsets:
         return None
@@ -59,10 +60,11 @@ def unheard_warning(ring: Ring, log: Log) -> str | None:
     kinds = ["no direct echo"] * (0 in offsets) + [f"no echo from neighbor {listed}"] * bool(neighbors)
     paths = int(np.isin(neighbor_offsets(ring), offsets).sum())
     what = f"{' and '.join(kinds)} among {log.echo_count} echoes, but {ring.name!r} lists {paths} such paths"
+    cause = "the device probably does not report them, and they count as not measured"
     if 0 in offsets:
-        return f"{what}; the device probably leaves direct echoes out; record them, or check tx and rx of the log"
-    if offsets == list(range(offsets[0], ring.neighbors + 1)):
+        cause, remedy = "the device probably leaves direct echoes out", "record them, or check tx and rx of the log"
+    elif offsets == list(range(offsets[0], ring.neighbors + 1)):
         remedy = f"set neighbors = {offsets[0] - 1} in the ring"
     else:
         remedy = "check which neighbors the device listens to"
-    return f"{what}; the device probably does not report them, and they count as not measured; {remedy}"
+    return Implausibility("unheard paths", what, cause, remedy)

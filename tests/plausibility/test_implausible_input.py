@@ -18,7 +18,7 @@ LOG = log_of(ranges(POSES), POSES)
 
 def warnings(ring, log):
     """The warnings, each with its three parts."""
-    texts = [*implausible_input(ring, log)]
+    texts = [str(found) for found in implausible_input(ring, log)]
     assert all(text.count("; ") == 2 and text.isprintable() for text in texts)
     return texts
 

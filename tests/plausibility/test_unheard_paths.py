@@ -34,7 +34,7 @@ def test_the_kinds_that_were_left_out_are_found(heard):
     log = with_offsets(scanned(RING), RING, heard)
     missing = [k for k in range(4) if k not in heard]
     assert unheard_offsets(RING, log) == missing
-    text = unheard_warning(RING, log)
+    text = str(unheard_warning(RING, log))
     assert text is not None
     assert text.count("; ") >= 2
     assert ("set neighbors = " in text) == (missing[-1] == 3 and missing == list(range(missing[0], 4)))
@@ -50,7 +50,7 @@ def test_paths_with_silent_readings_were_measured():
     some = RING.paths[neighbor_offsets(RING) < 2]
     listed = explicit_log(replace(direct, asked=some))
     assert unheard_offsets(RING, listed) == [2, 3]
-    text = unheard_warning(RING, listed)
+    text = str(unheard_warning(RING, listed))
     assert text is not None
     assert "neighbor 2 or 3" in text
     assert "set neighbors = 1" in text
