@@ -2,6 +2,7 @@
 
 import argparse
 from functools import partial
+from itertools import chain
 
 from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, finite
 from jaxsonar.cli.console import (
@@ -58,6 +59,6 @@ def run(options: argparse.Namespace) -> None:
     write_figure(figure, options.figure)
     if options.json != "-":
         print_tables(health_table(health))
-    for finding in health.findings:
-        print_status(finding)
+    for line in chain.from_iterable(finding.lines() for finding in health.findings):
+        print_status(line)
     print_status(f"{len(log)} scans, {plural(len(health.findings), 'finding')}" if health.source else health.empty)

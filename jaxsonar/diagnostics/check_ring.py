@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.detection.settings import check_sigma
 from jaxsonar.diagnostics.beam_width import count_by_angle, fit_cone, fit_each_cone
 from jaxsonar.diagnostics.echo_residuals import ResidualTable, explained_fraction, predict_and_match
-from jaxsonar.diagnostics.findings import describe_findings
+from jaxsonar.diagnostics.findings import Finding
 from jaxsonar.diagnostics.health_report import Health as Health
 from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
 from jaxsonar.diagnostics.range_offsets import OffsetEstimate, estimate_offsets
@@ -22,6 +22,7 @@ from jaxsonar.diagnostics.reference_scene import (
     select_scans,
 )
 from jaxsonar.diagnostics.repeated_ranges import RepeatedRanges
+from jaxsonar.diagnostics.sensor_findings import describe_findings
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.diagnostics.swapped_sensors import find_exchanged_sensors
 from jaxsonar.hardware.errors import SonarError
@@ -133,16 +134,34 @@ def check(
     return replace(health, remarks=remarks, findings=findings)
 
 
-def _prepared(ring: Ring, log: Log) -> tuple[Log, list[str]]:
+def _prepared(ring: Ring, log: Log) -> tuple[Log, list[Finding]]:
     """The log as the check needs it, and what had to be changed: faults of the driver."""
     faults = []
     if values := find_no_echo_values(log):
         listed = ", ".join(map(str, values))
-        faults.append(f"most sensors read {listed}, wherever the robot is: a mark for no echo, which counts as silence")
+        faults.append(
+            Finding(
+                "no-echo value",
+                (),
+                f"most sensors read {listed}, wherever the robot is: a mark for no echo, which counts as silence",
+                0.99,
+                "most sensors share the value, and it does not change while the robot moves",
+                "let the driver report nothing instead",
+            )
+        )
         log = without_no_echo_values(log, values)
     log = group_firings(log)
     if held := find_held_readings(ring, log):
-        faults.append(held.describe())
+        faults.append(
+            Finding(
+                "held readings",
+                (),
+                held.describe(),
+                0.99,
+                "no wall or point in the detection cone can keep its range during these motions",
+                "let the driver report nothing instead of the last range",
+            )
+        )
     return with_ages(log, held), faults
 
 

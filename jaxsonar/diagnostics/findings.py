@@ -1,236 +1,39 @@
-"""Findings of the health check: what is wrong with a ring, in sentences."""
+"""A finding of the health check: a fault, its evidence against other causes, and what to do."""
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
-
-import numpy as np
-from jaxtyping import Bool, Float, Int
-
-from jaxsonar.diagnostics.health_report import Health
-from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
-from jaxsonar.diagnostics.settings import SETTINGS
-
-_FINDINGS = SETTINGS.findings
-_ROLES = ("mute", "no other sensor hears it"), ("deaf", "it hears no other sensor")
-"""Remark and meaning if a sensor has no cross echo as transmitter, as receiver."""
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
 
 
-class Finding(NamedTuple):
-    """One fault."""
+@dataclass(frozen=True)
+class Finding:
+    """One fault of a ring, of its driver, or of the poses."""
 
+    cause: str
+    """The kind of fault, a fixed word such as "dead", "own echo" or "speed of sound"."""
+    sensors: tuple[int, ...]
+    """Sensors that have the fault, by their numbers in the log; empty if it does not lie in single sensors."""
     sentence: str
-    """Description for a person."""
-    remarks: dict[int, str]
-    """A short remark for each sensor concerned."""
-    exclusive: bool = False
-    """Whether this fault makes further findings about the same sensors meaningless."""
+    """What was found, in one sentence."""
+    confidence: float
+    """Probability of this cause against the next best explanation, from 0 to 1."""
+    evidence: str
+    """The measurements that tell this cause from the others."""
+    remedy: str
+    """What to do."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything but the sentence, which stands in a list of its own (``Health.as_json``)."""
+        plain = asdict(self)
+        del plain["sentence"]
+        return plain | {"sensors": list(self.sensors), "confidence": round(self.confidence, 4)}
+
+    def lines(self) -> tuple[str, ...]:
+        """The finding as text: the sentence, the evidence, the remedy; parts without text are left out."""
+        evidence = self.evidence and f"  evidence: {self.evidence} (confidence {self.confidence:.0%})"
+        return tuple(filter(None, (self.sentence, evidence, self.remedy and f"  what to do: {self.remedy}")))
 
 
-def describe_findings(
-    health: Health,
-    measured: MeasuredSensors,
-    pairs: Int[np.ndarray, " sensors"],
-    sigma: float | None,
-    faults: Sequence[str] = (),
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """A remark for each sensor, and a sentence for each finding, the most severe first.
-
-    Args:
-        health: the measurements.
-        measured: what was measured at all.
-        pairs: number of direct ranges of each sensor that were compared with the previous scan.
-        sigma: standard deviation of the ranges, metres, if it is known.
-        faults: sentences about the log as a whole, which come first.
-    """
-    found = [Finding(sentence, {}) for sentence in faults]
-    found += [*_silent_sensors(health, measured), *_exchanged_sensors(health), *_stuck_sensors(health, pairs)]
-    excluded = {k for finding in found if finding.exclusive for k in finding.remarks}
-    minor = (*_range_offsets(health, sigma), *_weak_or_turned_sensors(health))
-    found += [finding for finding in minor if not excluded & set(finding.remarks)]
-    found += [Finding(sentence, {}) for sentence in _ring_findings(health, measured)]
-    remarks = ["; ".join(f.remarks[k] for f in found if k in f.remarks) for k in range(health.ring.count)]
-    return tuple(remarks), tuple(finding.sentence for finding in found)
-
-
-def _silent_sensors(health: Health, measured: MeasuredSensors) -> Iterator[Finding]:
-    """Sensors that are dead, deaf (do not receive) or mute (do not transmit).
-
-    If the log does not mark paths that heard nothing, sensors that are never heard are named with both explanations.
-    """
-    usual = _usual_rates(health)
-    echoes = health.direct + health.cross
-    others, others_cross = float(np.median(echoes)), float(np.median(health.cross))
-    for k in range(health.ring.count):
-        expected, detected = health.expected[k], health.heard[k]
-        low = _is_low(expected, detected, usual, _FINDINGS.dead_rate)
-        few_cross = expected[1:].min() < _FINDINGS.min_expected
-        if low[0] and (np.isnan(usual[1]) or low[1:].all() or few_cross):
-            amount = "nothing" if detected.sum() == 0 else "hardly anything"
-            elsewhere = (
-                f", and reports {echoes[k]} echoes elsewhere" if echoes[k] > _FINDINGS.min_elsewhere * others else ""
-            )
-            yield Finding(
-                f"sensor {k} hears {amount}: {detected[0]} of {expected[0]} expected direct echoes, the others "
-                f"{100 * usual[0]:.0f} %{elsewhere}",
-                {k: "hears no wall" if elsewhere else "dead"},
-                exclusive=True,
-            )
-        elif echoes[k] == 0 and others >= _FINDINGS.min_echoes and (measured.any[k] or not measured.certain):
-            sentence = f"sensor {k} hears nothing: no echo in the log, the others {others:.0f} each"
-            doubt = "" if measured.any[k] else "; it is dead, or was not measured"
-            yield Finding(sentence + doubt, {k: "dead"}, exclusive=True)
-        elif _never_in_one_role(measured, k) and others_cross >= _FINDINGS.min_echoes:
-            remark, meaning = _ROLES[int(measured.cross[k, 0])]
-            yield Finding(
-                f"sensor {k} is {remark}, {meaning}: no such echo in the log, unless these paths were not measured",
-                {k: remark},
-                exclusive=True,
-            )
-        elif low[1] != low[2] and np.isfinite(usual[1:]).all():
-            role = 1 if low[1] else 2
-            remark, meaning = _ROLES[role - 1]
-            yield Finding(
-                f"sensor {k} is {remark}, {meaning}: {detected[role]} of {expected[role]} expected cross echoes, the "
-                f"others {100 * usual[role]:.0f} %",
-                {k: remark},
-                exclusive=True,
-            )
-
-
-def _never_in_one_role(measured: MeasuredSensors, sensor: int) -> bool:
-    """Whether the cross echoes of a sensor are all received or all sent, in a log that does not mark silence."""
-    sends, receives = measured.cross[sensor]
-    return not measured.certain and bool(sends != receives)
-
-
-def _exchanged_sensors(health: Health) -> Iterator[Finding]:
-    """Sensors at each other's positions."""
-    for cycle in _cycles(health.place):
-        *most, last = [str(k) for k in cycle]
-        names = f"{', '.join(most)} and {last}"
-        explained = 100 * health.fits[cycle].mean(axis=0)
-        better = f"as numbered {explained[0]:.0f} % of their echoes are explained, exchanged {explained[1]:.0f} %"
-        if len(cycle) == 2:
-            a, b = cycle
-            yield Finding(f"sensors {names} look swapped: {better}", {a: f"swapped with {b}", b: f"swapped with {a}"})
-        else:
-            who = ", ".join(f"{k} is {health.place[k]}" for k in cycle)
-            remarks = {k: f"is {health.place[k]}" for k in cycle}
-            yield Finding(f"sensors {names} look permuted ({who}): {better}", remarks)
-
-
-def _cycles(place: Int[np.ndarray, " sensors"]) -> Iterator[list[int]]:
-    """The cycles of a permutation, without fixed points."""
-    left = set(np.flatnonzero(place != np.arange(len(place))).tolist())
-    while left:
-        cycle = [min(left)]
-        while (step := int(place[cycle[-1]])) != cycle[0]:
-            cycle.append(step)
-        left -= set(cycle)
-        yield cycle
-
-
-def _stuck_sensors(health: Health, pairs: Int[np.ndarray, " sensors"]) -> Iterator[Finding]:
-    """Sensors that report the same range repeatedly."""
-    usual = float(np.nanmedian(health.repeats)) if np.isfinite(health.repeats).any() else 0.0
-    usual_constant = _usual_constant_fraction(health)
-    for k in range(health.ring.count):
-        value, constant = health.constant[k]
-        least = max(_FINDINGS.min_repeats, 3 * usual, 0.5 + usual / 2)
-        if pairs[k] >= _FINDINGS.min_samples and health.repeats[k] > least:
-            yield Finding(
-                f"sensor {k} repeats the range of the scan before in {100 * health.repeats[k]:.0f} % of the scans, the "
-                f"others in {100 * usual:.0f} %",
-                {k: "stale"},
-                exclusive=True,
-            )
-        elif constant > max(_FINDINGS.min_constant, 4 * usual_constant):
-            yield Finding(
-                f"sensor {k} reports exactly {value:.3f} m in {100 * constant:.0f} % of its direct echoes: is this its "
-                f"code for no echo?",
-                {k: "saturates"},
-            )
-
-
-def _range_offsets(health: Health, sigma: float | None) -> Iterator[Finding]:
-    """Range offsets, the largest first."""
-    threshold = max(_FINDINGS.min_offset, sigma if sigma is not None else float(np.nan_to_num(health.sigma)))
-    threshold = max(threshold, _FINDINGS.min_offset_from_map) if health.source == "map" else threshold
-    size = np.abs(health.offset)
-    off = np.flatnonzero((size > 3 * health.offset_error) & (size > threshold))
-    for k in off[np.argsort(-size[off], kind="stable")].tolist():
-        direction = "much" if health.offset[k] > 0 else "little"
-        yield Finding(
-            f"sensor {k} reports {1e3 * size[k]:.1f} ± {1e3 * health.offset_error[k]:.1f} mm too {direction}, relative "
-            f"to the others",
-            {k: "offset"},
-        )
-
-
-def _weak_or_turned_sensors(health: Health) -> Iterator[Finding]:
-    """Sensors that detect little, or point in another direction."""
-    usual = _usual_rates(health)
-    for k in range(health.ring.count):
-        expected, detected = health.expected[k], health.heard[k]
-        if _is_low(expected, detected, usual, _FINDINGS.weak_rate)[0] and expected[0] >= 2 * _FINDINGS.min_expected:
-            yield Finding(
-                f"sensor {k} hears {detected[0]} of {expected[0]} expected direct echoes, the others "
-                f"{100 * usual[0]:.0f} %",
-                {k: "weak"},
-            )
-        turn, error = np.degrees(health.centre[k])
-        # Not against a map: its walls end where they were detected.
-        if abs(turn) > max(_FINDINGS.min_turn_deg, 4 * error) and health.source == "scans":
-            side = "left" if turn > 0 else "right"
-            yield Finding(f"sensor {k} points {abs(turn):.0f} ± {error:.0f} deg too far to the {side}", {k: "turned"})
-
-
-def _ring_findings(health: Health, measured: MeasuredSensors) -> Iterator[str]:
-    """Findings about the ring as a whole."""
-    explained = health.fits[:, 1][np.isfinite(health.fits[:, 1])]
-    if health.source == "scans" and len(explained) and np.median(explained) < _FINDINGS.min_explained:
-        yield (
-            f"walls explain {100 * np.median(explained):.0f} % of the echoes: is it the right ring, are ranges half "
-            "path lengths in metres?"
-        )
-    width, error, nominal = np.degrees([*health.beam, health.nominal])
-    if abs(width - nominal) > max(_FINDINGS.min_beam_deg, 3 * error):
-        yield f"cones are measured {width:.0f} ± {error:.0f} deg wide, the ring has {nominal:.0f} deg"
-    usual_constant = _usual_constant_fraction(health)
-    if usual_constant > 0.1:
-        value = float(np.nanmedian(health.constant[:, 0]))
-        yield (
-            f"every sensor reports one range again and again, {value:.3f} m in {100 * usual_constant:.0f} % of its "
-            f"echoes"
-        )
-    all_echoes = int(health.direct.sum() + health.cross.sum() // 2)
-    if measured.any_cross and not health.cross.any() and all_echoes:
-        yield f"no cross echo in {health.scans} scans, the ring listens to {health.ring.neighbors} neighbors"
-    in_place = (health.place == np.arange(health.ring.count)).all()
-    if health.left_out > max(2, 0.001 * all_echoes) and in_place:
-        yield f"{health.left_out} of {all_echoes} echoes are of pairs of sensors that the ring does not listen to"
-
-
-def _usual_constant_fraction(health: Health) -> float:
-    """Fraction of direct echoes with a sensor's most frequent range, the median over the sensors."""
-    known = np.isfinite(health.constant[:, 1])
-    return float(np.median(health.constant[known, 1])) if known.any() else 0.0
-
-
-def _usual_rates(health: Health) -> Float[np.ndarray, " 3"]:
-    """Detection rates, the median over the sensors: direct, cross as transmitter, cross as receiver."""
-    enough = health.expected >= _FINDINGS.min_expected
-    rate = np.where(enough, health.heard / np.maximum(health.expected, 1), np.nan)
-    known = [column[np.isfinite(column)] for column in rate.T]
-    usual = np.array([np.median(column) if len(column) else np.nan for column in known])
-    return np.where(usual > 0.3, usual, np.nan)
-
-
-def _is_low(
-    expected: Int[np.ndarray, " 3"], detected: Int[np.ndarray, " 3"], usual: Float[np.ndarray, " 3"], fraction: float
-) -> Bool[np.ndarray, " 3"]:
-    """Whether the detection rates are below this fraction of the usual ones, and significantly (4 sigma, binomial)."""
-    usual = np.minimum(usual, 0.9)
-    sigma = np.sqrt(usual * (1 - usual) * np.maximum(expected, 1))
-    enough = expected >= _FINDINGS.min_expected
-    return enough & (detected < fraction * usual * expected) & (usual * expected - detected > 4 * sigma)
+def confidence_of(nats: float) -> float:
+    """Probability of a cause from its log-likelihood ratio to the next best explanation (nats), at equal priors."""
+    return 1 / (1 + math.exp(-min(max(nats, -50.0), 50.0)))

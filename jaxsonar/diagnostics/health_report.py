@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxsonar.diagnostics.findings import Finding
 from jaxsonar.sensors.ring import Ring
 
 
@@ -77,8 +78,9 @@ class Health:
     radians."""
     remarks: tuple[str, ...]
     """Short remark for each sensor; empty if nothing is wrong."""
-    findings: tuple[str, ...]
-    """One sentence per fault, the most severe first; none if the ring is healthy."""
+    findings: tuple[Finding, ...]
+    """The faults, the most severe first; none if the ring is healthy. In JSON, ``findings`` lists their sentences, and
+    ``diagnoses`` the rest of them in the same order."""
     unmeasured: tuple[str, ...] = ()
     """Kinds of paths, and sensors, of which the log holds no measurement; they are not judged."""
 
@@ -97,6 +99,10 @@ class Health:
                 return [plain(item) for item in value]
             return None if isinstance(value, float) and not np.isfinite(value) else value
 
-        return {"ring": self.ring.name, "nominal_beam": self.nominal} | {
-            field.name: plain(getattr(self, field.name)) for field in fields(self) if field.name != "ring"
+        found = {
+            "findings": [finding.sentence for finding in self.findings],
+            "diagnoses": [finding.as_json() for finding in self.findings],
         }
+        special = {"ring", *found}
+        measured = {field.name: plain(getattr(self, field.name)) for field in fields(self) if field.name not in special}
+        return {"ring": self.ring.name, "nominal_beam": self.nominal} | measured | found

@@ -177,7 +177,7 @@ def _draw_ring(axes: Axes, health: Health) -> None:
 def _write_findings(axes: Axes, health: Health) -> None:
     """Write the findings, as many as fit."""
     axes.axis("off")
-    findings = list(health.findings) or ["no findings" if health.source else ""]
+    findings = [finding.sentence for finding in health.findings] or ["no findings" if health.source else ""]
     if health.empty:
         findings.insert(0, f"sensors are not compared with walls: {health.empty}")
     if health.unmeasured:

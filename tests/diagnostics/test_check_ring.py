@@ -53,7 +53,7 @@ def test_left_out_echoes_are_reported(log):
     assert reported == [len(far)]
     assert seen[-1] == (len(log), len(log))
     assert found.left_out == len(far)
-    assert any("does not listen to" in finding for finding in found.findings)
+    assert any("does not listen to" in finding.sentence for finding in found.findings)
 
 
 @pytest.mark.slow

@@ -1,45 +1,35 @@
-"""Findings of the health check: dead, deaf, mute and stuck sensors are named."""
+"""A finding: its text, its JSON, and its confidence."""
 
-import numpy as np
+import json
+
 import pytest
-from support.health_logs import RING, only
 
-from jaxsonar import Log
-from jaxsonar.diagnostics.check_ring import check
+from jaxsonar.diagnostics.findings import Finding, confidence_of
 
-
-@pytest.mark.slow
-def test_a_dead_sensor_is_named(log):
-    found = check(RING, only(log, (log.tx != 11) & (log.rx != 11)))
-    assert found.findings[0].startswith("sensor 11 hears nothing")
-    assert found.remarks[11] == "dead"
-    assert sum(map(bool, found.remarks)) == 1
+FINDING = Finding("offset", (3,), "sensor 3 reports too much", 0.98765, "12 standard errors", "calibrate")
 
 
-@pytest.mark.slow
-def test_deaf_and_mute_sensors_are_distinguished(log):
-    deaf = check(RING, only(log, log.rx != 11))
-    mute = check(RING, only(log, log.tx != 11))
-    assert not deaf.heard[11, 2]
-    assert deaf.heard[11, 1]
-    assert not mute.heard[11, 1]
-    assert mute.heard[11, 2]
-    assert deaf.remarks[11] == "deaf"
-    assert mute.remarks[11] == "mute"
+def test_the_text_has_the_sentence_the_evidence_and_the_remedy():
+    sentence, evidence, remedy = FINDING.lines()
+    assert sentence == "sensor 3 reports too much"
+    assert "12 standard errors" in evidence
+    assert "99%" in evidence
+    assert remedy.endswith("calibrate")
 
 
-@pytest.mark.slow
-def test_a_stuck_sensor_is_named(log):
-    own = (log.tx == 4) & (log.rx == 4)
-    stuck = only(log, ~own)
-    scans = np.arange(len(log))
-    index = np.concatenate([stuck.echo_scan, scans])
-    order = np.argsort(index, kind="stable")
-    columns = (
-        np.concatenate([column, np.full(len(log), filler)])[order]
-        for column, filler in ((stuck.tx, 4), (stuck.rx, 4), (stuck.range, 0.777))
-    )
-    found = check(RING, Log.from_echoes(index[order], *columns, stamp=log.stamp, pose=log.pose))
-    assert any(finding.startswith("sensor 4 repeats the range") for finding in found.findings)
-    assert found.repeats[4] == 1
-    np.testing.assert_allclose(found.constant[4], [0.777, 1])
+def test_json_has_all_but_the_sentence():
+    plain = json.loads(json.dumps(FINDING.as_json()))
+    assert plain == {
+        "cause": "offset",
+        "sensors": [3],
+        "confidence": pytest.approx(0.9877, abs=1e-4),
+        "evidence": "12 standard errors",
+        "remedy": "calibrate",
+    }
+
+
+def test_the_confidence_follows_the_odds():
+    assert confidence_of(0.0) == 0.5
+    assert confidence_of(1e9) <= 1
+    assert confidence_of(2.0) + confidence_of(-2.0) == pytest.approx(1)
+    assert confidence_of(1.0) < confidence_of(2.0)

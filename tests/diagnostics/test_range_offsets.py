@@ -15,7 +15,7 @@ def test_an_offset_is_attributed_to_its_sensor_only():
     offset = np.zeros(24)
     offset[3] = 0.01
     found = check(RING, log_of(7, dataclasses.replace(RING, range_offset=offset)))
-    assert found.findings[0].startswith("sensor 3 reports")
+    assert found.findings[0].sentence.startswith("sensor 3 reports")
     assert found.remarks[3] == "offset"
     assert sum(map(bool, found.remarks)) == 1
     assert abs(found.offset[3] - 0.01) < 0.003

@@ -16,7 +16,7 @@ def test_swapped_sensors_are_named(log, pair):
     place[list(pair)] = pair[::-1]
     found = check(RING, renumbered(log, place))
     assert (found.place == place).all()
-    assert found.findings[0].startswith(f"sensors {pair[0]} and {pair[1]} look swapped")
+    assert found.findings[0].sentence.startswith(f"sensors {pair[0]} and {pair[1]} look swapped")
     assert found.remarks[pair[0]] == f"swapped with {pair[1]}"
     assert sum(map(bool, found.remarks)) == 2
 
@@ -49,4 +49,4 @@ def test_a_cyclic_exchange_of_three_sensors_is_named(log):
     place = np.arange(24)
     place[[2, 9, 16]] = 9, 16, 2
     found = check(RING, renumbered(log, place))
-    assert found.findings[0].startswith("sensors 2, 16 and 9 look permuted")
+    assert found.findings[0].sentence.startswith("sensors 2, 16 and 9 look permuted")

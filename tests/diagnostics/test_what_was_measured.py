@@ -63,8 +63,8 @@ def test_a_sensor_that_was_not_measured_is_not_dead(log):
     unmeasured, silent = check(RING, explicit(without, others)), check(RING, explicit(without, RING.paths))
     assert unmeasured.findings == ()
     assert unmeasured.unmeasured == ("sensor 11",)
-    assert silent.findings[0].startswith("sensor 11 hears nothing")
-    assert "not measured" not in silent.findings[0]
+    assert silent.findings[0].sentence.startswith("sensor 11 hears nothing")
+    assert "not measured" not in silent.findings[0].sentence
     assert silent.remarks[11] == "dead"
     assert silent.unmeasured == ()
 
@@ -107,10 +107,10 @@ def test_a_turning_robot_gives_the_findings_of_a_robot_at_rest(fault):
         together, alone = fire_in_turn(device, room, motion, 24, sigma=SIGMA, dropout=0.1, clutter=0.1, seed=3)
         found, of_single = check(RING, renumbered(together, place)), check(RING, renumbered(alone, place))
         assert found.source == "scans"
-        assert of_single.findings == found.findings
+        assert [one.sentence for one in of_single.findings] == [one.sentence for one in found.findings]
         np.testing.assert_array_equal(of_single.heard, found.heard)
-        findings.append([finding.split(" ± ")[0].split(" reports ")[0].split(":")[0] for finding in found.findings])
-    expected = {"none": [], "offset": ["sensor 3"], "exchange": ["sensors 5 and 16 look swapped"]}[fault]
+        findings.append([(finding.cause, finding.sensors) for finding in found.findings])
+    expected = {"none": [], "offset": [("offset", (3,))], "exchange": [("swapped", (5, 16))]}[fault]
     assert findings == [expected, expected]
 
 
@@ -133,7 +133,7 @@ def test_held_readings_are_a_finding():
     sound, holding = check(NARROW, log_of(true, pose)), check(NARROW, log_of(held(true)[0], pose))
     assert sound.findings == ()
     assert len(holding.findings) == 1
-    assert holding.findings[0].startswith("the driver repeats the last range of a sensor that hears nothing")
+    assert holding.findings[0].sentence.startswith("the driver repeats the last range of a sensor that hears nothing")
     np.testing.assert_array_equal(holding.direct, sound.direct)
 
 
@@ -145,8 +145,8 @@ def test_a_mark_for_no_echo_is_a_finding(rng):
     mark = 4.5 + 0.04 * rng.standard_normal(true.shape)
     found = check(NARROW, log_of(np.where(np.isnan(true), mark, true), pose))
     assert len(found.findings) == 1
-    assert "4.5" in found.findings[0]
-    assert "no echo" in found.findings[0]
+    assert "4.5" in found.findings[0].sentence
+    assert "no echo" in found.findings[0].sentence
     assert not any(found.remarks)
 
 
