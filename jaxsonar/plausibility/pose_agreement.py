@@ -1,0 +1,260 @@
+"""Do echoes and poses go together? The share of echoes that other scans of the trajectory explain.
+
+Scans that lie close together along the trajectory see the same walls. Every echo votes for all walls that can have
+caused it: its isorange arc in a Hough accumulator, in the frame of the group of scans. An echo is explained if more of
+the other scans vote for one cell of its arc than by chance. Chance is measured: the same scans, each turned by a random
+angle.
+
+The true description of a log explains more echoes than any wrong one. Two descriptions of a log, such as its sensors
+numbered counter-clockwise and clockwise, can therefore be compared. NumPy only: nothing is compiled.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxsonar.geometry.se2 import relative, rotate, wrap_angle
+from jaxsonar.scans.firing_poses import reading_poses
+from jaxsonar.scans.measured_paths import path_rows
+from jaxsonar.scans.readings import is_repeated
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.ring import Ring
+
+
+@dataclass(frozen=True)
+class PoseAgreementSettings:
+    """Constants of the comparison of echoes with poses. Chosen by hand on simulated rooms."""
+
+    angle_cell: float = float(np.radians(2.0))
+    """Size of a cell of the accumulator in the direction of a wall's normal, radians; it divides the full turn."""
+    range_cell: float = 0.025
+    """Size of a cell in the distance of the wall, metres. Votes reach the neighboring cells."""
+    spacing: float = 0.08
+    """A scan is used if the robot moved this far since the last one that is used, metres, ..."""
+    turn: float = float(np.radians(8.0))
+    """... or if it turned this far, radians."""
+    group: int = 10
+    """Scans of a group."""
+    least_group: int = 4
+    """Smaller groups are left out."""
+    groups: int = 16
+    """Largest number of groups, spread over the log."""
+    long_log: int = 4000
+    """In logs with more scans, only as many scans are looked at as the groups need."""
+    nearest: float = 0.05
+    """Echoes below this range are left out, metres."""
+    by_chance: float = 0.95
+    """Quantile of the votes by chance that an explained echo exceeds."""
+    least_votes: int = 2
+    """Least number of other scans that vote for the wall of an explained echo."""
+    seed: int = 0
+    """Seed of the random turns."""
+
+
+SETTINGS = PoseAgreementSettings()
+
+_ANGLES = round(2 * np.pi / SETTINGS.angle_cell)
+_COS, _SIN = (f(np.arange(_ANGLES) * SETTINGS.angle_cell).astype(np.float32) for f in (np.cos, np.sin))
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Which echoes of a log the other scans explain."""
+
+    reading: Int[np.ndarray, " echoes"]
+    """Rows of the compared echoes in the log."""
+    scan: Int[np.ndarray, " echoes"]
+    """Rows of their scans in the log."""
+    explained: Bool[np.ndarray, " echoes"]
+    """Whether other scans explain the echo."""
+    lucky: Bool[np.ndarray, " echoes"]
+    """Whether they do so after all scans were turned by random angles."""
+
+    @property
+    def echoes(self) -> int:
+        """Number of compared echoes; 0 if the log has no two poses that can be compared."""
+        return len(self.reading)
+
+    @property
+    def share(self) -> float:
+        """Share of the echoes that are explained; 0 if none is compared."""
+        return float(self.explained.mean()) if self.echoes else 0.0
+
+    @property
+    def chance(self) -> float:
+        """Share that is explained by chance."""
+        return float(self.lucky.mean()) if self.echoes else 0.0
+
+
+@dataclass(frozen=True)
+class Gain:
+    """How much more one description of a log explains than another one."""
+
+    share: float
+    """Difference of the shares of explained echoes."""
+    sigma: float
+    """Standard error of this difference, from the differences of the scans."""
+
+    @property
+    def z(self) -> float:
+        """The gain in standard errors."""
+        return self.share / self.sigma if self.sigma else 0.0
+
+
+def select_groups(log: Log) -> list[Int[np.ndarray, " group"]]:
+    """Groups of scans that are compared with each other: rows of the log, in order.
+
+    The scans of a group follow each other along the trajectory at distances at which echoes change. A robot that waits
+    adds no scan. The list is empty if the log has no poses or the robot hardly moves.
+    """
+    posed = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
+    pose = log.pose[posed]
+    if len(posed) <= SETTINGS.long_log:
+        row = _spaced(pose, len(pose))
+        groups = [row[k : k + SETTINGS.group] for k in range(0, len(row), SETTINGS.group)]
+    else:
+        bounds = np.linspace(0, len(pose), SETTINGS.groups + 1).astype(int)
+        pairs = zip(bounds[:-1], bounds[1:], strict=True)
+        groups = [begin + _spaced(pose[begin:end], SETTINGS.group) for begin, end in pairs]
+    groups = [posed[one] for one in groups if len(one) >= SETTINGS.least_group]
+    if len(groups) > SETTINGS.groups:
+        groups = [groups[k] for k in np.linspace(0, len(groups) - 1, SETTINGS.groups).round().astype(int)]
+    return groups
+
+
+def agreement(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, " group"]] | None = None) -> Agreement:
+    """Find the echoes of a log that other scans explain, given the poses of the log.
+
+    Args:
+        ring: the sensors; echoes of other (tx, rx) pairs and beyond the maximum range are left out.
+        log: the scans.
+        groups: rows of the scans to compare; ``select_groups`` of the log if omitted. Give the same groups to compare
+            two descriptions of a log on the same scans.
+    """
+    groups = select_groups(log) if groups is None else groups
+    of_scan = np.full(len(log), -1)
+    for k, group in enumerate(groups):
+        of_scan[group] = k
+    scan = log.echo_scan
+    path = path_rows(ring, log.tx, log.rx)
+    used = (of_scan[scan] >= 0) & (path >= 0) & np.isfinite(log.range)
+    if log.age.any():
+        used &= ~is_repeated(log)
+    row = np.flatnonzero(used)
+    distance = np.asarray(ring.corrected(log.range[row], log.tx[row], log.rx[row]))
+    near = (distance > SETTINGS.nearest) & (distance < ring.max_range)
+    row, distance = row[near], distance[near]
+    pose = reading_poses(log)[row] if log.t.any() or log.age.any() else log.pose[scan[row]]
+    rng = np.random.default_rng(SETTINGS.seed)
+    explained, lucky = np.zeros(len(row), bool), np.zeros(len(row), bool)
+    bounds = np.searchsorted(scan[row], [[one[0], one[-1] + 1] for one in groups]) if len(groups) else []
+    for group, (begin, end) in zip(groups, bounds, strict=True):
+        one = slice(begin, end)
+        place = np.searchsorted(group, scan[row[one]])
+        group_from_robot = relative(log.pose[group[len(group) // 2]], pose[one])
+        turned = group_from_robot.copy()
+        turned[:, 2] += rng.uniform(-np.pi, np.pi, len(group))[place]
+        votes = [
+            _votes_of_others(ring, path[row[one]], distance[one], frame, place, len(group))
+            for frame in (group_from_robot, turned)
+        ]
+        if end > begin:
+            least = max(SETTINGS.least_votes, int(np.quantile(votes[1], SETTINGS.by_chance)) + 1)
+            explained[one], lucky[one] = votes[0] >= least, votes[1] >= least
+    return Agreement(row, scan[row], explained, lucky)
+
+
+def gain(given: Agreement, other: Agreement) -> Gain:
+    """How much more ``other`` explains than ``given``; both are of the same scans of a log, or at least of one log."""
+    count = max(given.scan.max(initial=-1), other.scan.max(initial=-1)) + 1
+    total = [np.bincount(one.scan, minlength=count) for one in (given, other)]
+    hit = [np.bincount(one.scan, one.explained, minlength=count) for one in (given, other)]
+    difference = other.share - given.share
+    both = (total[0] > 0) & (total[1] > 0)
+    if 2 * both.sum() > max((total[0] > 0).sum(), (total[1] > 0).sum()):
+        # The same scans: each scan is one sample of the difference.
+        weight = np.maximum(total[0], total[1])[both]
+        each = hit[1][both] / total[1][both] - hit[0][both] / total[0][both]
+        mean = np.average(each, weights=weight)
+        variance = (weight**2 * (each - mean) ** 2).sum() / weight.sum() ** 2
+    else:
+        variance = sum(_variance(a, b) for a, b in zip(hit, total, strict=True))
+    floor = 0.5 / max(given.echoes + other.echoes, 1)
+    return Gain(float(difference), float(np.sqrt(variance + floor**2)))
+
+
+def _variance(hit: Float[np.ndarray, " scans"], total: Int[np.ndarray, " scans"]) -> float:
+    """Variance of the share of explained echoes, from the shares of the scans."""
+    if not total.any():
+        return 0.0
+    share = hit.sum() / total.sum()
+    return float(((hit - share * total) ** 2).sum() / total.sum() ** 2)
+
+
+def _spaced(pose: Float[np.ndarray, "scans 3"], limit: int) -> Int[np.ndarray, " spaced"]:
+    """Rows of scans each of which is some distance or angle away from the one before; the first ``limit`` of them."""
+    rows, at, block = [], 0, 32
+    while at < len(pose) and len(rows) < limit:
+        rows.append(at)
+        last, at = pose[at], at + 1
+        width = block
+        while at < len(pose):
+            ahead = pose[at : at + width]
+            moved = np.hypot(*(ahead[:, :2] - last[:2]).T) > SETTINGS.spacing
+            moved |= np.abs(wrap_angle(ahead[:, 2] - last[2])) > SETTINGS.turn
+            if moved.any():
+                at += int(np.argmax(moved))
+                break
+            at, width = at + width, 2 * width
+    return np.array(rows, np.int64)
+
+
+def _votes_of_others(
+    ring: Ring,
+    path: Int[np.ndarray, " echoes"],
+    distance: Float[np.ndarray, " echoes"],
+    pose: Float[np.ndarray, "echoes 3"],
+    place: Int[np.ndarray, " echoes"],
+    scans: int,
+) -> Int[np.ndarray, " echoes"]:
+    """Largest number of other scans of a group that vote for one wall on the arc of each echo.
+
+    Args:
+        ring: the sensors.
+        path: row of ``Ring.paths`` of each echo.
+        distance: corrected range, metres.
+        pose: group_from_robot when the echo was measured.
+        place: the scan of each echo within the group.
+        scans: number of scans of the group.
+    """
+    if not len(path):
+        return np.zeros(0, np.int64)
+    paths, size = ring.exact_paths, SETTINGS.angle_cell
+    # Directions of the grid in which the path can receive a wall; one at least.
+    start = np.mod(paths.start[path] + pose[:, 2], 2 * np.pi)
+    first = np.ceil(start / size).astype(np.int64)
+    count = np.maximum(np.floor((start + paths.width[path]) / size).astype(np.int64) - first + 1, 1)
+    begin = np.cumsum(count) - count
+    echo = np.repeat(np.arange(len(path)), count)
+    angle = (first[echo] + np.arange(len(echo)) - begin[echo]) % _ANGLES
+    # Distance of the wall from the origin of the group for each direction: the isorange arc of the echo.
+    midpoint = (pose[:, :2] + rotate(paths.midpoint[path], pose[:, 2])).astype(np.float32)[echo]
+    baseline = rotate(paths.half_baseline[path], pose[:, 2]).astype(np.float32)[echo]
+    cos, sin = _COS[angle], _SIN[angle]
+    across = baseline[:, 1] * cos - baseline[:, 0] * sin
+    height = np.sqrt(np.maximum(distance.astype(np.float32)[echo] ** 2 - across**2, 0))
+    rho = midpoint[:, 0] * cos + midpoint[:, 1] * sin + height
+    angle = np.where(rho < 0, (angle + _ANGLES // 2) % _ANGLES, angle)
+    # Walls farther away than another scan of the group can see are no common walls.
+    cells = int((2 * ring.max_range + SETTINGS.group * SETTINGS.spacing) / SETTINGS.range_cell) + 3
+    radius = np.minimum(np.abs(rho) / np.float32(SETTINGS.range_cell), cells).astype(np.int64) + 1
+    inside = radius < cells - 1
+    cell, voter = (angle * cells + radius)[inside], place[echo[inside]]
+    voted = np.zeros((scans, _ANGLES * cells), bool)
+    for shift in (-1, 0, 1):
+        voted[voter, cell + shift] = True
+    others = np.zeros(len(echo), np.int64)
+    others[inside] = voted.sum(axis=0, dtype=np.int16)[cell] - 1
+    return np.maximum.reduceat(others, begin)
