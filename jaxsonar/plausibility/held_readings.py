@@ -9,9 +9,9 @@ kept its range.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
-from jaxsonar.geometry.se2 import transform_points, unit, wrap_angle
+from jaxsonar.plausibility.constant_ranges import may_stay, range_resolution
 from jaxsonar.scans.firing_poses import reading_poses
 from jaxsonar.scans.measured_paths import path_rows
 from jaxsonar.scans.readings import measurement_times
@@ -28,12 +28,6 @@ class HeldReadingSettings:
     a few scans."""
     steps: float = 2.0
     """Added to it, in units of the resolution. Readings that differ by this at most are nearly equal."""
-    cone_factor: float = 1.2
-    """The detection cones are taken this much wider, ..."""
-    cone_margin: float = float(np.radians(5.0))
-    """... and by this on either side, radians, because cones and headings are not exact."""
-    directions: int = 17
-    """Directions in the cone in which a reflector is tried."""
     present: float = 0.99
     """A held sensor has a reading in at least this share of the scans since its first one."""
     min_readings: int = 20
@@ -52,8 +46,6 @@ class HeldReadingSettings:
     min_changed: float = 0.1
     """A scan counts only if at least this share of its readings changed; else the robot may be at rest, whatever its
     odometry says."""
-    resolution_quantile: float = 0.05
-    """Quantile of the differences of neighboring values that is taken for the resolution of the readings."""
     block: int = 20_000
     """Pairs of readings that are compared at a time."""
 
@@ -92,7 +84,7 @@ def find_held_readings(ring: Ring, log: Log) -> HeldReadings:
 
     The driver holds readings if all this is true of the paths that have a reading in every scan since their first one:
 
-    - Readings stay equal although the robot moved so that they must have changed (``_may_stay``), in several runs with
+    - Readings stay equal although the robot moved so that they must have changed (``may_stay``), in several runs with
       different values.
     - Readings that are nearly equal under the same conditions are much rarer. Equal readings are therefore no chance.
     - The runs are longer than the renewal period of the sensors.
@@ -114,7 +106,7 @@ def find_held_readings(ring: Ring, log: Log) -> HeldReadings:
     number, starts = np.cumsum(~equal) - 1, np.flatnonzero(~equal)
     first, length = starts[number], np.diff(np.append(starts, len(row)))
     last, before = first + length[number] - 1, np.append(0, first[:-1])
-    resolution = _resolution(reported)
+    resolution = range_resolution(reported)
     near = follows & ~equal & (np.abs(reported - reported[before]) <= SETTINGS.steps * resolution)
     # Did the robot move too far for an equal reading, or for the end of a run that is nearly equal to the run before?
     changes = np.bincount(scan[follows & ~equal], minlength=len(log))
@@ -125,7 +117,7 @@ def find_held_readings(ring: Ring, log: Log) -> HeldReadings:
     for begin in range(0, len(compared), SETTINGS.block):
         one = compared[begin : begin + SETTINGS.block]
         early, late = np.where(equal[one], first[one], before[one]), np.where(equal[one], one, last[one])
-        moved[one] = ~_may_stay(ring, path[one], reported[early], pose[early], pose[late], margin)
+        moved[one] = ~may_stay(ring, path[one], reported[early], pose[early], pose[late], margin)
     # A slow sensor is read several times; only longer runs are held. Runs are counted, whatever their length.
     period = int(np.quantile(length, SETTINGS.renewal_quantile))
     proven = equal & moved & (np.arange(len(row)) - first > period)
@@ -167,47 +159,6 @@ def _complete_paths(ring: Ring, log: Log) -> Int[np.ndarray, " rows"]:
     twice[path[1:][(np.diff(path) == 0) & (np.diff(scan) == 0)]] = True
     complete = ~twice & (count >= SETTINGS.min_readings) & (count >= SETTINGS.present * (len(log) - since))
     return row[complete[path]]
-
-
-def _resolution(reported: Float[np.ndarray, " readings"]) -> float:
-    """Step between the values of readings, metres; too large for few readings."""
-    steps = np.diff(np.unique(reported))
-    steps = steps[steps > 1e-6 * reported.max()]  # larger than the rounding of 32-bit floats
-    return float(np.quantile(steps, SETTINGS.resolution_quantile)) if len(steps) else 0.0
-
-
-def _may_stay(
-    ring: Ring,
-    path: Int[np.ndarray, " pairs"],
-    reported: Float[np.ndarray, " pairs"],
-    before: Float[np.ndarray, "pairs 3"],
-    after: Float[np.ndarray, "pairs 3"],
-    margin: float,
-) -> Bool[np.ndarray, " pairs"]:
-    """Whether a reflector may have the same range, up to the margin (metres), at two poses of the robot.
-
-    Walls and points in all directions of the detection cone at the first pose are tried; the cone must contain them at
-    the second pose, too. True where a pose is unknown.
-    """
-    geometry = ring.exact_paths
-    half = SETTINGS.cone_factor * geometry.width[path] / 2 + SETTINGS.cone_margin
-    center = geometry.start[path] + geometry.width[path] / 2
-    midpoint = np.asarray(geometry.midpoint)[path]
-    origin, to = transform_points(before, midpoint), transform_points(after, midpoint)
-    angle = (before[:, 2] + center)[:, None] + half[:, None] * np.linspace(-1, 1, SETTINGS.directions)
-    way, axis = to - origin, (after[:, 2] + center)[:, None]
-    # Change of the range of a wall with this normal, and of a point in this direction.
-    toward = unit(angle)
-    wall = (way[:, None] * toward).sum(axis=-1)
-    sight = reported[:, None, None] * toward - way[:, None]
-    point = np.hypot(*np.moveaxis(sight, -1, 0)) - reported[:, None]
-    direction = np.arctan2(sight[..., 1], sight[..., 0])
-    stays = np.isnan(before).any(axis=1) | np.isnan(after).any(axis=1)
-    for change, seen in ((wall, angle), (point, direction)):
-        in_cone = np.abs(wrap_angle(seen - axis)) <= half[:, None]
-        crosses = (change[:, 1:] * change[:, :-1] <= 0) & in_cone[:, 1:] & in_cone[:, :-1]
-        stays |= crosses.any(axis=1) | (in_cone & (np.abs(change) <= margin)).any(axis=1)
-    return stays
 
 
 def _since_first(proven: Bool[np.ndarray, " rows"], first: Int[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
