@@ -17,6 +17,9 @@ from jaxsonar.cli.console import errors_in, print_status
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.reports.text import plural
 
+_REPORTED_BY_CHECK = ("no-echo value", "held readings", "robot echo")
+"""Kinds of mistakes that ``check`` reports itself, as findings."""
+
 LOG_HELP = "scan log (CSV, Parquet), raw record (MCAP, extra live), ROS bag (extra ros), or what --from names"
 
 _TABLE_OPTIONS = {"ranges": "range_columns", "time": "time_column", "pose": "pose_columns"}
@@ -63,8 +66,13 @@ def add_reading_options(parser: argparse.ArgumentParser, metavar: str = "LOG") -
         metavar="METRES",
         help="a range that means no echo, in metres or in the unit of a table; can be repeated",
     )
-    reading.add_argument("--strict", action="store_true", help="a warning about the input is an error (exit code 2)")
+    add_strict(reading)
     _add_table_options(parser)
+
+
+def add_strict(parser: "argparse._ActionsContainer") -> None:
+    """Add ``--strict``."""
+    parser.add_argument("--strict", action="store_true", help="a warning about the input is an error (exit code 2)")
 
 
 def _add_table_options(parser: argparse.ArgumentParser) -> None:
@@ -160,6 +168,13 @@ class InputMessages:
         self.warnings += 1
         print_status(f"warning: {text}")
 
+    def warn_of_noise(self, sigma: float | None = None, **errors: float | None) -> None:
+        """Warn of probable mistakes in options that describe errors, as ``implausible_noise``."""
+        from jaxsonar.plausibility.implausible_noise import implausible_noise
+
+        for found in implausible_noise(sigma, **errors):
+            self.warn(str(found))
+
     def check(self) -> None:
         """Check that there was no warning, if there must be none.
 
@@ -192,25 +207,38 @@ def load_all_inputs(
     """Load the ring of a command and several logs, as ``load_inputs``."""
     from jaxsonar.plausibility.implausible_input import implausible_input
     from jaxsonar.plausibility.prepared_log import prepared_log
-    from jaxsonar.plausibility.unheard_paths import unheard_warning
-    from jaxsonar.sensors.ring_toml import load_ring
 
     messages = InputMessages(strict=options.strict)
-    ring, logs = load_ring(options.ring), []
+    ring, logs = load_checked_ring(options.ring, messages), []
+    messages.warn_of_noise(getattr(options, "sigma", None))
     for name in filenames:
         log = read_log(name, options, messages, ring=ring)
         with errors_in(name):
-            if not as_recorded:
-                log = prepared_log(ring, log, on_note=messages.note)
-            elif options.strict:
-                prepared_log(ring, log, on_note=messages.note)
+            if as_recorded and not options.strict:
+                for found in implausible_input(ring, log):
+                    if found.kind not in _REPORTED_BY_CHECK:
+                        messages.warn(str(found))
             else:
-                for text in (*implausible_input(ring, log), unheard_warning(ring, log)):
-                    if text is not None:
-                        messages.warn(str(text))
+                prepared = prepared_log(ring, log, on_note=messages.note)
+                log = log if as_recorded else prepared
         logs.append(log)
     messages.check()
     return ring, logs
+
+
+def load_checked_ring(name: str, messages: InputMessages) -> "Ring":
+    """Load the ring of a command; warn of probable mistakes in it.
+
+    Raises:
+        SonarError: it cannot be read.
+    """
+    from jaxsonar.plausibility.implausible_ring import implausible_ring
+    from jaxsonar.sensors.ring_toml import load_ring
+
+    ring = load_ring(name)
+    for found in implausible_ring(ring):
+        messages.warn(str(found))
+    return ring
 
 
 def _check_names_are_used(name: str, options: argparse.Namespace) -> None:

@@ -11,6 +11,7 @@ numbered counter-clockwise and clockwise, can therefore be compared. NumPy only:
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -103,7 +104,7 @@ class Gain:
         return self.share / self.sigma if self.sigma else 0.0
 
 
-def select_groups(log: Log) -> list[Int[np.ndarray, " group"]]:
+def select_groups(log: Log) -> list[Int[np.ndarray, "_"]]:
     """Groups of scans that are compared with each other: rows of the log, in order.
 
     The scans of a group follow each other along the trajectory at distances at which echoes change. A robot that waits
@@ -116,7 +117,7 @@ def select_groups(log: Log) -> list[Int[np.ndarray, " group"]]:
         groups = [row[k : k + SETTINGS.group] for k in range(0, len(row), SETTINGS.group)]
     else:
         bounds = np.linspace(0, len(pose), SETTINGS.groups + 1).astype(int)
-        pairs = zip(bounds[:-1], bounds[1:], strict=True)
+        pairs = pairwise(bounds)
         groups = [begin + _spaced(pose[begin:end], SETTINGS.group) for begin, end in pairs]
     groups = [posed[one] for one in groups if len(one) >= SETTINGS.least_group]
     if len(groups) > SETTINGS.groups:
@@ -124,7 +125,7 @@ def select_groups(log: Log) -> list[Int[np.ndarray, " group"]]:
     return groups
 
 
-def agreement(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, " group"]] | None = None) -> Agreement:
+def agreement(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]] | None = None) -> Agreement:
     """Find the echoes of a log that other scans explain, given the poses of the log.
 
     Args:

@@ -27,7 +27,7 @@ def test_falling_stamps():
     stamp = LOG.stamp.copy()
     stamp[200:] -= 30
     (text,) = warnings(RING, replace(LOG, stamp=stamp))
-    assert text.startswith("the stamps fall once from 119.900 s to 90.000 s; the clock was set")
+    assert text.startswith("the stamps run backwards once from 119.900 s to 90.000 s; the clock was set")
     stamp[10:20] = np.nan
     assert len(warnings(RING, replace(LOG, stamp=stamp))) == 1
 
@@ -35,7 +35,7 @@ def test_falling_stamps():
 @pytest.mark.parametrize("factor", [39.37, 100, 1000])
 def test_ranges_in_another_unit(factor):
     (text,) = warnings(RING, replace(LOG, range=LOG.range * factor))
-    assert "of the echoes are beyond the maximum range of the ring, 5 m; the ranges have another unit" in text
+    assert "of the echoes are beyond the maximum range of the ring, 5 m; the ranges are probably " in text
 
 
 def test_a_ring_that_trusts_half_of_the_ranges_is_sound():

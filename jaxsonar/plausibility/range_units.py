@@ -1,0 +1,169 @@
+"""The unit of the ranges of a log: half path lengths in metres, or what a driver reports instead."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
+from jaxsonar.plausibility.implausibility import Implausibility
+from jaxsonar.plausibility.pose_agreement import Agreement, agreement, gain, select_groups
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.ring import Ring
+
+
+@dataclass(frozen=True)
+class RangeUnitSettings:
+    """When ranges have another unit. Chosen by hand on simulated rooms."""
+
+    least_echoes: int = 20
+    """Logs with fewer echoes give no warning about their ranges."""
+    beyond: float = 0.8
+    """Share of the echoes beyond the maximum range of the ring that is implausible without further evidence. In a large
+    hall, half of them may be."""
+    fits: float = 0.95
+    """Share of the echoes that must be within the maximum range in the right unit."""
+    too_near: float = 0.035
+    """No sensor has nearly all of its echoes below this range, metres: the share ``fits``."""
+    nearest: float = 0.05
+    """In the right unit, the farthest echoes are at least this far away, metres."""
+    reach: float = 4.0
+    """Ranges up to this many times the maximum range are compared with the poses as they are."""
+    gain: float = 0.1
+    """The right unit explains at least this much more of the echoes than the given one, ..."""
+    sigmas: float = 4.0
+    """... and this many standard errors, ..."""
+    share: float = 0.5
+    """... and at least this share, ..."""
+    above_chance: float = 0.2
+    """... and this much more than chance."""
+
+
+SETTINGS = RangeUnitSettings()
+
+_TIME_OF_FLIGHT = REFERENCE_SPEED_OF_SOUND / 2
+_UNITS = (
+    (1000.0, "kilometres"),
+    (_TIME_OF_FLIGHT, "times of flight in seconds"),
+    (0.5, "lengths of the round trip, out and back"),
+    (0.3048, "feet"),
+    (1e-3 * _TIME_OF_FLIGHT, "times of flight in milliseconds"),
+    (0.0254, "inches"),
+    (0.01, "centimetres"),
+    (0.001, "millimetres"),
+    (1e-6 * _TIME_OF_FLIGHT, "times of flight in microseconds"),
+    (1e-9 * _TIME_OF_FLIGHT, "times of flight in nanoseconds"),
+)
+"""Metres per unit, and its name, from the largest one."""
+_ROUND_TRIP = 0.5
+
+
+@dataclass(frozen=True)
+class RangeUnit:
+    """A unit that the ranges of a log have instead of metres."""
+
+    scale: float
+    """Metres per unit; NaN if no unit fits."""
+    implausibility: Implausibility
+    """The mistake in words."""
+
+    def corrected(self, log: Log) -> Log:
+        """The log with ranges in metres; unchanged if no unit fits."""
+        return replace(log, range=log.range * self.scale) if np.isfinite(self.scale) else log
+
+
+def find_range_unit(ring: Ring, log: Log) -> RangeUnit | None:
+    """The unit of the ranges if it is not metres; None if nothing speaks against metres.
+
+    Most echoes beyond the maximum range of the ring, or at no distance at all, show another unit. Where the log has
+    poses, they decide between units, and they show a wrong unit whose ranges are within the maximum range.
+
+    Args:
+        ring: the sensors.
+        log: the scans.
+    """
+    distance = log.range[np.isfinite(log.range)] * float(ring.speed_of_sound / REFERENCE_SPEED_OF_SOUND)
+    if len(distance) < SETTINGS.least_echoes:
+        return None
+    beyond = float(np.mean(distance > ring.max_range))
+    most = float(np.quantile(distance, SETTINGS.fits))
+    candidates = [unit for unit in _UNITS if SETTINGS.nearest <= most * unit[0] <= 1.02 * ring.max_range]
+    if most < SETTINGS.too_near:
+        what = f"{SETTINGS.fits:.0%} of the echoes are nearer than {most * 1000:.2g} mm"
+        candidates = [unit for unit in candidates if unit[0] > 1]
+    elif beyond > SETTINGS.beyond:
+        what = f"{beyond:.0%} of the echoes are beyond the maximum range of the ring, {ring.max_range:g} m"
+        candidates = [unit for unit in candidates if unit[0] < 1]
+    else:
+        # Units whose values can be within the maximum range.
+        candidates = [unit for unit in candidates if _ROUND_TRIP >= unit[0] >= min(_ROUND_TRIP, 0.3 / most)]
+        best = _best_by_poses(ring, log, most, candidates)
+        return best if best is None or best.scale != 1.0 else None
+    found = _best_by_poses(ring, log, most, candidates)
+    if found is not None and found.scale == 1.0:
+        cause = "the poses agree with metres, so the maximum range of the ring is too small"
+        return RangeUnit(np.nan, Implausibility("range unit", what, cause, "set max_range in the ring"))
+    if found is not None:
+        return RangeUnit(found.scale, replace(found.implausibility, what=what))
+    if not candidates:
+        cause = "the ranges have another unit, or the ring is another one"
+        return RangeUnit(np.nan, Implausibility("range unit", what, cause, "give half path lengths in metres"))
+    scale, name = candidates[0]
+    cause = f"the ranges are probably {name}, or the ring is another one"
+    return RangeUnit(scale, Implausibility("range unit", what, cause, _remedy(scale)))
+
+
+def _best_by_poses(ring: Ring, log: Log, most: float, candidates: list[tuple[float, str]]) -> RangeUnit | None:
+    """The unit with which the poses agree best and clearly; None if there is none. Metres have the scale 1.
+
+    Args:
+        ring: the sensors.
+        log: the scans.
+        most: range that hardly any echo exceeds, in the unit of the log.
+        candidates: units that are compared with metres.
+    """
+    groups = select_groups(log)
+    if not groups or not candidates:
+        return None
+    log, groups = _part_of_groups(log, groups)
+    given = None
+    if most <= SETTINGS.reach * ring.max_range and most >= SETTINGS.nearest:
+        # With a larger maximum range, so that the same echoes are compared.
+        wide = replace(ring, max_range=min(max(most * 1.02, ring.max_range), 100.0))
+        given = agreement(wide, log, groups)
+    others = [agreement(ring, replace(log, range=log.range * scale), groups) for scale, _ in candidates]
+    index = int(np.argmax([other.share for other in others]))
+    (scale, name), best = candidates[index], others[index]
+    if given is not None and _is_clear(given) and given.share >= best.share:
+        return RangeUnit(1.0, Implausibility("range unit", "", "", ""))
+    if not _is_clear(best):
+        return None
+    what = f"{best.share:.0%} of the echoes agree with the poses"
+    if given is not None:
+        more = gain(given, best)
+        if more.share < SETTINGS.gain or more.z < SETTINGS.sigmas:
+            return None
+        what = f"only {given.share:.0%} of the echoes agree with the poses if ranges are metres"
+        cause = f"the ranges are probably {name}, with which {best.share:.0%} agree"
+    else:
+        cause = f"the ranges are probably {name}, with which {best.share:.0%} agree with the poses"
+    return RangeUnit(scale, Implausibility("range unit", what, cause, _remedy(scale)))
+
+
+def _is_clear(one: Agreement) -> bool:
+    """Whether poses explain echoes, and not by chance."""
+    return one.share >= SETTINGS.share and one.share >= one.chance + SETTINGS.above_chance
+
+
+def _part_of_groups(log: Log, groups: list[Int[np.ndarray, "_"]]) -> tuple[Log, list[Int[np.ndarray, "_"]]]:
+    """The scans of these groups alone, and their rows in this part, so that alternatives of a long log are cheap."""
+    rows = np.sort(np.concatenate(groups))
+    return log._part(rows), [np.searchsorted(rows, group) for group in groups]
+
+
+def _remedy(scale: float) -> str:
+    """What to do about ranges in a unit of this many metres."""
+    if scale == _ROUND_TRIP:
+        return "give half path lengths in metres: divide the ranges by 2"
+    action = f"multiply by {scale:.6g}" if scale not in (0.01, 0.001) else f"divide by {1 / scale:g}"
+    return f"give half path lengths in metres: {action}"
