@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 
 from jaxsonar.geometry.se2 import relative, rotate, wrap_angle
 from jaxsonar.scans.firing_poses import reading_poses
@@ -72,6 +72,8 @@ class Agreement:
     """Whether other scans explain the echo."""
     lucky: Bool[np.ndarray, " echoes"]
     """Whether they do so after all scans were turned by random angles."""
+    support: Float[np.ndarray, " echoes"]
+    """Share of the other scans of the group that agree with the echo: that vote for the wall with the most votes."""
 
     @property
     def echoes(self) -> int:
@@ -88,6 +90,11 @@ class Agreement:
         """Share that is explained by chance."""
         return float(self.lucky.mean()) if self.echoes else 0.0
 
+    @property
+    def mean_support(self) -> float:
+        """Mean support of the echoes; 0 if none is compared."""
+        return float(self.support.mean()) if self.echoes else 0.0
+
 
 @dataclass(frozen=True)
 class Gain:
@@ -97,11 +104,20 @@ class Gain:
     """Difference of the shares of explained echoes."""
     sigma: float
     """Standard error of this difference, from the differences of the scans."""
+    support: float
+    """Difference of the mean support of the echoes. It is more sensitive than the share."""
+    support_sigma: float
+    """Standard error of it."""
 
     @property
     def z(self) -> float:
-        """The gain in standard errors."""
-        return self.share / self.sigma if self.sigma else 0.0
+        """The difference of the shares in standard errors."""
+        return self.share / self.sigma
+
+    @property
+    def support_z(self) -> float:
+        """The difference of the support in standard errors."""
+        return self.support / self.support_sigma
 
 
 def select_groups(log: Log) -> list[Int[np.ndarray, "_"]]:
@@ -149,7 +165,7 @@ def agreement(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]] | Non
     row, distance = row[near], distance[near]
     pose = reading_poses(log)[row] if log.t.any() or log.age.any() else log.pose[scan[row]]
     rng = np.random.default_rng(SETTINGS.seed)
-    explained, lucky = np.zeros(len(row), bool), np.zeros(len(row), bool)
+    explained, lucky, support = np.zeros(len(row), bool), np.zeros(len(row), bool), np.zeros(len(row))
     bounds = np.searchsorted(scan[row], [[one[0], one[-1] + 1] for one in groups]) if len(groups) else []
     for group, (begin, end) in zip(groups, bounds, strict=True):
         one = slice(begin, end)
@@ -164,34 +180,34 @@ def agreement(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]] | Non
         if end > begin:
             least = max(SETTINGS.least_votes, int(np.quantile(votes[1], SETTINGS.by_chance)) + 1)
             explained[one], lucky[one] = votes[0] >= least, votes[1] >= least
-    return Agreement(row, scan[row], explained, lucky)
+            support[one] = votes[0] / (len(group) - 1)
+    return Agreement(row, scan[row], explained, lucky, support)
 
 
 def gain(given: Agreement, other: Agreement) -> Gain:
-    """How much more ``other`` explains than ``given``; both are of the same scans of a log, or at least of one log."""
-    count = max(given.scan.max(initial=-1), other.scan.max(initial=-1)) + 1
-    total = [np.bincount(one.scan, minlength=count) for one in (given, other)]
-    hit = [np.bincount(one.scan, one.explained, minlength=count) for one in (given, other)]
-    difference = other.share - given.share
-    both = (total[0] > 0) & (total[1] > 0)
-    if 2 * both.sum() > max((total[0] > 0).sum(), (total[1] > 0).sum()):
-        # The same scans: each scan is one sample of the difference.
-        weight = np.maximum(total[0], total[1])[both]
-        each = hit[1][both] / total[1][both] - hit[0][both] / total[0][both]
-        mean = np.average(each, weights=weight)
-        variance = (weight**2 * (each - mean) ** 2).sum() / weight.sum() ** 2
-    else:
-        variance = sum(_variance(a, b) for a, b in zip(hit, total, strict=True))
-    floor = 0.5 / max(given.echoes + other.echoes, 1)
-    return Gain(float(difference), float(np.sqrt(variance + floor**2)))
+    """How much more ``other`` explains than ``given``; both have echoes of one log, at best of the same scans."""
+    return Gain(
+        *_difference(given.scan, given.explained, other.scan, other.explained),
+        *_difference(given.scan, given.support, other.scan, other.support),
+    )
 
 
-def _variance(hit: Float[np.ndarray, " scans"], total: Int[np.ndarray, " scans"]) -> float:
-    """Variance of the share of explained echoes, from the shares of the scans."""
-    if not total.any():
-        return 0.0
-    share = hit.sum() / total.sum()
-    return float(((hit - share * total) ** 2).sum() / total.sum() ** 2)
+def _difference(
+    scan: Int[np.ndarray, " echoes"],
+    value: Num[np.ndarray, " echoes"] | Bool[np.ndarray, " echoes"],
+    other_scan: Int[np.ndarray, " others"],
+    other_value: Num[np.ndarray, " others"] | Bool[np.ndarray, " others"],
+) -> tuple[float, float]:
+    """Difference of two means over echoes, and its standard error if the echoes of a scan depend on each other."""
+    if not (len(scan) and len(other_scan)):
+        return 0.0, 1.0
+    count = max(scan[-1], other_scan[-1]) + 1
+    mean, other_mean = value.mean(), other_value.mean()
+    # The contribution of each scan to the difference of the means; those of scans in both descriptions cancel.
+    part = np.bincount(other_scan, other_value - other_mean, count) / len(other_scan)
+    part -= np.bincount(scan, value - mean, count) / len(scan)
+    least = 0.5 / (len(scan) + len(other_scan))
+    return float(other_mean - mean), float(np.hypot(np.linalg.norm(part), least))
 
 
 def _spaced(pose: Float[np.ndarray, "scans 3"], limit: int) -> Int[np.ndarray, " spaced"]:
