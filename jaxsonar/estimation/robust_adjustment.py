@@ -18,7 +18,7 @@ from jaxsonar.estimation.adjustment_state import AdjustmentResult, AdjustmentSta
 from jaxsonar.estimation.batch_data import BatchData
 from jaxsonar.estimation.landmark_map import LandmarkMap
 from jaxsonar.estimation.landmark_selection import reclassify_points, remove_misfitting_points
-from jaxsonar.estimation.sparse_adjustment import AdjustmentSolution, solve_adjustment
+from jaxsonar.estimation.sparse_adjustment import AdjustmentSolution, absorbed_freedom, solve_adjustment
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import PRIOR, ParameterBasis, parameter_basis
 
@@ -44,6 +44,9 @@ class GncSettings:
     """Rounds in which the scale of the loss is halved, at most."""
     final_rounds: int = 3
     """Rounds of association and least squares with a fixed gate, in which the noise is estimated."""
+    max_unknowns: float = 0.2
+    """Number of unknowns, as a fraction of the number of echoes, up to which the echoes alone determine all of them.
+    With more, odometry and priors determine a part."""
     mad_to_sigma: float = 1.4826
     """Standard deviation of a normal distribution over its median absolute deviation (exact value)."""
 
@@ -77,18 +80,28 @@ def gnc_adjust(
     job = _GncJob(ring, data, basis, poses_free, settings)
     # 1. Shrink the scale of the robust loss.
     state, noise = job.anneal(state, initial_scale, sigma)
-    parameters = int(np.linalg.matrix_rank(basis.columns)) if basis.columns.any() else 0
     for _ in range(settings.final_rounds):
         # 2. Associate with a fixed gate and minimize.
         found = job.reassociate(state, noise)
         # 3. Estimate the noise from the residuals.
-        landmarks = len(np.unique(np.asarray(found.problem.factors.reflection.first)[found.used]))
-        dof = int(found.used.sum()) - 2 * landmarks - parameters - 3 * data.scan_count * poses_free
+        dof = _degrees_of_freedom(data, basis, found, poses_free)
         if sigma is None and dof > 0:
             noise = max(float(np.sqrt((found.residual**2).sum() / dof)), settings.min_sigma)
         # 4. Correct the kind of points, and remove those that fit neither kind.
         state = remove_misfitting_points(reclassify_points(found), found)
     return job.reassociate(state, noise)
+
+
+def _degrees_of_freedom(
+    data: BatchData, basis: ParameterBasis, found: AdjustmentResult, poses_free: bool, settings: GncSettings = SETTINGS
+) -> float:
+    """Number of echoes minus what the unknowns absorb."""
+    echoes, landmarks = int(found.used.sum()), np.asarray(found.problem.factors.reflection.first)[found.used]
+    parameters = int(np.linalg.matrix_rank(basis.columns)) if basis.columns.any() else 0
+    unknowns = 2 * len(np.unique(landmarks)) + parameters + 3 * data.scan_count * poses_free
+    if unknowns <= settings.max_unknowns * echoes:
+        return echoes - unknowns
+    return echoes - absorbed_freedom(found.problem, found.solution.unknowns, poses_free=poses_free)
 
 
 def anneal(

@@ -29,6 +29,8 @@ class SparseAdjustmentSettings:
 
     min_echo_rows: int = 1024
     """Echoes are padded to a power of two, at least this, so that few shapes are compiled. Chosen by hand."""
+    trace_probes: int = 8
+    """Random vectors for the trace of a matrix: 2 % of the trace for a thousand echoes. Chosen by hand."""
     solver: LevenbergMarquardtSettings = DEFAULT_SOLVER
     """Damping schedule and convergence tests."""
 
@@ -100,6 +102,32 @@ def marginal_covariances(
         poses[count:] = np.eye(3) / sparse.prior_information[count:, :, None]
     landmarks = np.array(blocks[count : count + len(point.landmarks)]).reshape(-1, 2, 2)
     return MarginalCovariances(blocks[-1] if len(point.coordinates) else np.zeros((0, 0)), poses, landmarks)
+
+
+def absorbed_freedom(
+    problem: kernels.LeastSquaresProblem,
+    unknowns: kernels.Unknowns,
+    *,
+    poses_free: bool,
+    settings: SparseAdjustmentSettings = SETTINGS,
+) -> float:
+    """Degrees of freedom of the echoes that the unknowns absorb: the trace of the hat matrix of the echoes.
+
+    Without odometry and priors it is the number of unknowns. What odometry and priors determine is not absorbed. The
+    trace is estimated with random signs (Hutchinson), always the same ones.
+    """
+    sparse, point = _SparseProblem(problem, poses_free, settings), _Point.of(unknowns)
+    evaluation = sparse.evaluate(point)[1]
+    cholesky = sparse.structure.factorize(sparse.linearize(point, evaluation)[0])
+    echoes, odometry = evaluation
+    odometry = odometry._replace(residual=np.zeros_like(odometry.residual))
+    rng, traces = np.random.default_rng(0), []
+    for _ in range(settings.trace_probes):
+        signs = rng.choice([-1.0, 1.0], echoes.residual.shape)
+        probe = echoes._replace(residual=signs / np.sqrt(echoes.weight))
+        gradient = sparse.gradient((probe, odometry))
+        traces.append(float(gradient @ cholesky.solve(gradient)))
+    return float(np.mean(traces))
 
 
 class _Point(NamedTuple):
@@ -262,15 +290,7 @@ class _SparseProblem:
         matrix = np.bincount(np.concatenate(index), np.concatenate(values), minlength=structure.nnz)
         matrix = matrix.astype(np.float64, copy=False)  # whole numbers if there is no product
         # 2. Their gradients.
-        gradient = np.zeros(int(structure.begin[-1]))
-        for factors, group in zip(evaluation, self.dependencies, strict=True):
-            weighted = factors.weight * factors.residual
-            for jacobian, (block, term) in zip(factors.jacobians, group, strict=False):
-                if not len(term):
-                    continue
-                by_block = np.einsum("trd,tr->td", jacobian[term], weighted[term])
-                row = structure.begin[block][:, None] + np.arange(by_block.shape[1])
-                gradient += np.bincount(row.ravel(), by_block.ravel(), minlength=len(gradient))
+        gradient = self.gradient(evaluation)
         # 3. The priors.
         pose_change, landmark_change = self._prior_residuals(point)
         information, landmark_sd = self.prior_information[: self.pose_count], self.problem.landmark_prior_sd
@@ -280,6 +300,20 @@ class _SparseProblem:
         )
         by_prior = (information * pose_change[: self.pose_count]).ravel(), landmark_change.ravel() / landmark_sd
         return matrix, gradient - np.concatenate([*by_prior, point.coordinates])
+
+    def gradient(self, evaluation: tuple[_Factors, _Factors]) -> Float[np.ndarray, " unknowns"]:
+        """The negative gradient of the cost of echoes and odometry, without the priors."""
+        structure = self.structure
+        gradient = np.zeros(int(structure.begin[-1]))
+        for factors, group in zip(evaluation, self.dependencies, strict=True):
+            weighted = factors.weight * factors.residual
+            for jacobian, (block, term) in zip(factors.jacobians, group, strict=False):
+                if not len(term):
+                    continue
+                by_block = np.einsum("trd,tr->td", jacobian[term], weighted[term])
+                row = structure.begin[block][:, None] + np.arange(by_block.shape[1])
+                gradient += np.bincount(row.ravel(), by_block.ravel(), minlength=len(gradient))
+        return gradient
 
     def step(
         self,

@@ -107,7 +107,7 @@ def smooth(
         odometry=measured,
         basis=_parameter_basis(ring, speed=speed, scale=scale),
         odometry_noise=odometry_noise or OdometryNoise(),
-        sigma=SETTINGS.sparse_sigma if sigma is None and window is not None else sigma,
+        sigma=sigma,
         window=window,
         models=models,
         traversals=traversals,
