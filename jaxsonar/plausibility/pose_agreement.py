@@ -141,6 +141,45 @@ def select_groups(log: Log) -> list[Int[np.ndarray, "_"]]:
     return groups
 
 
+def part_of_groups(
+    log: Log, groups: Sequence[Int[np.ndarray, "_"]], *, most_echoes: int | None = None
+) -> tuple[Log, list[Int[np.ndarray, "_"]]]:
+    """The echoes of these scans alone, and the groups as rows of this part: descriptions of long logs are then cheap.
+
+    Args:
+        log: the scans.
+        groups: rows of the scans of each group.
+        most_echoes: only as many echoes of each scan, chosen at random; all of them if omitted.
+    """
+    rows = np.sort(np.concatenate(groups)) if len(groups) else np.zeros(0, np.int64)
+    count = np.diff(log.start)[rows]
+    begin = np.cumsum(count) - count
+    scan = np.repeat(np.arange(len(rows)), count)
+    echo = np.arange(len(scan)) + np.repeat(log.start[rows] - begin, count)
+    kept = np.isfinite(log.range[echo])
+    if log.age.any():
+        kept &= ~is_repeated(log)[echo]
+    scan, echo = scan[kept], echo[kept]
+    if most_echoes is not None:
+        order = np.lexsort((np.random.default_rng(SETTINGS.seed).random(len(scan)), scan))
+        place = np.arange(len(scan)) - np.searchsorted(scan, scan)
+        chosen = np.sort(order[place < most_echoes])
+        scan, echo = scan[chosen], echo[chosen]
+    part = Log.from_echoes(
+        scan,
+        log.tx[echo],
+        log.rx[echo],
+        log.range[echo],
+        t=log.t[echo],
+        age=log.age[echo],
+        stamp=log.stamp[rows],
+        pose=log.pose[rows],
+        asked=np.zeros((0, 2), np.int64),
+        odometry=log.motion,
+    )
+    return part, [np.searchsorted(rows, group) for group in groups]
+
+
 def agreement(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]] | None = None) -> Agreement:
     """Find the echoes of a log that other scans explain, given the poses of the log.
 

@@ -1,0 +1,195 @@
+"""Corrections of logs: mistakes in units, headings, axes and the numbering of sensors, undone."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.sensors.ring import Ring
+
+
+@dataclass(frozen=True)
+class CorrectionSettings:
+    """Which corrections are tried. Chosen by hand."""
+
+    least_extent: float = 0.05
+    """A robot whose trajectory is smaller than this in another unit does not move, metres: the unit is not tried."""
+    even: float = float(np.radians(0.5))
+    """A ring is evenly spaced if no heading differs by more, radians."""
+
+
+SETTINGS = CorrectionSettings()
+
+Poses = Float[np.ndarray, "poses 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """One mistake in the description of a log, and how it is undone."""
+
+    kind: str
+    """Kind of the mistake, as in ``Implausibility``."""
+    mistake: str
+    """The mistake in words, such as "the headings are in degrees"."""
+    remedy: str
+    """What to do."""
+    apply: Callable[[Log], Log]
+    """Gives the corrected log; it has the same scans and readings in the same order."""
+    equivalents: tuple[str, ...] = ()
+    """Other mistakes with the same effect, in words."""
+
+
+def heading_corrections() -> list[Correction]:
+    """Headings in degrees, clockwise, or as a compass shows them."""
+    tables = "of a table, give --angle-unit deg"
+    degrees = "give them in radians (log x pi / 180)"
+    found = []
+    for kind, mistake, remedy, unit, sign, offset in (
+        ("heading unit", "the headings are in degrees", f"{degrees}; {tables}", np.pi / 180, 1, 0.0),
+        (
+            "heading direction",
+            "the headings grow clockwise",
+            "negate theta; of a table, give --clockwise",
+            1.0,
+            -1,
+            0.0,
+        ),
+        (
+            "heading direction",
+            "the headings are compass headings, clockwise from the y axis",
+            "give pi / 2 - theta; of a table, give --compass",
+            1.0,
+            -1,
+            np.pi / 2,
+        ),
+        (
+            "heading unit",
+            "the headings are in degrees and grow clockwise",
+            f"negate them and {degrees}; {tables} --clockwise",
+            np.pi / 180,
+            -1,
+            0.0,
+        ),
+        (
+            "heading unit",
+            "the headings are compass headings in degrees, clockwise from the y axis",
+            f"subtract them from 90 and {degrees}; {tables} --compass",
+            np.pi / 180,
+            -1,
+            np.pi / 2,
+        ),
+    ):
+        found.append(Correction(kind, mistake, remedy, _headings(unit * sign, offset)))
+    return found
+
+
+def axis_corrections() -> list[Correction]:
+    """Axes of the positions that are swapped or negated."""
+
+    def positions(matrix: list[list[float]]) -> Callable[[Log], Log]:
+        return _poses(lambda pose: np.column_stack([pose[:, :2] @ np.array(matrix).T, pose[:, 2]]))
+
+    return [
+        Correction("axes", "x and y of the poses are swapped", "swap them", positions([[0.0, 1.0], [1.0, 0.0]])),
+        Correction(
+            "axes",
+            "y of the poses is negated",
+            "y must grow to the left of x: negate it; of a table, give --y-right",
+            positions([[1.0, 0.0], [0.0, -1.0]]),
+        ),
+        Correction("axes", "x of the poses is negated", "negate it", positions([[-1.0, 0.0], [0.0, 1.0]])),
+    ]
+
+
+def pose_unit_corrections(log: Log) -> list[Correction]:
+    """Positions in millimetres or centimetres, if the robot moves at all in this unit."""
+    position = log.pose[np.isfinite(log.pose).all(axis=1), :2]
+    extent = float(np.ptp(position, axis=0).max()) if len(position) else 0.0
+    found = []
+    for unit, name, short in ((1e-3, "millimetres", "mm"), (1e-2, "centimetres", "cm")):
+        if extent * unit >= SETTINGS.least_extent:
+            scale = np.array([unit, unit, 1.0])
+            remedy = f"give metres: divide x and y by {1 / unit:g}; of a table, give --pose-unit {short}"
+            apply = _poses(lambda pose, scale=scale: pose * scale)
+            found.append(Correction("pose unit", f"x and y of the poses are in {name}", remedy, apply))
+    return found
+
+
+def turned_rings(ring: Ring) -> list[Correction]:
+    """A ring that is mounted at another angle, which no renumbering of its sensors describes."""
+    angles = [np.pi / ring.count, -np.pi / ring.count] if _is_even(ring) else [np.pi / 2, -np.pi / 2, np.pi]
+    found = []
+    for angle in angles:
+        degrees = f"{np.degrees(angle):+.4g} deg"
+        remedy = f"add {degrees} to the headings of the ring, and turn its positions likewise"
+        found.append(Correction("first sensor", f"the ring is turned by {degrees}", remedy, _headings(1.0, angle)))
+    return found
+
+
+def renumbering(ring: Ring, shift: int, *, clockwise: bool) -> Correction:
+    """Another numbering of the sensors.
+
+    Args:
+        ring: the sensors.
+        shift: sensor k of the log is sensor k + shift of the ring, modulo the number of sensors; ...
+        clockwise: ... or sensor shift - k.
+    """
+    count = ring.count
+    order = ((-1 if clockwise else 1) * np.arange(count) + shift) % count
+    apply = _renumbered(order)
+    if clockwise:
+        first = f", from sensor {shift} of the ring" if shift else ""
+        remedy = f"replace the sensor numbers k by {shift or count} - k (modulo {count}) in tx and rx"
+        frame = ("y and the headings are those of a frame with z down",) if not shift else ()
+        return Correction("sensor order", f"the sensors are numbered clockwise{first}", remedy, apply, frame)
+    if shift == count - 1:
+        other = f"the ring is turned by one sensor{_angle(ring, -1)}"
+        remedy = "subtract 1 from tx and rx, or turn the headings of the ring"
+        return Correction("first sensor", "the sensors are numbered from 1", remedy, apply, (other,))
+    by = shift if shift <= count // 2 else shift - count
+    plural = "s" * (abs(by) != 1)
+    mistake = f"the ring is turned by {abs(by)} sensor{plural}{_angle(ring, by)}"
+    remedy = f"add {shift} to tx and rx (modulo {count}), or turn the headings of the ring"
+    half = ("x and y of the poses are both negated",) if _is_even(ring) and 2 * shift == count else ()
+    return Correction("first sensor", mistake, remedy, apply, half)
+
+
+def _angle(ring: Ring, shift: int) -> str:
+    """The angle of a shift in an evenly spaced ring, in words."""
+    return f" ({shift * 360 / ring.count:+.4g} deg)" if _is_even(ring) else ""
+
+
+def _is_even(ring: Ring) -> bool:
+    """Whether the sensors are evenly spaced, counter-clockwise."""
+    steps = wrap_angle(np.diff(np.asarray(ring.heading)) - 2 * np.pi / ring.count)
+    return bool((np.abs(steps) < SETTINGS.even).all())
+
+
+def _headings(scale: float, offset: float) -> Callable[[Log], Log]:
+    return _poses(lambda pose: np.column_stack([pose[:, :2], offset + scale * pose[:, 2]]))
+
+
+def _poses(change: Callable[[Poses], Poses]) -> Callable[[Log], Log]:
+    """A change of all poses of a log, those of its odometry included."""
+
+    def apply(log: Log) -> Log:
+        motion = log.motion
+        samples = None if motion is None else np.column_stack([motion[:, 0], change(motion[:, 1:])])
+        return replace(log, pose=change(log.pose), odometry=samples)
+
+    return apply
+
+
+def _renumbered(order: Int[np.ndarray, " sensors"]) -> Callable[[Log], Log]:
+    """Other numbers of sensors: k becomes ``order[k]``, and the first number beyond the ring that of sensor 0."""
+
+    def renumber(sensor: np.ndarray) -> np.ndarray:
+        return np.where(sensor <= len(order), order[sensor % len(order)], sensor)
+
+    def apply(log: Log) -> Log:
+        return replace(log, tx=renumber(log.tx), rx=renumber(log.rx), asked=renumber(log.asked))
+
+    return apply
