@@ -36,6 +36,7 @@ WORKLOADS = {
     "streaming": ("quick_metrics.of_streaming", "a device on a TCP link"),
     "calibration": ("quick_metrics.of_calibration", "calibration of a ring"),
     "accuracy": ("quick_metrics.of_accuracy", "recall, false lines and errors of the detection"),
+    "diagnosis": ("quick_metrics.of_diagnosis", "findings of the health check, warnings about inputs"),
     "device": ("speed.cpu_vs_gpu.measure", "a long batch on a GPU and on the CPU"),
 }
 DEFAULT_WORKLOADS = {

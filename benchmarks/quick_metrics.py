@@ -12,6 +12,10 @@ from benchmarks.detection.conditions import BASE
 from benchmarks.detection.methods import METHODS
 from benchmarks.detection.scenarios import POSES, random_scans
 from benchmarks.detection.scoring import score
+from benchmarks.diagnostics.confusion import outcome as diagnosis
+from benchmarks.diagnostics.faults import FAULTS, case
+from benchmarks.diagnostics.mistakes import WORDS, sound_inputs
+from benchmarks.diagnostics.warning_rates import warned, wrong_of
 from benchmarks.mapping import segment_merging as merging
 from benchmarks.metrics import RATIO, Metric, Options
 from benchmarks.speed import timing
@@ -97,3 +101,23 @@ def of_accuracy(options: Options) -> list[Metric]:
         metrics.append(Metric(f"accuracy.{method}.recall", 100 * found["recall"], "%", "higher"))
         metrics.append(Metric(f"accuracy.{method}.false", found["false_per_scan"], "lines/scan"))
     return [one for one in metrics if np.isfinite(one.value)]
+
+
+def of_diagnosis(options: Options) -> list[Metric]:
+    """Shares of correct findings of the health check, of named mistakes in inputs, and of false alarms."""
+    logs, inputs = options.pick(gate=1, quick=1, full=4), options.pick(gate=1, quick=1, full=3)
+    seeds = range(options.seed, options.seed + max(logs, inputs))
+    found = [diagnosis(case(cause, seed)) for seed in seeds[:logs] for cause in FAULTS]
+    named = [wrong_of(name, seed).result == "named" for seed in seeds[:inputs] for name in WORDS]
+    alarms = [warned(one).result != "silent" for one in sound_inputs(options.seed)]
+    shares = {
+        "correct": [one.result == "correct" for one in found],
+        "accused": [bool(one.accused) for one in found],
+        "named": named,
+        "alarms": alarms,
+    }
+    direction = {"correct": "higher", "named": "higher"}
+    return [
+        Metric(f"diagnosis.{name}", 100 * float(np.mean(values)), "%", direction.get(name, "lower"))
+        for name, values in shares.items()
+    ]

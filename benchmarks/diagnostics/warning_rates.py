@@ -5,6 +5,7 @@ Run ``python -m benchmarks.diagnostics.warning_rates [--quick] [--only NAME ...]
 
 import argparse
 import importlib
+import importlib.util
 import json
 import re
 import time
@@ -76,10 +77,9 @@ def warnings_about(one: Input) -> Iterator[str]:
 
 
 def _texts(name: str, call: Callable[[Any], Iterable[Any]]) -> Iterator[str]:
-    """Warnings of a public function; none from a version that lacks it."""
-    function = getattr(importlib.import_module("jaxsonar.plausibility"), name, None)
-    if function is not None:
-        yield from map(str, call(function))
+    """Warnings of a function of the package ``plausibility``; none from a version that lacks it."""
+    if importlib.util.find_spec(f"jaxsonar.plausibility.{name}") is not None:
+        yield from map(str, call(getattr(importlib.import_module(f"jaxsonar.plausibility.{name}"), name)))
 
 
 def wrong_of(name: str, seed: int) -> Warned:
