@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
 from jaxsonar.plausibility.implausibility import Implausibility
+from jaxsonar.plausibility.implausible_ring import implausible_ring
 from jaxsonar.plausibility.implausible_stamps import implausible_stamps
 from jaxsonar.plausibility.range_units import find_range_unit
+from jaxsonar.plausibility.robot_echoes import find_robot_echoes, without_robot_echoes
 from jaxsonar.plausibility.unheard_paths import unheard_warning
 from jaxsonar.scans.no_echo_values import NoEchoValue, find_no_echo_values, without_no_echo_values
 from jaxsonar.scans.scan_log import Log
@@ -32,6 +34,7 @@ class PreparedLog:
         - Ranges that mean no echo (``find_no_echo_values``) become silent readings.
         - Firings that are scans of their own are merged into scans (``group_firings``).
         - Readings that repeat the last range because the sensor heard nothing get an age (``find_held_readings``).
+        - Echoes that move with the robot are removed (``find_robot_echoes``).
 
         A probable mistake in the units or the numbering of a log is reported, but not corrected.
 
@@ -53,7 +56,11 @@ class PreparedLog:
             remedy = "let the driver report nothing instead"
             warnings.append(Implausibility("held readings", held.describe(), "each range counts once", remedy))
         prepared = with_ages(grouped, held)
-        if unit := find_range_unit(ring, prepared):
+        if robot := find_robot_echoes(ring, prepared):
+            warnings.append(robot.warning())
+            prepared = without_robot_echoes(prepared, robot)
+        # Nothing is concluded from a ring that is wrong itself.
+        if not any(implausible_ring(ring)) and (unit := find_range_unit(ring, prepared)):
             warnings.append(unit.implausibility)
         return cls(prepared, tuple(warnings), tuple(notes))
 

@@ -1,18 +1,21 @@
 """Echoes that move with the robot: its own body, a cable, the floor. They are no walls.
 
-Such an echo has the same range wherever the robot is. A constant range alone is no proof: a sensor reads one range along
-a whole wall. The echo of a wall is recognized by geometry. After the robot has moved so that none of the walls and points
-that may have caused the echo so far can have kept its range, an echo of a wall is gone, and an echo of the robot is not.
+Such an echo has the same range wherever the robot is. A constant range alone is no proof: a sensor reads one range
+along a whole wall. Geometry tells the difference. After the robot has moved so that none of the walls and points that
+may have caused the echo so far can have kept its range, an echo of a wall is gone, and an echo of the robot is not.
+Without poses, only the other echoes tell how far the robot has moved.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.se2 import wrap_angle
-from jaxsonar.plausibility.constant_ranges import may_stay, range_resolution
+from jaxsonar.plausibility.constant_ranges import range_resolution
+from jaxsonar.plausibility.implausibility import Implausibility
+from jaxsonar.plausibility.robot_echo_evidence import distinct_views, independent_places, is_contradicted
 from jaxsonar.scans.firing_poses import reading_poses
 from jaxsonar.scans.measured_paths import measured_paths, path_rows
 from jaxsonar.scans.readings import explicit_log, is_repeated, without_readings
@@ -22,7 +25,7 @@ from jaxsonar.sensors.ring import Ring
 
 @dataclass(frozen=True)
 class RobotEchoSettings:
-    """Constants of the search for echoes of the robot. Chosen by hand on simulated rooms and rings."""
+    """Constants of the search for constant ranges. Chosen by hand on simulated rooms and rings."""
 
     spacing: float = 0.08
     """Scans that are compared lie apart by this distance, metres, ..."""
@@ -30,10 +33,16 @@ class RobotEchoSettings:
     """... or by this rotation, radians."""
     most_scans: int = 300
     """Largest number of compared scans, spread over the log."""
+    min_scans: int = 6
+    """Smallest number of them."""
+    windows: int = 3
+    """Number of constant ranges of one path that are examined; a wall may have more echoes than the robot."""
     half_widths: tuple[float, ...] = (0.006, 0.012, 0.025, 0.04)
     """Half widths of a window in the ranges of a path that are tried, metres; from exact echoes to those of a rough
     floor."""
-    present: float = 0.5
+    max_half_width: float = 0.16
+    """Largest distance from the constant range, metres."""
+    present: float = 0.6
     """Share of the measurements of a path that have an echo in the window, at least. A nearer echo may hide it;
     measurements with nearer echoes only do not count, ..."""
     present_in_all: float = 0.2
@@ -46,20 +55,27 @@ class RobotEchoSettings:
     """Smallest distance, in units of the resolution of the ranges."""
     contrast: float = 3.0
     """A constant range has this many times as many echoes as a window of equal width on either side."""
-    min_change: float = 0.03
-    """Change of the range of a wall from which on it must show, metres; larger than the errors of odometry within a few
-    scans."""
-    places: int = 6
-    """Number of poses, none of which shares a possible wall or point with another, at which the echo must be."""
-    enough: int = 18
-    """The search ends after this many."""
-    returned: float = 0.6
-    """After the robot has left all walls and points that may have caused the echo, the next measurements have the echo
-    with this probability, at least."""
-    extent: float = 0.25
-    """Distance between two of these poses, at least, metres. A robot that only turns may be in a regular room."""
-    floor: float = 0.6
-    """Share of the sensors with an echo of the robot, from which on the floor is the likely cause."""
+    alike: float = 0.03
+    """Constant ranges of a path and of its reverse path, or of the sensors around the robot, differ by at most this,
+    metres, ..."""
+    alike_relative: float = 0.05
+    """... or by this share of the range."""
+    most: float = 0.5
+    """Share of the sensors with an echo of the robot, from which on the floor is the likely cause; and share of the
+    paths with a constant range that prove it for the others."""
+    around: float = 0.3
+    """These are at least this share of the sensors of the ring."""
+    most_without_poses: float = 0.7
+    """Share of the sensors with one constant range, from which on no walls can be the cause, without poses."""
+    hidden: float = 0.5
+    """Without poses, a path that hears something nearer in more than this share of its measurements contradicts no
+    wall, ..."""
+    near: float = 0.8
+    """... and none contradicts a wall farther away than this multiple of the maximum range."""
+    floor_sensors: int = 3
+    """Smallest number of sensors that hear the floor."""
+    listed: int = 4
+    """Number of paths that a warning names."""
 
 
 SETTINGS = RobotEchoSettings()
@@ -84,12 +100,12 @@ class RobotEcho:
     share: float
     """Share of the measurements of the path that have it."""
     places: int
-    """Number of poses that have no possible wall or point in common and at which the echo was received."""
+    """Number of poses that have no possible wall or point in common and at which the echo was received, or of scans
+    without common echoes in a log without poses; 0 if only other paths prove it."""
 
     def __str__(self) -> str:
         who = f"sensor {self.tx}" if self.tx == self.rx else f"path {self.tx} to {self.rx}"
-        noise = f" +- {self.sigma:.3f}" if self.sigma else ""
-        return f"{who} {self.range:.3f}{noise} m"
+        return f"{who} reads {self.range:.3f} +- {self.sigma:.3f} m in {self.share:.0%} of its measurements"
 
 
 @dataclass(frozen=True)
@@ -97,9 +113,9 @@ class RobotEchoes:
     """All echoes of a log that move with the robot. False if there are none."""
 
     echoes: tuple[RobotEcho, ...]
-    """One for each path and range, by path."""
+    """One or more for each path, by path."""
     is_floor: bool
-    """Whether most sensors have one, so that the floor is the likely cause."""
+    """Whether half of the sensors have one, so that the floor is the likely cause."""
 
     def __bool__(self) -> bool:
         return bool(self.echoes)
@@ -117,28 +133,51 @@ class RobotEchoes:
             found |= of_path & (np.abs(log.range - one.range) <= one.half_width)  # False for NaN
         return found
 
+    def warning(self) -> Implausibility:
+        """The finding as a warning."""
+        # Cross echoes of a sensor that is named are not listed.
+        direct = self.sensors
+        named = [one for one in self.echoes if one.tx == one.rx or not {one.tx, one.rx} & set(direct)]
+        if len(direct) > SETTINGS.listed:
+            ranges = [one.range for one in named if one.tx == one.rx]
+            listed = f"{len(direct)} sensors read a constant range of {min(ranges):.3f} to {max(ranges):.3f} m"
+        else:
+            listed = ", ".join(map(str, named[: SETTINGS.listed])) + ", ..." * (len(named) > SETTINGS.listed)
+        cause = (
+            "they probably hear the floor" if self.is_floor else "probably the robot's own body, a cable or the floor"
+        )
+        remedy = "these echoes are left out; mount the sensors so that they do not hear it"
+        return Implausibility("robot echo", f"{listed}, wherever the robot is", cause, remedy)
+
 
 def find_robot_echoes(ring: Ring, log: Log) -> RobotEchoes:
     """Find echoes that have the same range wherever the robot is.
 
     A path has such an echo if all this is true:
 
-    - Most of its measurements have an echo in a narrow window, and few just beside it.
+    - Most of its measurements have an echo in a narrow window, and few just beside it. Measurements with nearer echoes
+      only do not count.
     - The robot was at several poses, of which no two can have received the echo from one wall or point (``may_stay``),
       and the echo was there.
-    - Whenever the robot had left all walls and points that may have caused the echo before, most of the next
-      measurements had it again.
+    - Whenever the robot had left all walls and points that may have caused the echo before, the next measurements had
+      it about as often as all others.
 
-    A robot that rests or only turns gives no statement, and neither does one that only drives along walls.
+    Without poses, the scans must differ in nearly all other echoes, and other sensors that look in the same directions
+    must not have a constant range, or most sensors around the robot have the same one.
+
+    A path that cannot prove this has the echo, too, if its reverse path has it at the same range, or half of the paths
+    with the same distance between transmitter and receiver. A robot that rests or only turns gives no statement, and
+    neither does one that only drives along walls.
 
     Args:
         ring: the sensors; other (tx, rx) pairs are ignored.
         log: the scans. Full scans; see ``group_firings``.
     """
-    found = list(_with_poses(ring, log))
+    search = _Search.of(ring, log)
+    found = _with_companions(ring, list(search.with_poses() if search.has_poses else search.without_poses()))
     direct = {one.tx for one in found if one.tx == one.rx}
-    measured = {int(tx) for tx, rx in zip(log.tx, log.rx, strict=True) if tx == rx}
-    return RobotEchoes(tuple(found), bool(found) and len(direct) >= max(2, SETTINGS.floor * len(measured)))
+    measured = np.unique(log.tx[log.tx == log.rx])
+    return RobotEchoes(tuple(found), len(direct) >= max(SETTINGS.floor_sensors, SETTINGS.most * len(measured)))
 
 
 def without_robot_echoes(log: Log, found: RobotEchoes) -> Log:
@@ -154,53 +193,142 @@ def without_robot_echoes(log: Log, found: RobotEchoes) -> Log:
     return without_readings(log, found.mask(log))
 
 
-def _with_poses(ring: Ring, log: Log) -> Iterator[RobotEcho]:
-    """The echoes of the robot in a log with poses."""
-    chosen = _spaced_scans(log.pose)
-    if len(chosen) < SETTINGS.places:
-        return
-    path = path_rows(ring, log.tx, log.rx)
-    used = (path >= 0) & np.isfinite(log.range) & ~is_repeated(log)
-    compared = np.zeros(len(log), bool)
-    compared[chosen] = True
-    row = np.flatnonzero(used & compared[log.echo_scan])
-    row = row[np.lexsort((log.range[row], path[row]))]
-    measured = measured_paths(ring, log)
-    number, resolution = measured[chosen].sum(axis=0), range_resolution(log.range[row])
-    edges = np.searchsorted(path[row], np.arange(len(ring.paths) + 1))
-    pose = reading_poses(log)
-    for one in range(len(ring.paths)):
-        mine = row[edges[one] : edges[one + 1]]
-        if number[one] < SETTINGS.places:
-            continue
-        window = _window(log.range[mine], int(number[one]), resolution)
-        if window is None:
-            continue
-        center, sigma, half_width = window
-        hit = mine[np.abs(log.range[mine] - center) <= half_width]
-        # The pose of each measurement, and whether it has the echo. A measurement with nearer echoes only is neither.
-        scan = chosen[measured[chosen, one]]
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """A constant range of a path, in the scans that are compared."""
+
+    echo: RobotEcho
+    path: int
+    scan: Int[np.ndarray, " measurements"]
+    """Rows of the scans that tell something about it: with the echo, or without a nearer one only."""
+    has_echo: Bool[np.ndarray, " measurements"]
+    pose: Float[np.ndarray, "measurements 3"]
+    """world_from_robot of these measurements; NaN if unknown."""
+    rows: Int[np.ndarray, " echoes"]
+    """Rows of the log of the echoes."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Echoes of the scans that are compared."""
+
+    ring: Ring
+    log: Log
+    has_poses: bool
+    chosen: Int[np.ndarray, " chosen"]
+    """Rows of these scans."""
+    measured: Bool[np.ndarray, "scans paths"]
+    """Paths that each scan of the log measured."""
+    path: Int[np.ndarray, " readings"]
+    """Row of ``Ring.paths`` of each reading of the log; -1: none, or not an echo."""
+    row: Int[np.ndarray, " echoes"]
+    """Rows of the log of the echoes of the chosen scans, by path and range."""
+
+    @classmethod
+    def of(cls, ring: Ring, log: Log) -> "_Search":
+        has_poses = bool(np.isfinite(log.pose).any())
+        chosen = _spaced_scans(log.pose) if has_poses else np.arange(len(log))
+        if len(chosen) > SETTINGS.most_scans:
+            chosen = chosen[np.linspace(0, len(chosen) - 1, SETTINGS.most_scans).astype(np.int64)]
+        path = path_rows(ring, log.tx, log.rx)
+        path[~np.isfinite(log.range) | is_repeated(log)] = -1
+        row = np.flatnonzero((path >= 0) & np.isin(log.echo_scan, chosen))
+        row = row[np.lexsort((log.range[row], path[row]))]
+        return cls(ring, log, has_poses, chosen, measured_paths(ring, log), path, row)
+
+    def with_poses(self) -> Iterator[RobotEcho]:
+        """Constant ranges of paths; ``places`` is 0 if they may be of walls."""
+        for one in self.windows():
+            tx, rx = self.ring.paths[one.path]
+            distance = float(self.ring.corrected(one.echo.range, tx, rx))
+            places = independent_places(self.ring, one.path, distance, one.echo.half_width, one.pose, one.has_echo)
+            yield replace(one.echo, places=places)
+
+    def without_poses(self) -> Iterator[RobotEcho]:
+        """As ``with_poses``, for a log without poses."""
+        windows = list(self.windows())
+        if not windows:
+            return
+        # The first echo of each path that is not constant.
+        constant = np.unique(np.concatenate([one.rows for one in windows]))
+        row = np.setdiff1d(self.row, constant)
+        first = np.full((len(self.log), len(self.ring.paths)), np.inf)
+        np.minimum.at(first, (self.log.echo_scan[row], self.path[row]), self.log.range[row])
+        first = np.where(np.isfinite(first), first, np.nan)
+        of_path = np.zeros(len(self.ring.paths), bool)
+        of_path[[one.path for one in windows]] = True
+        number, reach = self.measured[self.chosen].sum(axis=0), self.ring.max_range
+        measured = number > 0
+        direct = np.array([one.echo.range for one in windows if one.echo.tx == one.echo.rx])
+        sensors = int(measured[: self.ring.count].sum())  # the first paths are the direct ones
+        for one in windows:
+            alike = int((np.abs(direct - one.echo.range) <= _tolerance(one.echo.range)).sum())
+            around = alike >= max(SETTINGS.floor_sensors, SETTINGS.most_without_poses * sensors)
+            hidden = (first[self.chosen] < one.echo.range).sum(axis=0) > SETTINGS.hidden * number
+            near = float(self.ring.corrected(one.echo.range, one.echo.tx, one.echo.rx)) < SETTINGS.near * reach
+            clear = near and is_contradicted(self.ring, one.path, of_path, measured & ~hidden)
+            if not around and not clear:
+                yield one.echo
+                continue
+            tells, has_echo = np.zeros(len(self.log), bool), np.zeros(len(self.log), bool)
+            tells[one.scan], has_echo[one.scan] = True, one.has_echo
+            places = distinct_views(first[self.chosen], tells[self.chosen], has_echo[self.chosen])
+            yield replace(one.echo, places=places)
+
+    def windows(self) -> Iterator[_Window]:
+        """Constant ranges of all paths."""
+        if len(self.chosen) < SETTINGS.min_scans:
+            return
+        path, reported, pose = self.path[self.row], self.log.range, reading_poses(self.log)
+        number, resolution = self.measured[self.chosen].sum(axis=0), range_resolution(reported[self.row])
+        edges = np.searchsorted(path, np.arange(len(self.ring.paths) + 1))
+        for one in np.flatnonzero(number >= SETTINGS.min_scans).tolist():
+            rest = rows = self.row[edges[one] : edges[one + 1]]
+            for _ in range(SETTINGS.windows):
+                found = _fullest_window(reported[rest], int(number[one]), resolution)
+                if found is None:
+                    break
+                inside = np.abs(reported[rest] - found[0]) <= found[2]
+                if (window := self._window(one, found, rows, rest[inside], pose)) is not None:
+                    yield window
+                rest = rest[~inside]
+
+    def _window(
+        self,
+        path: int,
+        found: tuple[float, float, float],
+        rows: Int[np.ndarray, " echoes"],
+        inside: Int[np.ndarray, " inside"],
+        pose: Float[np.ndarray, "readings 3"],
+    ) -> _Window | None:
+        """A constant range of a path (center, standard deviation, half width); None if too few measurements have it.
+
+        Args:
+            path: row of ``Ring.paths``.
+            found: center, standard deviation, half width, metres.
+            rows: rows of the log of all echoes of the path, by range.
+            inside: those in the window.
+            pose: of all readings.
+        """
+        log, (center, sigma, half_width) = self.log, found
+        scan = self.chosen[self.measured[self.chosen, path]]
         at, has_echo, farthest = log.pose[scan].copy(), np.zeros(len(scan), bool), np.full(len(scan), np.inf)
-        last = np.unique(log.echo_scan[mine][::-1], return_index=True)
-        farthest[np.searchsorted(scan, last[0])] = log.range[mine][::-1][last[1]]
-        position = np.searchsorted(scan, log.echo_scan[hit])
-        at[position], has_echo[position] = pose[hit], True
+        heard, last = np.unique(log.echo_scan[rows][::-1], return_index=True)
+        farthest[np.searchsorted(scan, heard)] = log.range[rows][::-1][last]
+        place = np.searchsorted(scan, log.echo_scan[inside])
+        at[place], has_echo[place] = pose[inside], True
         tells = has_echo | (farthest > center)
-        if has_echo.sum() < max(SETTINGS.present * tells.sum(), SETTINGS.places):
-            continue
-        at, has_echo = at[tells], has_echo[tells]
-        places = _independent_places(ring, one, center, half_width, at, has_echo)
-        if not places:
-            continue
-        tx, rx = ring.paths[one].tolist()
-        all_of_path = used & (path == one) & (np.abs(log.range - center) <= half_width)
-        readings = int(all_of_path.sum())
-        share = len(np.unique(log.echo_scan[all_of_path])) / int(measured[:, one].sum())
-        yield RobotEcho(tx, rx, center, sigma, half_width, readings, share, places)
+        if has_echo.sum() < max(SETTINGS.present * tells.sum(), SETTINGS.min_scans):
+            return None
+        tx, rx = self.ring.paths[path].tolist()
+        everywhere = (self.path == path) & (np.abs(log.range - center) <= half_width)
+        share = len(np.unique(log.echo_scan[everywhere])) / int(self.measured[:, path].sum())
+        echo = RobotEcho(tx, rx, center, sigma, half_width, int(everywhere.sum()), share, 0)
+        return _Window(echo, path, scan[tells], has_echo[tells], at[tells], inside)
 
 
 def _spaced_scans(pose: Float[np.ndarray, "scans 3"]) -> Int[np.ndarray, " chosen"]:
-    """Scans that lie apart from the one before, spread over the trajectory."""
+    """Scans with a pose that lie apart from the one before."""
     chosen: list[int] = []
     x, y, theta = pose.T
     last = np.full(3, np.nan)
@@ -209,16 +337,13 @@ def _spaced_scans(pose: Float[np.ndarray, "scans 3"]) -> Int[np.ndarray, " chose
         if far or abs(wrap_angle(theta[k] - last[2])) >= SETTINGS.rotation or not chosen:
             chosen.append(k)
             last = pose[k]
-    rows = np.array(chosen, np.int64)
-    if len(rows) > SETTINGS.most_scans:
-        rows = rows[np.linspace(0, len(rows) - 1, SETTINGS.most_scans).astype(np.int64)]
-    return rows
+    return np.array(chosen, np.int64)
 
 
-def _window(
+def _fullest_window(
     ordered: Float[np.ndarray, " echoes"], measurements: int, resolution: float
 ) -> tuple[float, float, float] | None:
-    """Center, standard deviation and half width (metres) of a window that holds one echo of most measurements.
+    """Center, standard deviation and half width (metres) of a narrow window that holds many echoes; None if none does.
 
     Args:
         ordered: ranges of a path, ascending, metres.
@@ -226,9 +351,7 @@ def _window(
         resolution: of the ranges, metres.
     """
     least = SETTINGS.present_in_all * measurements
-    if len(ordered) < least:
-        return None
-    for trial in SETTINGS.half_widths:
+    for trial in SETTINGS.half_widths if len(ordered) >= max(least, 1) else ():
         end = np.searchsorted(ordered, ordered + 2 * trial, side="right")
         begin = int(np.argmax(end - np.arange(len(ordered))))
         if end[begin] - begin < least:
@@ -242,44 +365,31 @@ def _window(
         deviation = ordered - center
         inside = int((np.abs(deviation) <= half_width).sum())
         beside = max(int(((side > half_width) & (side <= 3 * half_width)).sum()) for side in (deviation, -deviation))
-        if half_width <= 4 * SETTINGS.half_widths[-1] and inside >= max(least, SETTINGS.contrast * beside):
+        if half_width <= SETTINGS.max_half_width and inside >= max(least, SETTINGS.contrast * beside):
             return center, sigma, half_width
         return None
     return None
 
 
-def _independent_places(
-    ring: Ring,
-    path: int,
-    distance: float,
-    half_width: float,
-    pose: Float[np.ndarray, "measurements 3"],
-    has_echo: Bool[np.ndarray, " measurements"],
-) -> int:
-    """Number of poses at which the echo cannot have come from a common wall or point; 0 if they prove nothing.
+def _with_companions(ring: Ring, candidates: list[RobotEcho]) -> list[RobotEcho]:
+    """The proven candidates, and those that have the range of a proven reverse path or of most paths like them."""
+    proven: dict[tuple[int, int], float] = {(one.tx, one.rx): one.range for one in candidates if one.places}
+    if not proven:
+        return []
+    offset = {(one.tx, one.rx): (one.rx - one.tx) % ring.count for one in candidates}
+    found = []
+    for one in candidates:
+        pair, reverse = (one.tx, one.rx), (one.rx, one.tx)
+        similar = [key for key, value in offset.items() if value == offset[pair]]
+        of_these = [proven[key] for key in similar if key in proven]
+        expected = [proven[reverse]] if reverse in proven and reverse != pair else []
+        if len(of_these) >= max(2, SETTINGS.most * len(similar), SETTINGS.around * ring.count):
+            expected.append(float(np.median(of_these)))
+        if one.places or any(abs(one.range - other) <= _tolerance(one.range) for other in expected):
+            found.append(one)
+    return found
 
-    Args:
-        ring: the sensors.
-        path: row of ``Ring.paths``.
-        distance: the constant range, metres.
-        half_width: half width of the window, metres.
-        pose: world_from_robot of the measurements of the path.
-        has_echo: whether each measurement has the echo.
-    """
-    margin = max(SETTINGS.min_change, 2 * half_width)
-    explained, places, lost, k = np.zeros(len(pose), bool), [], 0, 0
-    while len(places) < SETTINGS.enough and len(fresh := np.flatnonzero(~explained[k:])):
-        k += int(fresh[0])
-        if not has_echo[k]:
-            lost += 1
-            k += 1
-            continue
-        places.append(k)
-        here = np.broadcast_to(pose[k], pose[k:].shape)
-        count = len(here)
-        explained[k:] |= may_stay(ring, np.full(count, path), np.full(count, distance), here, pose[k:], margin)
-        explained[k] = True
-    if len(places) < SETTINGS.places or len(places) < SETTINGS.returned * (len(places) + lost):
-        return 0
-    extent = float(np.hypot(*np.ptp(pose[places, :2], axis=0)))
-    return len(places) if extent >= SETTINGS.extent else 0
+
+def _tolerance(distance: float) -> float:
+    """Largest difference between similar constant ranges, metres."""
+    return max(SETTINGS.alike, SETTINGS.alike_relative * distance)

@@ -1,0 +1,141 @@
+"""Evidence that a constant range of a path is an echo of the robot: no wall and no point can have caused it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxsonar.plausibility.constant_ranges import may_stay
+from jaxsonar.sensors.ring import Ring
+
+
+@dataclass(frozen=True)
+class RobotEchoEvidenceSettings:
+    """Constants of the evidence for echoes of the robot. Chosen by hand on simulated rooms and rings."""
+
+    min_change: float = 0.03
+    """Change of the range of a wall from which on it must show, metres; larger than the errors of odometry within a few
+    scans."""
+    places: int = 6
+    """Number of poses, none of which shares a possible wall or point with another, at which the echo must be. A robot
+    that drives along the walls of a room at a fixed distance reaches fewer."""
+    enough: int = 18
+    """The search ends after this many."""
+    returned: float = 0.6
+    """After the robot has left all walls and points that may have caused the echo, at least this share of the next
+    measurements has the echo, ..."""
+    returned_relative: float = 0.8
+    """... and at least this multiple of the share of all measurements. Along walls at equal distances, the share of all
+    measurements is larger."""
+    extent: float = 0.25
+    """Extent of these poses, at least, metres. A robot that only turns may be in the middle of a regular room."""
+    same_view: float = 0.2
+    """Two scans show one view if at least this share of the paths that heard something in both has about the same
+    range, ..."""
+    same_range: float = 0.05
+    """... up to this difference, metres."""
+    common_paths: int = 3
+    """Scans with fewer common paths count as one view."""
+    covered: float = 0.95
+    """Share of the detection range of a path that other sensors must cover to contradict a wall."""
+    directions: int = 40
+    """Directions in the detection range that are examined."""
+
+
+SETTINGS = RobotEchoEvidenceSettings()
+
+
+def independent_places(
+    ring: Ring,
+    path: int,
+    distance: float,
+    half_width: float,
+    pose: Float[np.ndarray, "measurements 3"],
+    has_echo: Bool[np.ndarray, " measurements"],
+) -> int:
+    """Number of poses at which an echo cannot have come from a common wall or point; 0 if they prove nothing.
+
+    Args:
+        ring: the sensors.
+        path: row of ``Ring.paths``.
+        distance: the constant range, metres.
+        half_width: tolerance of the range, metres.
+        pose: world_from_robot of the measurements of the path.
+        has_echo: whether each measurement has the echo.
+    """
+    margin = max(SETTINGS.min_change, half_width)
+    explained, places, lost, k = np.zeros(len(pose), bool), [], 0, 0
+    while len(places) < SETTINGS.enough and len(fresh := np.flatnonzero(~explained[k:])):
+        k += int(fresh[0])
+        if not has_echo[k]:
+            lost += 1
+            k += 1
+            continue
+        places.append(k)
+        here = np.broadcast_to(pose[k], pose[k:].shape)
+        count = len(here)
+        explained[k:] |= may_stay(ring, np.full(count, path), np.full(count, distance), here, pose[k:], margin)
+        explained[k] = True
+    if not _is_enough(len(places), lost, float(has_echo.mean())):
+        return 0
+    return len(places) if float(np.hypot(*np.ptp(pose[places, :2], axis=0))) >= SETTINGS.extent else 0
+
+
+def distinct_views(
+    first_echo: Float[np.ndarray, "scans paths"],
+    tells: Bool[np.ndarray, " scans"],
+    has_echo: Bool[np.ndarray, " scans"],
+) -> int:
+    """Number of scans with an echo whose other echoes differ from one another; 0 if they prove nothing.
+
+    Without poses, only the other echoes tell that the robot moves.
+
+    Args:
+        first_echo: range of the first echo that is not constant, metres; NaN if there is none.
+        tells: the scans that measured the path and did not only hear something nearer.
+        has_echo: the scans with the echo.
+    """
+    explained, views, lost, k = ~tells, 0, 0, 0
+    while views < SETTINGS.enough and len(fresh := np.flatnonzero(~explained[k:])):
+        k += int(fresh[0])
+        difference = np.abs(first_echo[k:] - first_echo[k])
+        common = np.isfinite(difference).sum(axis=1)
+        if common[0] < SETTINGS.common_paths:  # this scan shows too little
+            k += 1
+            continue
+        if not has_echo[k]:
+            lost += 1
+            k += 1
+            continue
+        views += 1
+        same = (difference <= SETTINGS.same_range).sum(axis=1)
+        explained[k:] |= (common < SETTINGS.common_paths) | (same >= SETTINGS.same_view * common)
+    return views if _is_enough(views, lost, float(has_echo[tells].mean())) else 0
+
+
+def is_contradicted(
+    ring: Ring, path: int, constant: Bool[np.ndarray, " paths"], looking: Bool[np.ndarray, " paths"]
+) -> bool:
+    """Whether other sensors look in all directions of a path, and none of them has a constant range.
+
+    A wall beside a robot that drives along it has a constant range in all paths that hear it.
+
+    Args:
+        ring: the sensors.
+        path: row of ``Ring.paths``.
+        constant: paths that may have a constant range.
+        looking: paths that were measured and usually heard nothing nearer.
+    """
+    geometry = ring.exact_paths
+    others = ~np.isin(ring.paths, ring.paths[path]).any(axis=1) & looking & (geometry.width > 0)
+    fraction = (np.arange(SETTINGS.directions) + 0.5) / SETTINGS.directions
+    angle = geometry.start[path] + geometry.width[path] * fraction
+    seen = np.mod(angle - geometry.start[others][:, None], 2 * np.pi) < geometry.width[others][:, None]
+    seen_by_constant = seen[constant[others]].any()
+    return bool(geometry.width[path] > 0 and seen.any(axis=0).mean() >= SETTINGS.covered and not seen_by_constant)
+
+
+def _is_enough(found: int, lost: int, share: float) -> bool:
+    """Whether an echo was found again often enough, compared with its share of all measurements."""
+    least = max(SETTINGS.returned, SETTINGS.returned_relative * share)
+    return found >= SETTINGS.places and found >= least * (found + lost)
