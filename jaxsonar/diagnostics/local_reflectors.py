@@ -54,7 +54,7 @@ SETTINGS = LocalReflectorSettings()
 
 @dataclass(frozen=True, eq=False)
 class EchoGroups:
-    """Echoes of groups of consecutive scans. The frame of a group has the axes of the world and its middle as origin."""
+    """Echoes of groups of consecutive scans. The frame of a group has the axes of the world and the middle as origin."""
 
     ring: Ring
     path: Int[np.ndarray, " echoes"]
