@@ -13,6 +13,7 @@ from jaxsonar.geometry.se2 import compose, inverse
 from jaxsonar.graph_slam.slam import Slam
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.loop_closure.closure_candidate import ACCEPTED, WITHDRAWN
+from jaxsonar.plausibility.odometry_jumps import OdometryJump
 from jaxsonar.reports.text import plural
 from jaxsonar.scans.scan_log import Log
 
@@ -94,6 +95,15 @@ def as_json(result: Slam, errors: Errors | None) -> dict[str, Any]:
             }
             for closure in result.closures
         ],
+        "odometry_jumps": [
+            {
+                "scan": jump.scan,
+                "step": jump.step.tolist(),
+                "seconds": jump.seconds if math.isfinite(jump.seconds) else None,
+                "bridged": is_bridged(result, jump),
+            }
+            for jump in result.jumps
+        ],
     }
     table |= {"explained": result.explained.measured, "explained_required": result.explained.required}
     smoothed = result.smoothed
@@ -116,6 +126,24 @@ def _errors_as_json(errors: TrajectoryErrors) -> dict[str, float | int | None]:
     return {key: value if math.isfinite(value) else None for key, value in values.items()}
 
 
+def is_bridged(result: Slam, jump: OdometryJump) -> bool:
+    """Whether the poses before and after a jump of the odometry are in one frame."""
+    return bool(np.isfinite(result.poses[[jump.before, jump.after]]).all())
+
+
+def _jump_lines(result: Slam) -> list[str]:
+    """What happened at the jumps of the odometry."""
+    lines = []
+    for jump in result.jumps:
+        line = f"the odometry jumps {jump}"
+        if is_bridged(result, jump):
+            lines.append(f"{line}; the trajectory continues there by the motion before and after it")
+        else:
+            side = "after" if np.isnan(result.poses[jump.after]).any() else "before"
+            lines.append(f"{line}; the scans {side} it have no pose, because their place is unknown")
+    return lines
+
+
 def summary_lines(result: Slam, errors: Errors | None) -> list[str]:
     """The result as lines of text for the user."""
     states = {state: sum(closure.state == state for closure in result.closures) for state in (ACCEPTED, WITHDRAWN)}
@@ -128,7 +156,8 @@ def summary_lines(result: Slam, errors: Errors | None) -> list[str]:
     if smoothed is None:
         lines.append(str(result.explained))
     else:
-        line = f"range noise {1e3 * smoothed.sigma:.2f} mm; {result.explained}"
+        noise = "" if smoothed.sigma is None else f"range noise {1e3 * smoothed.sigma:.2f} mm; "
+        line = f"{noise}{result.explained}"
         if smoothed.speed_of_sound_sd:
             line += f"; speed of sound {smoothed.ring.speed_of_sound:.2f} +- {smoothed.speed_of_sound_sd:.2f} m/s"
         if any(smoothed.scale_sd):
@@ -139,12 +168,13 @@ def summary_lines(result: Slam, errors: Errors | None) -> list[str]:
             line += f"; scale error of the odometry: distances {distance}, rotations {rotation}"
         lines.append(line)
     covariance = result.trajectory.covariance
-    if covariance is not None:
+    if covariance is not None and len(covariance) > 1:  # the first pose is exact by definition
         sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0))
         lines.append(
             f"standard deviation of the poses (RMS, from the first one): {1e3 * np.hypot(sd[0], sd[1]):.1f} mm, "
             f"{np.degrees(sd[2]):.2f} deg"
         )
+    lines += _jump_lines(result)
     lines += [f"{_ERROR_LABELS[name]}: {_error_text(one)}" for name, one in (errors or {}).items() if one is not None]
     return lines
 

@@ -49,3 +49,5 @@ class AdjustmentResult(NamedTuple):
     """Reported minus predicted range of the inliers, metres; 0 elsewhere."""
     sigma: float
     """Standard deviation of the range noise, metres."""
+    sigma_dof: float = 0.0
+    """Degrees of freedom from which ``sigma`` was estimated; 0 if it was given, or could not be estimated."""

@@ -80,20 +80,21 @@ def gnc_adjust(
     job = _GncJob(ring, data, basis, poses_free, settings)
     # 1. Shrink the scale of the robust loss.
     state, noise = job.anneal(state, initial_scale, sigma)
+    dof = 0.0
     for _ in range(settings.final_rounds):
         # 2. Associate with a fixed gate and minimize.
         found = job.reassociate(state, noise)
         # 3. Estimate the noise from the residuals.
-        dof = _degrees_of_freedom(data, basis, found, poses_free)
+        dof = _degrees_of_freedom(data, basis, found, poses_free, settings)
         if sigma is None and dof > 0:
             noise = max(float(np.sqrt((found.residual**2).sum() / dof)), settings.min_sigma)
         # 4. Correct the kind of points, and remove those that fit neither kind.
         state = remove_misfitting_points(reclassify_points(found), found)
-    return job.reassociate(state, noise)
+    return job.reassociate(state, noise)._replace(sigma_dof=max(dof, 0.0) if sigma is None else 0.0)
 
 
 def _degrees_of_freedom(
-    data: BatchData, basis: ParameterBasis, found: AdjustmentResult, poses_free: bool, settings: GncSettings = SETTINGS
+    data: BatchData, basis: ParameterBasis, found: AdjustmentResult, poses_free: bool, settings: GncSettings
 ) -> float:
     """Number of echoes minus what the unknowns absorb."""
     echoes, landmarks = int(found.used.sum()), np.asarray(found.problem.factors.reflection.first)[found.used]

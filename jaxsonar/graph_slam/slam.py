@@ -17,10 +17,12 @@ from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.robust_adjustment import explained_echoes
 from jaxsonar.estimation.trajectory import Trajectory, stamps_of
 from jaxsonar.graph_slam.initial_poses import InitialPoses, LoopClosure, detect, initial_poses
+from jaxsonar.graph_slam.interrupted_odometry import InterruptedOdometryNoise, continue_odometry
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_evidence import gather_evidence
+from jaxsonar.plausibility.odometry_jumps import OdometryJump
 from jaxsonar.scans.measured_paths import measured_paths
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import check_window
@@ -72,6 +74,9 @@ class Slam:
     """The result of smoothing; None without it."""
     explained: ExplainedShare
     """The share of the echoes that poses and map explain."""
+    jumps: tuple[OdometryJump, ...] = ()
+    """Steps at which the odometry jumps, in rows of the scans. The result does not use them: the motion before and
+    after a jump is continued, if the ranges go on; otherwise the smaller part of the log has no poses."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -126,6 +131,13 @@ def slam(
     report = progress or (lambda task, done, total: None)
     noise = odometry_noise or OdometryNoise()
     log = estimation_log(log)
+    continued = continue_odometry(ring, log)
+    if len(continued.parts) > 1:
+        part = continued.largest_part
+        options = {"sigma": sigma, "window": window, "odometry_noise": odometry_noise, "smooth": smooth}
+        options |= {"speed": speed, "scale": scale, "live": live, "progress": progress}
+        return _of_whole_log(slam(ring, log[part], **options), log, part, continued.jumps)
+    log, odometry = continued.log, log.pose
     has_odometry = np.asarray(np.isfinite(log.pose).all(axis=1))
     if window is None and len(log) and _echoes_of_a_long_wall(ring, log) < SETTINGS.sparse_echoes:
         if not has_odometry.any():
@@ -153,7 +165,7 @@ def slam(
                 window=window,
                 speed=speed,
                 scale=scale,
-                odometry_noise=noise,
+                odometry_noise=InterruptedOdometryNoise(noise, continued.bridged),
                 models=initial.models,
                 traversals=initial.traversals,
                 progress=lambda task: report(task, 0, 0),
@@ -176,7 +188,37 @@ def slam(
             "radians?"
         )
     stamp, closures = stamps_of(log), initial.closures
-    return Slam(poses, covariance, stamp, world, log.pose, closures, initial.step_ms, smoothed, explained)
+    jumps = continued.jumps
+    return Slam(poses, covariance, stamp, world, odometry, closures, initial.step_ms, smoothed, explained, jumps)
+
+
+def _of_whole_log(found: Slam, log: Log, part: slice, jumps: tuple[OdometryJump, ...]) -> Slam:
+    """The result for one part of a log as a result for all scans; those of other parts have no pose."""
+
+    def padded(values: np.ndarray, fill: float) -> np.ndarray:
+        whole = np.full((len(log), *values.shape[1:]), fill, dtype=values.dtype)
+        whole[part] = values
+        return whole
+
+    smoothed = found.smoothed
+    if smoothed is not None:
+        smoothed = replace(
+            smoothed,
+            poses=padded(smoothed.poses, np.nan),
+            pose_cov=padded(smoothed.pose_cov, np.nan),
+            explained_counts=padded(smoothed.explained_counts, 0),
+        )
+    first = part.start
+    return replace(
+        found,
+        poses=padded(found.poses, np.nan),
+        covariance=padded(found.covariance, np.nan),
+        stamp=stamps_of(log),
+        odometry=log.pose,
+        closures=tuple(one._replace(first=one.first + first, second=one.second + first) for one in found.closures),
+        smoothed=smoothed,
+        jumps=jumps,
+    )
 
 
 def _echoes_of_a_long_wall(ring: Ring, log: Log) -> float:
@@ -247,7 +289,7 @@ def _check(
     count, total = int(has_odometry.sum()), len(log)
     if not total:
         raise SonarError("slam: no scan in the log; allowed is a log with one or more")
-    if count and count < max(2, total / 2):
+    if count and count < max(min(2, total), total / 2):
         raise SonarError(f"slam: odometry in {count} of {total} scans; allowed are half of them or more, or none")
     if scale and not count:
         raise SonarError("slam: the scale factors of the odometry need odometry; allowed is a log with odometry")

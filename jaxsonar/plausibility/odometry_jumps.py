@@ -68,6 +68,10 @@ class OdometryJump:
     """Row of the last scan with a pose before it."""
     after: int
     """Row of the first scan with a pose after it."""
+    scan: int
+    """Number of the scan after it."""
+    pose: Float[np.ndarray, "3"]
+    """Pose of this scan, metres and radians."""
     step: Float[np.ndarray, "3"]
     """The pose after it in the frame of the pose before it, metres and radians."""
     seconds: float
@@ -81,6 +85,17 @@ class OdometryJump:
     def displacement(self) -> float:
         """Length of the step, metres."""
         return float(np.hypot(self.step[0], self.step[1]))
+
+    def __str__(self) -> str:
+        """Size, duration and scan."""
+        size = f"by {self.displacement:.2f} m and {abs(np.degrees(wrap_angle(self.step[2]))):.0f} deg"
+        time = f" in {self.seconds:.2f} s" if np.isfinite(self.seconds) else ""
+        begins = ""
+        if self.restarts:
+            x, y, theta = (self.pose.round(6) + 0.0).tolist()
+            begins = f", to ({x:.3g}, {y:.3g}, {theta:.3g})"
+        echoes = ", while the ranges hardly change" if self.ranges_continue else ""
+        return f"{size}{time} at scan {self.scan}{begins}{echoes}"
 
 
 def find_odometry_jumps(ring: Ring, log: Log) -> tuple[OdometryJump, ...]:
@@ -127,7 +142,9 @@ def find_odometry_jumps(ring: Ring, log: Log) -> tuple[OdometryJump, ...]:
         elif continues is False and changes.over(0, k + 1)[1] <= SETTINGS.same_range:
             continue  # the robot is indeed where it began
         duration = float(stamp[k + 1] - stamp[k]) if timed else np.nan
-        jumps.append(OdometryJump(int(posed[k]), int(posed[k + 1]), step[k], duration, bool(restarts[k]), continues))
+        before, after = int(posed[k]), int(posed[k + 1])
+        scan = int(log.scan[after])
+        jumps.append(OdometryJump(before, after, scan, pose[k + 1], step[k], duration, bool(restarts[k]), continues))
     return tuple(jumps)
 
 
@@ -138,24 +155,12 @@ def implausible_odometry(ring: Ring, log: Log) -> Iterator[Implausibility]:
         return
     first = jumps[0]
     times = "" if len(jumps) == 1 else f"{len(jumps)} times, first "
-    what = f"the odometry jumps {times}{describe_jump(log, first)}"
+    what = f"the odometry jumps {times}{first}"
     cause = "the odometry was reset or restarted" if first.restarts else "the odometry was corrected or reset"
     if not first.restarts and first.ranges_continue is False:
         cause = "the robot was moved by hand, or logs were joined"
     remedy = "split the log there, or estimate the poses with slam, which does not use this step"
     yield Implausibility("odometry jump", what, cause, remedy)
-
-
-def describe_jump(log: Log, jump: OdometryJump) -> str:
-    """Size, duration and scans of a jump."""
-    size = f"by {jump.displacement:.2f} m and {abs(np.degrees(wrap_angle(jump.step[2]))):.0f} deg"
-    time = f" in {jump.seconds:.2f} s" if np.isfinite(jump.seconds) else ""
-    begins = ""
-    if jump.restarts:
-        x, y, theta = (log.pose[jump.after].round(6) + 0.0).tolist()
-        begins = f", to ({x:.3g}, {y:.3g}, {theta:.3g})"
-    echoes = ", while the ranges hardly change" if jump.ranges_continue else ""
-    return f"{size}{time} at scan {log.scan[jump.after]}{begins}{echoes}"
 
 
 def _durations(

@@ -20,9 +20,8 @@ class SmoothingSettings:
     one holds for the parameters of landmarks as well."""
     odometry_scale_sd: float = 0.05
     """Prior standard deviation of the scale factors of an odometry that was never calibrated, relative."""
-    sparse_sigma: float = 0.01
-    """Standard deviation of the ranges for windows, metres. A scan with hardly more echoes than its pose has unknowns
-    does not determine it."""
+    min_sigma_dof: float = 10.0
+    """Least degrees of freedom of an estimate of the noise of the ranges; its relative error is 0.2 then."""
 
     # Association
     initial_scale: float = 0.04

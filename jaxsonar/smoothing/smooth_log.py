@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxsonar.detection.extract import local_models
 from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import check_sigma
-from jaxsonar.estimation.odometry_noise import OdometryNoise
+from jaxsonar.estimation.odometry_noise import OdometryNoise, OdometryNoiseModel
 from jaxsonar.estimation.sparse_adjustment import marginal_covariances
 from jaxsonar.geometry.se2 import compose, relative
 from jaxsonar.hardware.errors import SonarError
@@ -42,8 +42,9 @@ class Smoothed:
     """The adjusted landmarks, with their standard deviations."""
     used: float
     """Fraction of the echoes of scans with a pose that the map explains."""
-    sigma: float
-    """Standard deviation of the ranges, metres."""
+    sigma: float | None
+    """Standard deviation of the ranges, metres, if it was estimated; None if it was given, or the echoes do not
+    determine it."""
     ring: Ring
     """The ring, with the estimated speed of sound."""
     speed_of_sound_sd: float
@@ -69,7 +70,7 @@ def smooth(
     window: float | None = None,
     speed: bool = False,
     scale: bool = False,
-    odometry_noise: OdometryNoise | None = None,
+    odometry_noise: OdometryNoiseModel | None = None,
     models: Sequence[LocalModel] | None = None,
     traversals: Traversals | None = None,
     progress: Callable[[str], None] | None = None,
@@ -83,7 +84,7 @@ def smooth(
             loop closures; NaN where unknown. Those are predicted from the nearest pose by odometry, or registered on
             the map.
         odometry: (scans, 3) world_from_robot as measured, with drift; NaN where there is none.
-        sigma: standard deviation of the ranges, metres; if left out it is estimated, with windows it is 1 cm.
+        sigma: standard deviation of the ranges, metres; estimated if left out.
         window: metres of trajectory gathered into one local model of the map, for sparse rings.
         speed: whether the speed of sound is estimated.
         scale: whether the scale factors of the odometry's displacements and rotations are estimated.
@@ -162,7 +163,7 @@ def _result(smoother: Smoother, fit: SmoothingFit) -> Smoothed:
         explained_counts=fit.echo_counts,
         world=adjusted_map(fit.alternation.maps[0], found, cov.landmarks),
         used=float(found.used.sum() / max(fit.data.echo_count, 1)),
-        sigma=found.sigma,
+        sigma=found.sigma if found.sigma_dof >= SETTINGS.min_sigma_dof else None,
         ring=ring,
         speed_of_sound_sd=float(sd[sensors] * ring.speed_of_sound),
         scale=(float(np.expm1(change[-2])), float(np.expm1(change[-1]))) if has_scale else (0.0, 0.0),

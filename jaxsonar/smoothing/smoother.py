@@ -20,7 +20,7 @@ from jaxsonar.estimation.alternation import SETTINGS as ALTERNATION_SETTINGS
 from jaxsonar.estimation.alternation import AlternationResult, alternate
 from jaxsonar.estimation.batch_data import BatchData
 from jaxsonar.estimation.landmark_map import LandmarkMap, landmark_map_of, map_with_tentative_points
-from jaxsonar.estimation.odometry_noise import OdometryNoise
+from jaxsonar.estimation.odometry_noise import OdometryNoiseModel
 from jaxsonar.estimation.robust_adjustment import anneal, gnc_adjust
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.global_map import GlobalMap
@@ -68,7 +68,7 @@ class Smoother:
     """world_from_robot as measured; NaN where there is none."""
     basis: ParameterBasis
     """Free parameters: speed of sound, scale factors of the odometry."""
-    odometry_noise: OdometryNoise
+    odometry_noise: OdometryNoiseModel
     sigma: float | None
     """Standard deviation of the ranges, metres; None: estimated."""
     window: float | None
