@@ -6,7 +6,7 @@ from contextlib import ExitStack
 
 from jaxsonar.cli.arguments import add_detection_arguments, filename, number
 from jaxsonar.cli.console import check_sigma_is_used, print_left_out, print_status, progress_bar
-from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, input_options
+from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, input_options, load_checked_ring
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Lines of every scan of many logs, as Parquet; resumes after an interruption."
@@ -39,14 +39,14 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.detection.settings_toml import load_settings
     from jaxsonar.fileio.atomic_files import shown
     from jaxsonar.hardware.errors import SonarError
-    from jaxsonar.sensors.ring_toml import load_ring
 
     check_sigma_is_used(options.sigma, options.method, None)
     if options.output == "-":
         raise SonarError("-o - came; allowed is a folder, which can hold tables")
-    ring = load_ring(options.ring)
-    settings = load_settings(options.settings) if options.settings else None
     messages = InputMessages(strict=options.strict)
+    ring = load_checked_ring(options.ring, messages)
+    messages.warn_of_noise(options.sigma)
+    settings = load_settings(options.settings) if options.settings else None
     with ExitStack() as stack:
         show: list[Callable[[int], None]] = []
 

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
 
 from jaxsonar.cli.arguments import RING_HELP, filename, filename_ending_in
 from jaxsonar.cli.console import print_status
-from jaxsonar.cli.inputs import InputMessages, add_log_arguments, input_options, read_log
+from jaxsonar.cli.inputs import InputMessages, add_log_arguments, input_options, load_checked_ring, read_log
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Convert recordings, ROS bags and tables to scan logs, and scan logs between CSV and Parquet."
@@ -35,11 +35,11 @@ def run(options: argparse.Namespace) -> int:
     """Run ``jaxsonar convert``. Returns 1 if there is no scan."""
     from jaxsonar.fileio.atomic_files import check_outputs, shown
     from jaxsonar.scans.log_file import save_log, unmarked_paths, unmarked_warning
-    from jaxsonar.sensors.ring_toml import load_ring, save_ring
+    from jaxsonar.sensors.ring_toml import save_ring
 
     check_outputs({"OUT": options.destination, "--ring-out": options.ring_out}, [options.source, options.ring])
     messages = InputMessages(strict=options.strict)
-    ring = None if options.ring is None else load_ring(options.ring)
+    ring = None if options.ring is None else load_checked_ring(options.ring, messages)
     if options.ring_out is not None:
         ring = _ring_of_bag(options, messages)
     log = read_log(options.source, options, messages, ring=ring)

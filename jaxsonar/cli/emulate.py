@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 from jaxsonar.cli.arguments import RING_HELP, filename, finite, number
 from jaxsonar.cli.console import print_status, stopped_by_signals
-from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, read_log
+from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_checked_ring, read_log
 
 SUMMARY = "Emulate a device: play a log, or simulate a drive through a room."
 
@@ -60,7 +60,6 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.hardware.device_emulator import emulate as emulate_device
     from jaxsonar.hardware.fault_injection import FaultSettings, parse_stall
     from jaxsonar.hardware.transport_servers import listen
-    from jaxsonar.sensors.ring_toml import load_ring
 
     stall, every = parse_stall(options.stall) if options.stall else (0.0, 10.0)
     faults = FaultSettings(
@@ -71,7 +70,9 @@ def run(options: argparse.Namespace) -> None:
         every=every,
         seed=options.seed,
     )
-    messages = _messages(options, load_ring(options.ring))
+    inputs = InputMessages(strict=options.strict)
+    messages = _messages(options, load_checked_ring(options.ring, inputs), inputs)
+    inputs.check()
     with listen(options.listen) as sink, stopped_by_signals() as stop:
         print(f"listening on {sink.url}", flush=True)
         done = emulate_device(messages, sink, speed=options.speed, faults=faults, stop=stop)
@@ -88,11 +89,12 @@ def run(options: argparse.Namespace) -> None:
     print_status(f"{done.messages} messages, {done.frames} frames, {done.sent_bytes} bytes{damage}")
 
 
-def _messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
+def _messages(options: argparse.Namespace, ring: "Ring", inputs: InputMessages) -> "Iterable[Message]":
+    """What the device sends; warnings about the inputs are printed."""
     if Path(options.log).suffix.lower() not in (".geojson", ".json"):
         if options.path or options.sigma:
             raise SonarError("--path or --sigma came with a log; allowed are they with a room (.geojson)")
-        return _log_messages(options, ring)
+        return _log_messages(options, ring, inputs)
     if options.from_ or options.sensor or options.no_echo or options.odometry_topic:
         raise SonarError("--from, --sensor, --odometry-topic or --no-echo came with a room; allowed with it is --path")
     if not options.path:
@@ -102,10 +104,13 @@ def _messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
     from jaxsonar.simulation.poses_csv import load_poses
 
     poses, stamps = load_poses(options.path)
-    return room_messages(ring, load_room(options.log), poses, stamps, sigma=options.sigma, seed=options.seed)
+    room = load_room(options.log)
+    inputs.warn_of_room(room, poses)
+    inputs.warn_of_noise(options.sigma)
+    return room_messages(ring, room, poses, stamps, sigma=options.sigma, seed=options.seed)
 
 
-def _log_messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Message]":
+def _log_messages(options: argparse.Namespace, ring: "Ring", inputs: InputMessages) -> "Iterable[Message]":
     """The messages of a device that would give a log; those of a raw record as they were received."""
     from jaxsonar.cli.console import errors_in
     from jaxsonar.live.replay import messages_of, messages_of_log
@@ -113,9 +118,6 @@ def _log_messages(options: argparse.Namespace, ring: "Ring") -> "Iterable[Messag
 
     if options.from_ in (None, "record") and file_content(options.log).format == "record":
         return messages_of(options.log, ring)
-    messages = InputMessages(strict=options.strict)
-    log = read_log(options.log, options, messages, ring=ring)
+    log = read_log(options.log, options, inputs, ring=ring)
     with errors_in(options.log):
-        sent = messages_of_log(log, ring, on_note=messages.note)
-    messages.check()
-    return sent
+        return messages_of_log(log, ring, on_note=inputs.note)

@@ -8,6 +8,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from jaxsonar.floor_plans.room import Room
     from jaxsonar.recordings.input_options import InputOptions
     from jaxsonar.scans.scan_log import Log
     from jaxsonar.sensors.ring import Ring
@@ -175,6 +178,18 @@ class InputMessages:
         for found in implausible_noise(sigma, **errors):
             self.warn(str(found))
 
+    def warn_of_room(self, room: "Room", poses: "np.ndarray | None" = None) -> None:
+        """Warn of probable mistakes in a floor plan, and in the poses (x, y, theta) of a robot in it."""
+        from jaxsonar.plausibility.implausible_room import implausible_room
+        from jaxsonar.plausibility.implausible_trajectory import implausible_trajectory
+
+        found = [*implausible_room(room)]
+        if poses is not None:
+            # A room in another unit makes every position implausible; the headings can be judged nevertheless.
+            found += implausible_trajectory(None if found else room, poses)
+        for one in found:
+            self.warn(str(one))
+
     def check(self) -> None:
         """Check that there was no warning, if there must be none.
 
@@ -185,7 +200,9 @@ class InputMessages:
             raise SonarError(f"--strict: {plural(self.warnings, 'warning')} came; allowed is input without warnings")
 
 
-def load_inputs(options: argparse.Namespace, *, as_recorded: bool = False) -> tuple["Ring", "Log"]:
+def load_inputs(
+    options: argparse.Namespace, *, as_recorded: bool = False, messages: InputMessages | None = None
+) -> tuple["Ring", "Log"]:
     """Load the ring and the log of a command; print notes and warnings.
 
     The log is prepared for computations (``prepared_log``).
@@ -193,22 +210,27 @@ def load_inputs(options: argparse.Namespace, *, as_recorded: bool = False) -> tu
     Args:
         options: the options of the command.
         as_recorded: return the log as it was recorded, for a command that reports itself what is wrong with it.
+        messages: count the warnings together with earlier ones.
 
     Raises:
         SonarError: an input cannot be read, or there was a warning and ``--strict`` was given.
     """
-    ring, logs = load_all_inputs(options, [options.log], as_recorded=as_recorded)
+    ring, logs = load_all_inputs(options, [options.log], as_recorded=as_recorded, messages=messages)
     return ring, logs[0]
 
 
 def load_all_inputs(
-    options: argparse.Namespace, filenames: Sequence[str], *, as_recorded: bool = False
+    options: argparse.Namespace,
+    filenames: Sequence[str],
+    *,
+    as_recorded: bool = False,
+    messages: InputMessages | None = None,
 ) -> tuple["Ring", list["Log"]]:
     """Load the ring of a command and several logs, as ``load_inputs``."""
     from jaxsonar.plausibility.implausible_input import implausible_input
     from jaxsonar.plausibility.prepared_log import prepared_log
 
-    messages = InputMessages(strict=options.strict)
+    messages = messages or InputMessages(strict=options.strict)
     ring, logs = load_checked_ring(options.ring, messages), []
     messages.warn_of_noise(getattr(options, "sigma", None))
     for name in filenames:

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
 
 from jaxsonar.cli.arguments import add_slam_arguments, figure_filename, filename, odometry_noise
 from jaxsonar.cli.console import ascii_name, errors_in, print_status, stage_status, write_figure
-from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs, nothing_used
+from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Localize the robot in a known map."
@@ -42,8 +42,9 @@ def run(options: argparse.Namespace) -> int:
     check_outputs(
         {"--trajectory": options.trajectory, "--figure": options.figure}, [options.log, options.ring, options.map]
     )
-    world = _load_known_map(options.map)
-    ring, log = load_inputs(options)
+    messages = InputMessages(strict=options.strict)
+    world = _load_known_map(options.map, messages)
+    ring, log = load_inputs(options, messages=messages)
     if nothing_used(ring, log, options.log):
         return 1
     with errors_in(options.log), stage_status() as progress:
@@ -79,8 +80,8 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _load_known_map(map_filename: str) -> "GlobalMap":
-    """Load a map, or a floor plan as a map."""
+def _load_known_map(map_filename: str, messages: InputMessages) -> "GlobalMap":
+    """Load a map, or a floor plan as a map; warn of probable mistakes in the plan."""
     from jaxsonar.fileio.atomic_files import shown
     from jaxsonar.floor_plans.room_geojson import load_room
     from jaxsonar.hardware.errors import SonarError
@@ -91,9 +92,11 @@ def _load_known_map(map_filename: str) -> "GlobalMap":
         world = load_map(map_filename)
     except SonarError as not_a_map:
         try:
-            world = map_from_room(load_room(map_filename))
+            room = load_room(map_filename)
         except SonarError:
             raise not_a_map from None
+        messages.warn_of_room(room)
+        world = map_from_room(room)
     if not len(world):
         raise SonarError(f"{shown(map_filename)}: no wall; allowed is a map with walls")
     return world

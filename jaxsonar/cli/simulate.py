@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 
 from jaxsonar.cli.arguments import RING_HELP, filename, finite, number, odometry_error
 from jaxsonar.cli.console import print_status, progress_bar, settings_filename
+from jaxsonar.cli.inputs import InputMessages, add_strict, load_checked_ring
 
 SUMMARY = "Simulate the echoes of a ring along a trajectory through a room."
 
@@ -46,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     logged.add_argument("--no-odometry", action="store_true", help="no poses in the log")
     parser.add_argument("--truth", type=filename, metavar="TRAJ", help="the true poses, for evo: TUM; - = stdout")
+    add_strict(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -57,7 +59,6 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.scans.csv_log import csv_lines
     from jaxsonar.scans.log_file import save_log
     from jaxsonar.scans.scan_log import log_format
-    from jaxsonar.sensors.ring_toml import load_ring
     from jaxsonar.simulation.poses_csv import load_poses
     from jaxsonar.simulation.simulator import simulate as simulate_scans
 
@@ -68,8 +69,12 @@ def run(options: argparse.Namespace) -> None:
         raise SonarError("--truth -: the log goes to standard output, too; allowed are different places")
     if options.output != "-":
         log_format(options.output)  # checks the suffix before the simulation
-    ring, room = load_ring(options.ring), load_room(options.room)
+    messages = InputMessages(strict=options.strict)
+    ring, room = load_checked_ring(options.ring, messages), load_room(options.room)
     poses, stamps = load_poses(options.path)
+    messages.warn_of_room(room, poses)
+    messages.warn_of_noise(options.sigma, drift=options.drift, clutter=options.clutter)
+    messages.check()
     with progress_bar("scans", len(poses)) as show:
         simulation = simulate_scans(
             ring,
@@ -92,7 +97,8 @@ def run(options: argparse.Namespace) -> None:
     if options.truth:
         save_trajectory(Trajectory(stamps, poses), options.truth)
     if settings_file:
-        used_options = {key: value for key, value in vars(options).items() if key not in ("command", "output", "truth")}
+        unused = ("command", "output", "truth", "strict")
+        used_options = {key: value for key, value in vars(options).items() if key not in unused}
         write_toml(
             {key: value for key, value in used_options.items() if value is not None and value is not False},
             settings_file,

@@ -25,6 +25,7 @@ from jaxsonar.cli.arguments import (
     odometry_noise,
 )
 from jaxsonar.cli.console import check_sigma_is_used, print_status, stopped_by_signals
+from jaxsonar.cli.inputs import InputMessages, add_strict, load_checked_ring
 
 TERMINAL_INTERVAL, LOG_INTERVAL = 1.0, 10.0
 """Seconds between two status lines, on a terminal and elsewhere. Chosen by hand."""
@@ -73,6 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="METRES",
         help="file:LOG: a range that means no echo; can be repeated",
     )
+    add_strict(parser)
     parser.add_argument("--view", action="store_true", help="show the stream (extra viz), on this machine only")
     parser.add_argument(
         "--rrd", type=filename_ending_in(".rrd"), metavar="FILE", help="the view as a file for rerun (extra viz)"
@@ -86,7 +88,6 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.fileio.compilation_cache import use_compilation_cache
     from jaxsonar.hardware.transport_base import parse_url
     from jaxsonar.live.stream import stream as stream_scans
-    from jaxsonar.sensors.ring_toml import load_ring
 
     check_sigma_is_used(options.sigma, options.method, None)
     url = parse_url(options.url)
@@ -102,7 +103,10 @@ def run(options: argparse.Namespace) -> int:
         "--trajectory": options.trajectory,
     }
     check_outputs(outputs, [options.ring, options.settings, replayed])
-    ring = load_ring(options.ring)
+    messages = InputMessages(strict=options.strict)
+    ring = load_checked_ring(options.ring, messages)
+    messages.warn_of_noise(options.sigma)
+    messages.check()
     settings = load_settings(options.settings) if options.settings else None
     view = None
     if options.view or options.rrd:
@@ -110,9 +114,10 @@ def run(options: argparse.Namespace) -> int:
 
         view = RerunViewer(ring, file=options.rrd, print_status=print_status)
     use_compilation_cache()
-    status_line = StatusLine()
+    status_line = StatusLine(messages)
     try:
         with stopped_by_signals() as stop:
+            status_line.stop = stop
             status = stream_scans(
                 options.url,
                 ring,
@@ -134,8 +139,19 @@ def run(options: argparse.Namespace) -> int:
         print_status("jaxsonar stream: interrupted")
         _exit_now(1)
     status_line.last(status)
-    if reason := status.why_nothing_is_used(ring):
+    reason = ""
+    if unknown := status.unknown_protocol():
+        messages.warn(f"{shown(options.url)}: {unknown}")
+        reason = str(unknown)
+    elif reason := status.why_nothing_is_used(ring):
         print_status(f"nothing found: {shown(options.url)}: {reason}")
+    try:
+        messages.check()
+    except SonarError as error:
+        if status.warm:
+            raise
+        print_status(f"jaxsonar stream: {error}")
+        _exit_now(2)
     if not status.warm:
         _exit_now(int(bool(reason)))
     return int(bool(reason))
@@ -144,7 +160,10 @@ def run(options: argparse.Namespace) -> int:
 class StatusLine:
     """Prints the status: an overwritten line on a terminal, new lines at intervals elsewhere; events at once."""
 
-    def __init__(self):
+    def __init__(self, messages: InputMessages):
+        self.stop: threading.Event | None = None
+        """Set if a warning ends the stream (``--strict``)."""
+        self._messages = messages
         self._is_terminal = sys.stderr.isatty()
         self._printed_at = 0.0
         self._ending = False
@@ -166,6 +185,10 @@ class StatusLine:
     def event(self, event: "LinkEvent") -> None:
         """Print a link event; called in the reading thread."""
         self._write(event.text)
+        if event.text.startswith("warning: "):
+            self._messages.warnings += 1
+            if self._messages.strict and self.stop is not None:
+                self.stop.set()
 
     def last(self, status: "Status") -> None:
         """Print the final status."""

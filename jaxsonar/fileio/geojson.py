@@ -13,6 +13,9 @@ from jaxsonar.hardware.errors import SonarError
 
 T = TypeVar("T")
 
+_FEATURE_KEYS = ("type", "id", "bbox", "properties", "geometry")
+_GEOMETRIES = "allowed are LineString, MultiLineString, Polygon, MultiPolygon and Point"
+
 
 def read_features(
     filename: str | os.PathLike[str], read: Callable[[dict[str, Any], str, Any], T], *, what: str
@@ -79,7 +82,7 @@ def lines_of(form: str, coordinates: Any) -> Iterator[tuple[Any, bool]]:
     """
     depth = {"LineString": 0, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}.get(form)
     if depth is None:
-        raise SonarError(f"geometry {form!r:.60}; allowed are LineString, Polygon, their Multi forms and Point")
+        raise SonarError(f"geometry {form!r:.60}; {_GEOMETRIES}")
     lists = [coordinates]
     for _ in range(depth):
         if not all(isinstance(entry, list) for entry in lists):
@@ -110,10 +113,14 @@ def _feature_parts(entry: Any) -> tuple[dict[str, Any], str, Any]:
     """Properties, type of the geometry and coordinates of one feature."""
     if not isinstance(entry, dict) or entry.get("type") != "Feature":
         raise SonarError("no Feature came; allowed are Feature objects")
+    if unknown := [key for key in entry if key not in _FEATURE_KEYS]:
+        raise SonarError(f"unknown key {shown(unknown[0], 60)!r}; allowed in a Feature are {', '.join(_FEATURE_KEYS)}")
     properties, geometry = entry.get("properties"), entry.get("geometry")
     properties = {} if properties is None else properties
     if not isinstance(properties, dict):
         raise SonarError("properties are no object; allowed is an object or null")
+    if isinstance(geometry, dict) and geometry.get("type") in ("GeometryCollection", "Feature", "FeatureCollection"):
+        raise SonarError(f"geometry {geometry['type']!r}; {_GEOMETRIES}; give each part a Feature of its own")
     if not isinstance(geometry, dict) or "coordinates" not in geometry:
         raise SonarError("no geometry with coordinates came; allowed are LineString, Polygon, their Multi forms, Point")
     return properties, str(geometry.get("type")), geometry["coordinates"]

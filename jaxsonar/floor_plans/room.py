@@ -46,9 +46,10 @@ class Room:
         walls = _close_gaps(walls)
         short = np.flatnonzero(np.linalg.norm(walls[:, 1] - walls[:, 0], axis=-1) <= TOUCH)
         if len(short):
-            raise SonarError(
-                f"room: wall {short[0]} ({names[short[0]]}) has no length; allowed is more than {TOUCH * 1e3:g} mm"
-            )
+            tiny = np.ptp(walls.reshape(-1, 2), axis=0).max() < 0.1
+            degrees = "; are the coordinates degrees of longitude and latitude? needed are metres" if tiny else ""
+            allowed = f"allowed is more than {TOUCH * 1e3:g} mm{degrees}"
+            raise SonarError(f"room: wall {short[0]} ({names[short[0]]}) has no length; {allowed}")
         walls.setflags(write=False)
         poles.setflags(write=False)
         object.__setattr__(self, "walls", walls)

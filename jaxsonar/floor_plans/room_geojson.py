@@ -11,6 +11,11 @@ from jaxsonar.floor_plans.junctions import TOUCH
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.hardware.errors import SonarError
 
+_PROPERTIES = ("kind", "name", "id")
+"""Properties of the features of a room."""
+_KINDS_OF_MAPS = ("segment", "corner", "edge")
+"""Kinds of features of maps, which have properties of their own."""
+
 
 def load_room(filename: str | os.PathLike[str]) -> Room:
     """Read a room from a GeoJSON FeatureCollection, world frame, metres.
@@ -53,14 +58,17 @@ def save_room(room: Room, filename: str | os.PathLike[str]) -> None:
 
 def _feature(properties: dict[str, Any], form: str, coordinates: Any) -> tuple[str, list[np.ndarray], list[np.ndarray]]:
     """Name, walls and poles of one GeoJSON feature."""
-    name = properties.get("name")
+    name, kind = properties.get("name"), properties.get("kind")
     if not isinstance(name, str | None):
         raise SonarError(f"name {name!r:.60}; allowed is text")
+    if kind not in _KINDS_OF_MAPS and (unknown := [key for key in properties if key not in _PROPERTIES]):
+        raise SonarError(f"unknown property {shown(unknown[0], 60)!r}; allowed are {', '.join(_PROPERTIES)}")
     if form == "Point":
-        kind = properties.get("kind")
         if kind not in ("pole", "corner", "edge"):
             raise SonarError(f'Point of kind {kind!r:.60}; allowed is "pole" ("corner" and "edge" are skipped)')
         return name or "", [], [positions([coordinates])[0]] if kind == "pole" else []
+    if kind in ("pole", "corner", "edge"):
+        raise SonarError(f"{form:.60} of kind {kind!r}; allowed with this kind is a Point")
     pieces: list[np.ndarray] = []
     for line, is_ring in lines_of(form, coordinates):
         points = positions(line)
@@ -75,6 +83,9 @@ def _feature(properties: dict[str, Any], form: str, coordinates: Any) -> tuple[s
         length = np.linalg.norm(np.diff(points, axis=0), axis=1)
         if (length <= TOUCH).any():
             x, y = points[int(length.argmin())]
-            raise SonarError(f"a wall of no length at ({x:g}, {y:g}); allowed is more than {TOUCH * 1e3:g} mm")
+            tiny = np.ptp(points, axis=0).max() < 0.1 and not (points[1:] == points[:-1]).all(axis=1).any()
+            degrees = "; are the coordinates degrees of longitude and latitude? needed are metres" if tiny else ""
+            allowed = f"allowed is more than {TOUCH * 1e3:g} mm{degrees}"
+            raise SonarError(f"a wall of no length at ({x:g}, {y:g}); {allowed}")
         pieces += list(np.stack([points[:-1], points[1:]], axis=1))
     return name or "", pieces, []

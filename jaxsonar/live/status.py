@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.plausibility.unused_echoes import EchoCounts
 from jaxsonar.sensors.ring import Ring
 
@@ -54,14 +55,23 @@ class Status:
     ending: bool = False
     """The stream was stopped during compilation; queued scans are still to be processed for the map."""
 
+    def unknown_protocol(self) -> Implausibility | None:
+        """A warning if bytes came, but no frame; None otherwise."""
+        counts = {"bytes": 0, "frames": 0, "rejected": 0, **self.counts}
+        if counts["frames"] or not counts["bytes"]:
+            return None
+        damaged = f", {counts['rejected']} damaged{self._rejected_text()}" if counts["rejected"] else ""
+        what = f"no frame of the wire protocol in {counts['bytes']} bytes{damaged}"
+        cause = "the device probably speaks another protocol, or has another baud rate"
+        return Implausibility("protocol", what, cause, "let the device send frames of the wire protocol")
+
     def why_nothing_is_used(self, ring: Ring) -> str:
         """Why no echo of a finished stream could be used; empty if one was."""
         counts = {"bytes": 0, "frames": 0, "rejected": 0, "scans": 0, "echoes": 0, **self.counts}
         if not counts["bytes"]:
             return "no data came: is the device on, and does it send?"
-        if not counts["frames"]:
-            damaged = f", {counts['rejected']} damaged{self._rejected_text()}" if counts["rejected"] else ""
-            return f"no frame of the wire protocol in {counts['bytes']} bytes{damaged}: is this another protocol?"
+        if unknown := self.unknown_protocol():
+            return str(unknown)
         if not counts["scans"]:
             return f"no firing group in {counts['frames']} frames"
         if not self.warm:  # the scans were only recorded

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxsonar.floor_plans.room import Room
+from jaxsonar.geometry.segments import lengths
 from jaxsonar.plausibility.implausibility import Implausibility
 
 
@@ -14,13 +15,11 @@ class RoomSettings:
     """When the coordinates of a room are no metres. Chosen by hand."""
 
     long_wall: float = 40.0
-    """Most walls are shorter than this, metres: the quantile ``quantile``."""
-    quantile: float = 0.2
-    """Quantile of the lengths of the walls that is compared. Only the shortest walls are below it."""
-    large: float = 100.0
-    """Smaller rooms than this, metres, may have long walls only."""
-    shortest_wall: float = 0.15
-    """The same quantile in the right unit is above this value, metres."""
+    """Half of the walls are shorter than this, metres, in all rooms but ..."""
+    large: float = 150.0
+    """... those that are smaller than this, metres: a hall with four walls."""
+    millimetres: float = 500.0
+    """In rooms in millimetres, half of the walls are longer than this; in centimetres, they are shorter."""
     tiny: float = 0.1
     """No room is smaller than this, metres."""
 
@@ -40,9 +39,9 @@ def implausible_room(room: Room) -> Iterator[Implausibility]:
     width, depth = np.ptp(ends, axis=0)
     size = max(width, depth)
     what = f"the room is {width:.4g} m x {depth:.4g} m"
-    wall = float(np.quantile(np.linalg.norm(room.walls[:, 1] - room.walls[:, 0], axis=-1), SETTINGS.quantile))
+    wall = float(np.median(lengths(room.walls)))
     if size > SETTINGS.large and wall > SETTINGS.long_wall:
-        unit = "millimetres" if wall / 1000 > SETTINGS.shortest_wall else "centimetres"
+        unit = "millimetres" if wall > SETTINGS.millimetres else "centimetres"
         scale = 1000 if unit == "millimetres" else 100
         cause = f"its coordinates are probably {unit}"
         yield Implausibility("room unit", what, cause, f"give metres: divide the coordinates by {scale}")

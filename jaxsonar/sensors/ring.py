@@ -110,15 +110,18 @@ class Ring(eqx.Module):
         if not 0 <= self.neighbors < count:
             raise SonarError(f"ring: neighbors {self.neighbors}; allowed is 0 to {count - 1} with {count} sensors")
         if not 0 < self.max_range <= MAX_SIZE:
-            raise SonarError(f"ring: max_range {self.max_range:g} m; allowed is more than 0 and at most {MAX_SIZE:g} m")
+            allowed = f"allowed is more than 0 and at most {MAX_SIZE:g} m{_other_unit(self.max_range)}"
+            raise SonarError(f"ring: max_range {self.max_range:g} m; {allowed}")
         for field in ("position", "range_offset"):
             if (worst := np.abs(getattr(self, field)).max()) > MAX_SIZE:
-                raise SonarError(f"ring: {field} {worst:g} m; allowed is at most {MAX_SIZE:g} m either way")
+                allowed = f"allowed is at most {MAX_SIZE:g} m either way{_other_unit(worst)}"
+                raise SonarError(f"ring: {field} {worst:g} m; {allowed}")
         if (worst := np.degrees(np.abs(self.heading).max())) > 720:
             raise SonarError(f"ring: heading {worst:g} deg; allowed is at most 720 deg either way")
         if not 0 < self.speed_of_sound <= 10_000:
-            raise SonarError(f"ring: speed_of_sound {self.speed_of_sound:g} m/s; allowed is more than 0, at most 10000")
-
+            hint = "; is it in cm/s, mm/s or inches per second?" if self.speed_of_sound > 10_000 else ""
+            allowed = f"allowed is more than 0, at most 10000{hint}"
+            raise SonarError(f"ring: speed_of_sound {self.speed_of_sound:g} m/s; {allowed}")
         if self.names and len(self.names) != count:
             raise SonarError(f"ring: {len(self.names)} names came; allowed is one for each of {count} sensors, or none")
         given = [one for one in self.names if one]
@@ -158,7 +161,8 @@ class Ring(eqx.Module):
         if _whole(count, "count") < 1:
             raise SonarError(f"ring: count {count}; allowed is 1 or more")
         if not 0 <= radius <= MAX_SIZE:
-            raise SonarError(f"ring: radius {radius:g} m; allowed is 0 or more, at most {MAX_SIZE:g} m")
+            allowed = f"allowed is 0 or more, at most {MAX_SIZE:g} m{_other_unit(radius)}"
+            raise SonarError(f"ring: radius {radius:g} m; {allowed}")
         heading = first_heading + 2 * np.pi * np.arange(count) / count
         position = radius * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         return cls(
@@ -286,6 +290,13 @@ def _one_each(
     if values.shape not in ((), (count,)):
         raise SonarError(f"ring: {field} of shape {values.shape}; allowed is one for all, or one for each of {count}")
     return np.array(np.broadcast_to(values, (count,)))
+
+
+def _other_unit(value: float) -> str:
+    """A question about the unit of a length of metres that is too large; empty for other values."""
+    if not MAX_SIZE < value < np.inf:
+        return ""
+    return "; is it in mm?" if value >= 10 * MAX_SIZE else "; is it in mm or cm?"
 
 
 def _whole(value: int, field: str) -> int:
