@@ -7,6 +7,7 @@ from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
 from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.plausibility.implausible_ring import implausible_ring
 from jaxsonar.plausibility.implausible_stamps import implausible_stamps
+from jaxsonar.plausibility.odometry_jumps import implausible_odometry
 from jaxsonar.plausibility.range_units import find_range_unit
 from jaxsonar.plausibility.robot_echoes import find_robot_echoes, without_robot_echoes
 from jaxsonar.plausibility.unheard_paths import unheard_warning
@@ -59,6 +60,7 @@ class PreparedLog:
         if robot := find_robot_echoes(ring, prepared):
             warnings.append(robot.warning())
             prepared = without_robot_echoes(prepared, robot)
+        warnings += implausible_odometry(ring, prepared)
         # Nothing is concluded from a ring that is wrong itself.
         if not any(implausible_ring(ring)) and (unit := find_range_unit(ring, prepared)):
             warnings.append(unit.implausibility)
