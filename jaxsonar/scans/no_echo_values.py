@@ -70,7 +70,12 @@ class NoEchoSettings:
     """Largest share of the echoes: where hardly any other value is read, this one does not replace silence."""
     beyond_exact: float = 0.005
     """Largest share of the echoes that are beyond an exact value: it is the smallest or the largest range."""
-    beyond_noisy: float = 0.02
+    certain_readings: float = 0.2
+    """Beyond this share of the echoes, an exact value of ranges with a fine resolution may also lie between others."""
+    beside: float = 0.02
+    """Largest share of its readings with another reading of the same path in the scan: where it stands for no echo,
+    there is none."""
+    beyond_noisy: float = 0.05
     """Largest share of the echoes that are above a noisy value: it is about the largest range."""
     equal: float = 1e-6
     """Ranges that differ by less, relative to their value, are equal; larger than the rounding of 32-bit floats."""
@@ -214,6 +219,11 @@ class _Sample:
         pairs = np.unique(self.path[echoes].astype(np.int64) << 32 | place[self.scan[echoes]])
         return np.bincount(pairs >> 32, minlength=self.measured.shape[1])
 
+    def has_others_beside(self, echoes: Bool[np.ndarray, " echoes"]) -> bool:
+        """Whether paths often have another echo in the scan beside one of these."""
+        key = self.scan * self.measured.shape[1] + self.path
+        return bool(np.isin(key[echoes], key[~echoes]).mean() > SETTINGS.beside)
+
     def run_counts(self, echoes: Bool[np.ndarray, " echoes"]) -> Int[np.ndarray, " paths"]:
         """Number of runs of these echoes among those of each path."""
         order = np.lexsort((self.scan, self.path))
@@ -245,14 +255,15 @@ def _exact(sample: _Sample, value: float) -> NoEchoValue | None:
     beyond = (np.mean(sample.range < value - width), np.mean(sample.range > value + width))
     if not SETTINGS.exact_readings <= share <= SETTINGS.most_readings or has_it.sum() < SETTINGS.path_readings:
         return None
-    if (min(beyond) if sample.has_poses else beyond[1]) > SETTINGS.beyond_exact:
-        return None
     # With a resolution of 1 cm, readings of a wall are equal, too; but then its neighbours are frequent.
     near = ~has_it & (np.abs(sample.range - value) <= SETTINGS.neighbors)
     if SETTINGS.contrast * max(np.unique(sample.range[near], return_counts=True)[1], default=0) > has_it.sum():
         return None
     _, which, count = np.unique(sample.range[~has_it], return_inverse=True, return_counts=True)
     is_fine = len(which) == 0 or float(np.mean(count[which] > 1)) < SETTINGS.repeated
+    is_certain = is_fine and share >= SETTINGS.certain_readings and not sample.has_others_beside(has_it)
+    if not is_certain and (min(beyond) if sample.has_poses else beyond[1]) > SETTINGS.beyond_exact:
+        return None
     if not sample.has_poses and not is_fine:
         return None
     counted = sample.echo_counts >= SETTINGS.path_readings
@@ -285,6 +296,8 @@ def _noisy(sample: _Sample, value: float, sigma: float) -> NoEchoValue | None:
     share = float(has_it.mean())
     beyond = np.mean(deviation > width)
     if not SETTINGS.noisy_readings <= share <= SETTINGS.most_readings or beyond > SETTINGS.beyond_noisy:
+        return None
+    if sample.has_others_beside(has_it):
         return None
     below = np.sum((deviation < -width) & (deviation >= -3 * width)) / 2
     above = np.sum((deviation > width) & (deviation <= 3 * width)) / 2
