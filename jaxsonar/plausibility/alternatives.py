@@ -37,6 +37,9 @@ class AlternativeSettings:
     """An alternative that is worse than the best one by less than this many standard errors may be true, too, ..."""
     tie_margin: float = 0.01
     """... if it is also worse by less than this."""
+    above_chance: float = 0.3
+    """The alternative explains at least this share of the echoes more than chance. Then it is no accident among wrong
+    descriptions."""
     least_echoes: int = 30
     """With fewer compared echoes, nothing is stated."""
     screen_groups: int = 5
@@ -125,21 +128,19 @@ def best_alternative(ring: Ring, log: Log) -> Alternative | None:
     given = comparison.full(())
     if given.echoes < SETTINGS.least_echoes:
         return None
-    headings = heading_corrections()
-    single = [*headings, *axis_corrections(), *turned_rings(ring), *_renumberings(comparison)]
-    candidates: list[tuple[Correction, ...]] = [(one,) for one in single]
-    for unit in pose_unit_corrections(log):
-        candidates += [(unit,), *((unit, heading) for heading in headings)]
-    results = [(one, comparison.full(one)) for one in _finalists(comparison, candidates)]
+    candidates = _candidates(comparison)
+    results = [(one, comparison.full(one, support_only=True)) for one in _finalists(comparison, candidates)]
     best, agreed = max(results, key=lambda one: one[1].mean_support)
     ties = [(one, other) for one, other in results if _ties(agreed, other)]
     # Of two descriptions that agree as well, the one with fewer mistakes, or the more common one.
     different = [one for one in ties if [c.kind for c in one[0]] != [c.kind for c in best]]
-    if different:
-        rank = {one: (len(one), k) for k, one in enumerate(candidates)}
-        best, agreed = min([(best, agreed), *different], key=lambda one: rank[one[0]])
+    rank = {one: (len(one), k) for k, one in enumerate(candidates)}
+    best, _ = min([(best, agreed), *different], key=lambda one: rank[one[0]])
+    agreed = comparison.full(best)
     more = gain(given, agreed)
     if more.support < SETTINGS.gain or more.support_z < SETTINGS.z or agreed.echoes < SETTINGS.least_echoes:
+        return None
+    if agreed.share < agreed.chance + SETTINGS.above_chance:
         return None
     kinds = {one.kind for one in best}
     others = {one[0].kind: one[0] for one, _ in reversed(ties) if len(one) == 1 and one[0].kind not in kinds}
@@ -151,34 +152,34 @@ class _Comparison:
 
     def __init__(self, ring: Ring, log: Log):
         self.ring = ring
-        self._log = log
+        self.log = log
         self._parts: dict[str, tuple[tuple[Log, list[Int[np.ndarray, _]]], ...]] = {}
         self._screened: dict[tuple[Correction, ...], float] = {}
 
     def screen(self, corrections: tuple[Correction, ...]) -> float:
         """Mean support on few groups."""
         if corrections not in self._screened:
-            self._screened[corrections] = self._agreement(corrections, 0).mean_support
+            self._screened[corrections] = self._agreement(corrections, 0, support_only=True).mean_support
         return self._screened[corrections]
 
-    def full(self, corrections: tuple[Correction, ...]) -> Agreement:
+    def full(self, corrections: tuple[Correction, ...], *, support_only: bool = False) -> Agreement:
         """Agreement on all groups."""
-        return self._agreement(corrections, 1)
+        return self._agreement(corrections, 1, support_only=support_only)
 
-    def _agreement(self, corrections: tuple[Correction, ...], which: int) -> Agreement:
+    def _agreement(self, corrections: tuple[Correction, ...], which: int, *, support_only: bool) -> Agreement:
         # Positions in another unit bring other scans close together.
         unit = next((one for one in corrections if one.kind == "pose unit"), None)
         key = "" if unit is None else unit.mistake
         if key not in self._parts:
-            scaled = self._log if unit is None else unit.apply(self._log)
+            scaled = self.log if unit is None else unit.apply(self.log)
             groups = select_groups(scaled)
             few = _moving_groups(scaled, groups)
             limits = {"most_echoes": SETTINGS.most_echoes}
-            self._parts[key] = tuple(part_of_groups(self._log, one, **limits) for one in (few, groups))
+            self._parts[key] = tuple(part_of_groups(self.log, one, **limits) for one in (few, groups))
         log, groups = self._parts[key][which]
         for one in corrections:
             log = one.apply(log)
-        return agreement(self.ring, log, groups)
+        return agreement(self.ring, log, groups, support_only=support_only)
 
 
 def _moving_groups(log: Log, groups: list[Int[np.ndarray, "_"]]) -> list[Int[np.ndarray, "_"]]:
@@ -193,24 +194,37 @@ def _moving_groups(log: Log, groups: list[Int[np.ndarray, "_"]]) -> list[Int[np.
     return [groups[k] for k in sorted(most)]
 
 
+def _candidates(comparison: _Comparison) -> list[tuple[Correction, ...]]:
+    """All alternatives, common mistakes first."""
+    ring, log = comparison.ring, comparison.log
+    headings = heading_corrections()
+    clockwise, from_one = renumbering(ring, 0, clockwise=True), renumbering(ring, ring.count - 1, clockwise=False)
+    common = [*headings, clockwise, from_one] if ring.count > 2 else headings
+    candidates = [(one,) for one in [*common, *axis_corrections(), *turned_rings(ring), *_renumberings(comparison)]]
+    for unit in pose_unit_corrections(log):
+        candidates += [(unit,), *((unit, heading) for heading in headings)]
+    if ring.count > 2:  # with headings in another unit, no numbering of the sensors alone agrees
+        candidates += [(one, clockwise) for one in headings if one.kind == "heading unit"]
+    return candidates
+
+
 def _renumberings(comparison: _Comparison) -> list[Correction]:
     """Other numberings of the sensors: from another first one, counter-clockwise or clockwise.
 
-    In large rings, every few shifts are screened first, and then those near the best one.
+    In large rings, every few shifts are screened first, and then those near the best one. Those of ``_candidates`` are
+    left out.
     """
     ring, found = comparison.ring, []
     stride = -(-ring.count // SETTINGS.shifts)
     for clockwise in (False, True):
-        if clockwise and ring.count < 3:
+        if ring.count < 3:
             continue
-        first = 0 if clockwise else 1
-        near = {0, 1, ring.count - 1, *range(0, ring.count, stride)}
-        shifts = {k: renumbering(ring, k, clockwise=clockwise) for k in sorted(near) if k >= first}
-        if not shifts:
-            continue
+        last = ring.count - 1 if clockwise else ring.count - 2
+        near = {1, last, *range(1, last, stride)}
+        shifts = {k: renumbering(ring, k, clockwise=clockwise) for k in sorted(near)}
         best = max(shifts, key=lambda k: comparison.screen((shifts[k],)))
         for k in range(best - stride + 1, best + stride):
-            if (k := k % ring.count) >= first and k not in shifts:
+            if 1 <= k <= last and k not in shifts:
                 shifts[k] = renumbering(ring, k, clockwise=clockwise)
         found += shifts.values()
     return found

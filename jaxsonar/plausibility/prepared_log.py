@@ -3,8 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
 from jaxsonar.plausibility.implausibility import Implausibility
+from jaxsonar.plausibility.implausible_poses import implausible_poses
 from jaxsonar.plausibility.implausible_ring import implausible_ring
 from jaxsonar.plausibility.implausible_stamps import implausible_stamps
 from jaxsonar.plausibility.odometry_jumps import implausible_odometry
@@ -61,9 +64,13 @@ class PreparedLog:
             warnings.append(robot.warning())
             prepared = without_robot_echoes(prepared, robot)
         warnings += implausible_odometry(ring, prepared)
-        # Nothing is concluded from a ring that is wrong itself.
-        if not any(implausible_ring(ring)) and (unit := find_range_unit(ring, prepared)):
-            warnings.append(unit.implausibility)
+        # Nothing is concluded from a ring that is wrong itself, nor from ranges whose unit is unknown.
+        if not any(implausible_ring(ring)):
+            unit = find_range_unit(ring, prepared)
+            if unit:
+                warnings.append(unit.implausibility)
+            if unit is None or np.isfinite(unit.scale):
+                warnings += implausible_poses(ring, unit.corrected(prepared) if unit else prepared)
         return cls(prepared, tuple(warnings), tuple(notes))
 
 
