@@ -41,11 +41,11 @@ class CommonCauseSettings:
     """... and raise the log-likelihood by this, nats."""
     searches: int = 3
     """Searches for a time offset, each around the last estimate."""
-    odometry_scale: float = 0.005
+    odometry_scale: float = 0.003
     """Standard deviation of the scale of odometry, which has the same effect as the scale of the ranges."""
     min_scale: float = 0.017
     """Smaller errors of the scale are not reported: 10 K of the air's temperature, or odometry."""
-    scale_errors: float = 3.5
+    scale_errors: float = 3.0
     """A scale error must be this many standard errors."""
     air: tuple[float, float] = (312.0, 360.5)
     """Speeds of sound in air of -31 to 50 deg C, m/s."""
@@ -89,15 +89,15 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
             break
         findings.append(_description_finding(comparison))
         ring, log = comparison.best.ring, comparison.best.log
-    if groups and (motion := _estimate_motion(ring, log, groups)) is not None:
-        offset = motion.lag_finding()
-        if offset is not None:
-            findings.append(offset)
-            log = with_later_poses(log, motion.lag)
-        scale = motion.scale_finding(ring)
-        if scale is not None:
-            findings.append(scale)
-            log = replace(log, range=log.range / (1 + motion.scale))
+    if groups:
+        echoes, step = group_echoes(ring, log, groups), search_step(log)
+        fit = _search_motion(ring, log, groups, echoes, step)
+        if fit is not None and (found := _lag_finding(echoes, fit, step)) is not None:
+            findings.append(found)
+            log = with_later_poses(log, float(fit.estimate[LAG]))
+        if fit is not None and (found := _scale_finding(ring, fit)) is not None:
+            findings.append(found)
+            log = replace(log, range=log.range / (1 + fit.estimate[SCALE]))
     measured = range_noise(ring, log)
     if sigma is not None and max(measured / sigma, sigma / measured) > SETTINGS.noise_ratio:
         findings.append(_noise_finding(sigma, measured))
@@ -105,102 +105,73 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
     return CommonCauses(ring, log, sigma, tuple(findings))
 
 
-@dataclass(frozen=True, eq=False)
-class _Motion:
-    """Time offset and scale of the ranges, with the fits that they are compared with."""
+def _lag_finding(echoes: EchoGroups, fit: MotionFit, step: float) -> Finding | None:
+    """The finding about a time offset; None if there is none."""
+    lag, error = float(fit.estimate[LAG]), float(fit.error[LAG])
+    if not abs(lag) > max(SETTINGS.min_lag, SETTINGS.lag_steps * step, SETTINGS.lag_errors * error):
+        return None
+    without = fit_motion(echoes, free=(True, False))
+    if without is None or (nats := fit.log_likelihood - without.log_likelihood) < SETTINGS.min_nats:
+        return None
+    return Finding(
+        "time offset",
+        (),
+        "echoes and poses do not go together in time: the poses are "
+        f"{abs(lag):.2f} ± {error:.2f} s {'late' if lag > 0 else 'early'}",
+        confidence_of(nats / SETTINGS.echoes_per_fact),
+        f"so shifted, walls and points explain {_share(fit)} of the echoes; as recorded, with any scale of the ranges, "
+        f"{_share(without)}",
+        f"correct the stamps of the poses by {-lag:+.2f} s before they are joined with the echoes",
+    )
 
-    both: MotionFit
-    """Both are estimated."""
-    no_lag: MotionFit
-    """Only the scale is estimated."""
-    no_scale: MotionFit
-    """Only the time offset is estimated."""
-    step: float
-    """Step of the search for a time offset, seconds."""
 
-    @property
-    def lag(self) -> float:
-        """Time after an echo at which the poses of the log fit, seconds."""
-        return float(self.both.estimate[LAG])
-
-    @property
-    def scale(self) -> float:
-        """Corrected range divided by true range, minus 1."""
-        return float(self.both.estimate[SCALE])
-
-    def lag_finding(self) -> Finding | None:
-        """The finding about a time offset; None if there is none."""
-        least = max(SETTINGS.min_lag, SETTINGS.lag_steps * self.step)
-        error = float(self.both.error[LAG])
-        nats = self.both.log_likelihood - self.no_lag.log_likelihood
-        if not (abs(self.lag) > max(least, SETTINGS.lag_errors * error) and nats > SETTINGS.min_nats):
-            return None
-        side = "late" if self.lag > 0 else "early"
-        sign = "-" if self.lag > 0 else "+"
-        return Finding(
-            "time offset",
-            (),
-            f"echoes and poses do not go together in time: the poses are {abs(self.lag):.2f} ± {error:.2f} s {side}",
-            confidence_of(nats / SETTINGS.echoes_per_fact),
-            f"so shifted, walls and points explain {_share(self.both)} of the echoes; as recorded, with any scale of the "
-            f"ranges, {_share(self.no_lag)}",
-            f"correct the stamps of the poses by {sign}{abs(self.lag):.2f} s before they are joined with the echoes",
-        )
-
-    def scale_finding(self, ring: Ring) -> Finding | None:
-        """The finding about the scale of the ranges; None if it is right."""
-        error = float(np.hypot(self.both.error[SCALE], SETTINGS.odometry_scale))
-        if not abs(self.scale) > max(SETTINGS.min_scale, SETTINGS.scale_errors * error):
-            return None
-        low, high = SETTINGS.air
-        speed = float(ring.speed_of_sound) / (1 + self.scale)
-        size = f"{100 * abs(self.scale):.1f} ± {100 * error:.1f} % too {'long' if self.scale > 0 else 'short'}"
-        nats = (self.scale / error) ** 2 / 2
-        evidence = (
-            f"this is how ranges change while the robot moves: walls and points explain {_share(self.both)} of the "
-            f"echoes, with the stated scale {_share(self.no_scale)}; odometry that is {100 * abs(self.scale):.1f} % "
-            f"too {'short' if self.scale > 0 else 'long'} would look the same"
-        )
-        if low < speed < high:
-            celsius = 273.15 * ((speed / 331.3) ** 2 - 1)
-            sentence = f"all ranges are {size}: the speed of sound is {speed:.1f} m/s, the ring has "
-            sentence += f"{float(ring.speed_of_sound):.1f} m/s"
-            remedy = f"set speed_of_sound = {speed:.1f} in the ring (air of {celsius:.0f} deg C)"
-            return Finding("speed of sound", (), sentence, confidence_of(nats), evidence, remedy)
-        sentence = f"all ranges are {size}; air has no such speed of sound ({speed:.0f} m/s)"
-        remedy = f"multiply times of flight by half of {REFERENCE_SPEED_OF_SOUND} m/s; check the clock of the driver"
-        return Finding("range scale", (), sentence, confidence_of(nats), evidence, remedy)
+def _scale_finding(ring: Ring, fit: MotionFit) -> Finding | None:
+    """The finding about the scale of the ranges; None if it is right."""
+    scale, error = float(fit.estimate[SCALE]), float(np.hypot(fit.error[SCALE], SETTINGS.odometry_scale))
+    if not abs(scale) > max(SETTINGS.min_scale, SETTINGS.scale_errors * error):
+        return None
+    speed = float(ring.speed_of_sound) / (1 + scale)
+    size = f"{100 * abs(scale):.1f} ± {100 * error:.1f} % too {'long' if scale > 0 else 'short'}"
+    confidence = confidence_of((scale / error) ** 2 / 2)
+    other = f"{100 * abs(scale):.1f} % too {'short' if scale > 0 else 'long'}"
+    evidence = (
+        f"so the ranges of {fit.explained} echoes change while the robot moves, {abs(scale) / error:.0f} standard "
+        f"errors off the stated scale; odometry that is {other} would look the same"
+    )
+    if SETTINGS.air[0] < speed < SETTINGS.air[1]:
+        sentence = f"all ranges are {size}: the speed of sound is {speed:.1f} m/s, the ring has "
+        sentence += f"{float(ring.speed_of_sound):.1f} m/s"
+        celsius = 273.15 * ((speed / 331.3) ** 2 - 1)
+        remedy = f"set speed_of_sound = {speed:.1f} in the ring (air of {celsius:.0f} deg C)"
+        return Finding("speed of sound", (), sentence, confidence, evidence, remedy)
+    sentence = f"all ranges are {size}; air has no such speed of sound ({speed:.0f} m/s)"
+    remedy = f"multiply times of flight by half of {REFERENCE_SPEED_OF_SOUND} m/s; check the clock of the driver"
+    return Finding("range scale", (), sentence, confidence, evidence, remedy)
 
 
 def _share(fit: MotionFit) -> str:
     return f"{fit.explained / fit.echoes:.0%} (within {1e3 * fit.noise:.1f} mm)"
 
 
-def _estimate_motion(ring: Ring, log: Log, groups: _Groups) -> _Motion | None:
-    """Fit time offset and scale; None if the robot sees too few walls."""
-    echoes = group_echoes(ring, log, groups)
-    no_lag = fit_motion(echoes, free=(True, False))
-    if no_lag is None:
-        return None
-    step = search_step(log)
-    both = _search_motion(ring, log, groups, echoes, step) if np.isfinite(step) else None
-    both = no_lag if both is None else both
-    lag = float(both.estimate[LAG])
-    no_scale = fit_motion(echoes, lag=lag, free=(False, False))
-    return _Motion(both, no_lag, both if no_scale is None else no_scale, float(np.nan_to_num(step)))
-
-
 def _search_motion(ring: Ring, log: Log, groups: _Groups, echoes: EchoGroups, step: float) -> MotionFit | None:
-    """The most likely fit among those that start from several time offsets."""
-    best, center = None, 0.0
+    """Time offset and scale: the most likely fit among those from several time offsets; None without walls."""
+    if not np.isfinite(step):
+        return fit_motion(echoes, free=(True, False))
+    fits: list[MotionFit] = []
+    tried, center = [0.0], 0.0
     for _ in range(SETTINGS.searches):
         shifted = with_later_poses(log, center) if center else log
-        starts = [center, *(center + lag for lag in search_time_offsets(ring, shifted, groups))]
-        fits = [fit for lag in starts if (fit := fit_motion(echoes, lag=lag)) is not None]
-        best = max([*fits, *([] if best is None else [best])], key=lambda fit: fit.log_likelihood, default=None)
-        if best is None or not abs(best.estimate[LAG] - center) > step / 2:
+        starts = [center + lag for lag in search_time_offsets(ring, shifted, groups)]
+        starts = [lag for lag in starts if min(abs(lag - one) for one in tried) > step / 2]
+        fits += [fit for lag in ([] if fits else [0.0]) + starts if (fit := fit_motion(echoes, lag=lag)) is not None]
+        if not fits:
+            return None
+        best = max(fits, key=lambda fit: fit.log_likelihood)
+        lag = float(best.estimate[LAG])
+        if not abs(lag - center) > step / 2:
             break
-        center = float(best.estimate[LAG])
+        tried += [*starts, *(float(fit.estimate[LAG]) for fit in fits)]
+        center = lag
     return best
 
 

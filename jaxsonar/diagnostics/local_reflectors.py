@@ -54,7 +54,7 @@ SETTINGS = LocalReflectorSettings()
 
 @dataclass(frozen=True, eq=False)
 class EchoGroups:
-    """Echoes of groups of consecutive scans. The frame of a group has the axes of the world and the middle as origin."""
+    """Echoes of groups of consecutive scans. A group's frame has the axes of the world and its middle as origin."""
 
     ring: Ring
     path: Int[np.ndarray, " echoes"]
@@ -84,10 +84,12 @@ class EchoGroups:
         """Whether poses at other times are known."""
         return len(self.samples) > 1
 
-    def poses_after(self, lag: float) -> Float[np.ndarray, "echoes 3"]:
-        """group_from_robot a time (seconds) after the echoes were measured."""
-        pose = poses_at(self.samples[:, 0], self.samples[:, 1:], self.time + lag)
-        pose[:, :2] -= self.origin
+    def poses_after(self, lag: float, echo: Int[np.ndarray, " rows"]) -> Float[np.ndarray, "rows 3"]:
+        """group_from_robot a time (seconds) after echoes were measured."""
+        if not (lag and self.has_times):
+            return self.pose[echo]
+        pose = poses_at(self.samples[:, 0], self.samples[:, 1:], self.time[echo] + lag)
+        pose[:, :2] -= self.origin[echo]
         return pose
 
     def geometry(

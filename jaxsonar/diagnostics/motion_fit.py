@@ -1,6 +1,7 @@
 """Scale of the ranges and time offset between echoes and poses, estimated jointly with local walls."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,6 +13,7 @@ from jaxsonar.diagnostics.local_reflectors import (
     find_reflectors,
     residual_noise,
 )
+from jaxsonar.geometry.se2 import perpendicular, wrap_angle
 from jaxsonar.sensors.range_models import PredictedRange, predict_ranges
 
 SCALE, LAG = 0, 1
@@ -23,18 +25,26 @@ class MotionFitSettings:
 
     iterations: int = 6
     """Iterations of the reweighted least squares, ..."""
-    rounds: int = 3
+    rounds: int = 2
     """... after which the echoes are assigned again, this many times."""
     time_step: float = 0.02
     """Half the time over which the motion of the robot is differentiated, seconds."""
-    prior_information: float = 1e-3
-    """Added to the information of walls and points."""
-    min_information: float = 1e-2
-    """Information (sum of squared derivatives) from which on a parameter is observable."""
+    prior_information: float = 1e-2
+    """Added to the information of walls, points and poses."""
+    first_noise: float = 0.02
+    """Standard deviation of the residuals at the beginning, metres."""
+    odometry: tuple[float, float] = (0.01, float(np.radians(0.5)))
+    """Errors of odometry after one metre, standard deviations, metres and radians."""
+    odometry_floor: tuple[float, float] = (0.0005, float(np.radians(0.05)))
+    """Errors of a short step of it."""
+    slip: float = 0.01
+    """Error of a turn, as a share of it."""
+    min_information: float = 1.0
+    """Information (inverse variance) from which on a parameter is observable."""
     largest_step: tuple[float, float] = (0.1, 0.2)
     """Largest change of scale and time offset (seconds) in one iteration."""
     min_groups: int = 4
-    """Groups of scans that an estimate needs; their scatter gives its standard error."""
+    """Groups of scans that an estimate needs."""
 
 
 SETTINGS = MotionFitSettings()
@@ -48,7 +58,7 @@ class MotionFit:
     """Corrected range divided by true range, minus 1; and the time after an echo at which the poses of the log fit,
     seconds. NaN where it cannot be estimated."""
     error: Float[np.ndarray, " 2"]
-    """Standard errors by the scatter between groups of scans (jackknife)."""
+    """Standard errors, from the noise, the odometry, and the scatter between groups of scans."""
     noise: float
     """Robust standard deviation of the residuals, metres."""
     explained: int
@@ -75,9 +85,11 @@ def fit_motion(groups: EchoGroups, *, lag: float = 0.0, free: tuple[bool, bool] 
     Returns:
         The estimates; None if there are too few groups with walls.
     """
-    value, fit = np.array([0.0, lag]), None
+    value, fit, everything = np.array([0.0, lag]), None, np.arange(len(groups.path))
     for _ in range(SETTINGS.rounds):
-        found = find_reflectors(replace(groups, range=groups.range / (1 + value[SCALE])), _poses(groups, value[LAG]))
+        found = find_reflectors(
+            replace(groups, range=groups.range / (1 + value[SCALE])), groups.poses_after(value[LAG], everything)
+        )
         if len(np.unique(found.group)) < SETTINGS.min_groups:
             return None
         fit = _solve(groups, found, value, np.array(free))
@@ -85,49 +97,115 @@ def fit_motion(groups: EchoGroups, *, lag: float = 0.0, free: tuple[bool, bool] 
     return fit
 
 
-def _poses(groups: EchoGroups, lag: float) -> Float[np.ndarray, "echoes 3"]:
-    return groups.poses_after(lag) if lag and groups.has_times else groups.pose
-
-
 def _solve(
     groups: EchoGroups, found: LocalReflectors, start: Float[np.ndarray, " 2"], free: Bool[np.ndarray, " 2"]
 ) -> MotionFit:
-    """Robust least squares over all reflectors and the two parameters; the reflectors are eliminated (Schur)."""
-    value, landmark, echo = start.copy(), found.parameters.copy(), found.echo
-    kind, path, measured = found.kind[found.reflector], groups.path[echo], groups.range[echo]
-    count, group = groups.count, found.group[found.reflector]
-    information, gradient, noise, weight = np.zeros((count, 2, 2)), np.zeros((count, 2)), 0.0, np.ones(len(echo))
-
-    def predict(lag: float) -> PredictedRange:
-        pose = _poses(groups, lag)[echo]
-        return predict_ranges(kind, landmark[found.reflector], *groups.geometry(pose, path))
-
+    """Robust least squares over reflectors, poses and the two parameters."""
+    value, parts = start.copy(), [_Part(groups, found, number) for number in np.unique(found.group)]
+    noise, residual = SETTINGS.first_noise, np.zeros(0)
+    reduced: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(SETTINGS.iterations):
-        predicted = predict(value[LAG])
-        factor = 1 + value[SCALE]
-        residual = measured - factor * predicted.range
-        noise = residual_noise(residual)
-        weight = biweight(residual, noise)
-        d_landmark, d_value = factor * predicted.d_range_d_landmark, np.zeros((len(echo), 2))
-        d_value[:, SCALE] = predicted.range  # not the measured range: its noise would bias the estimate
-        if groups.has_times:
-            step = SETTINGS.time_step
-            change = predict(value[LAG] + step).range - predict(value[LAG] - step).range
-            d_value[:, LAG] = factor * change / (2 * step)
-        block = _sum_by(found.reflector, weight[:, None, None] * _outer(d_landmark, d_landmark), len(landmark))
-        coupling = _sum_by(found.reflector, weight[:, None, None] * _outer(d_landmark, d_value), len(landmark))
-        pull = _sum_by(found.reflector, (weight * residual)[:, None] * d_landmark, len(landmark))
-        cov = np.linalg.inv(block + SETTINGS.prior_information * np.eye(2))
-        reduced = np.einsum("wik,wij->wkj", coupling, cov)
-        information = _sum_by(group, weight[:, None, None] * _outer(d_value, d_value), count)
-        information -= _sum_by(found.group, reduced @ coupling, count)
-        gradient = _sum_by(group, (weight * residual)[:, None] * d_value, count)
-        gradient -= _sum_by(found.group, (reduced @ pull[..., None])[..., 0], count)
-        step = _solution(information.sum(axis=0), gradient.sum(axis=0), free)
-        landmark += np.einsum("wij,wj->wi", cov, pull - coupling @ step)
+        reduced = [part.reduced_system(value, noise) for part in parts]
+        step = _solution(sum(a for a, _ in reduced), sum(g for _, g in reduced), free)
+        for part in parts:
+            part.move(step)
         value += step
-    estimate, error = _jackknife(information, gradient, value, free)
-    return MotionFit(estimate, error, noise, int((weight > 0).sum()), len(groups.path), groups.ring.max_range)
+        residual = np.concatenate([part.residual(value) for part in parts])
+        noise = residual_noise(residual)
+    explained = int((biweight(residual, noise) > 0).sum())
+    information, gradient = (np.array(one) for one in zip(*reduced, strict=True))
+    estimate, error = _errors(information, gradient, value, free)
+    return MotionFit(estimate, error, noise, explained, len(groups.path), groups.ring.max_range)
+
+
+class _Part:
+    """One group of scans: its echoes, reflectors, and corrections of its poses."""
+
+    def __init__(self, groups: EchoGroups, found: LocalReflectors, number: int):
+        """Take the echoes and the reflectors of a group."""
+        own = found.group == number
+        self.groups, self.kind, self.landmark = groups, found.kind[own], found.parameters[own].copy()
+        of_group = own[found.reflector]
+        self.echo = found.echo[of_group]
+        self.reflector = np.cumsum(own)[found.reflector[of_group]] - 1
+        self.path, self.measured = groups.path[self.echo], groups.range[self.echo]
+        rows, first, self.scan = np.unique(groups.scan[self.echo], return_index=True, return_inverse=True)
+        self.correction = np.zeros((len(rows), 3))
+        self.prior = _odometry_information(groups.pose[self.echo[first]])
+        self.system: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def residual(self, value: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " echoes"]:
+        """Measured minus predicted ranges, metres."""
+        return self.measured - (1 + value[SCALE]) * self._predict(value[LAG])[0].range
+
+    def _predict(self, lag: float) -> tuple[PredictedRange, Float[np.ndarray, "echoes 3"]]:
+        pose = self.groups.poses_after(lag, self.echo) + self.correction[self.scan]
+        geometry = self.groups.geometry(pose, self.path)
+        predicted = predict_ranges(self.kind[self.reflector], self.landmark[self.reflector], *geometry)
+        lever = perpendicular(geometry[0] - pose[:, :2])
+        turning = (predicted.d_range_d_midpoint * lever).sum(axis=-1)
+        turning += (predicted.d_range_d_half_baseline * perpendicular(geometry[1])).sum(axis=-1)
+        return predicted, np.column_stack([predicted.d_range_d_midpoint, turning])
+
+    def reduced_system(
+        self, value: Float[np.ndarray, " 2"], noise: float
+    ) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, " 2"]]:
+        """Normal equations of the two parameters; reflectors and poses are eliminated (Schur complement)."""
+        predicted, d_pose = self._predict(value[LAG])
+        factor, row = 1 + value[SCALE], np.arange(len(self.echo))
+        residual = self.measured - factor * predicted.range
+        weight = biweight(residual, noise) / noise**2
+        poses, landmarks = self.correction.size, self.landmark.size
+        jacobian = np.zeros((len(row), poses + landmarks + 2))
+        for k in range(3):
+            jacobian[row, 3 * self.scan + k] = factor * d_pose[:, k]
+        for k in range(2):
+            jacobian[row, poses + 2 * self.reflector + k] = factor * predicted.d_range_d_landmark[:, k]
+        # Not the measured range: its noise would bias the estimate.
+        jacobian[:, poses + landmarks + SCALE] = predicted.range
+        if self.groups.has_times:
+            step = SETTINGS.time_step
+            change = self._predict(value[LAG] + step)[0].range - self._predict(value[LAG] - step)[0].range
+            jacobian[:, poses + landmarks + LAG] = factor * change / (2 * step)
+        information = jacobian.T @ (weight[:, None] * jacobian)
+        gradient = jacobian.T @ (weight * residual)
+        information[:poses, :poses] += self.prior
+        gradient[:poses] -= self.prior @ self.correction.ravel()
+        own, rest = slice(0, poses + landmarks), slice(poses + landmarks, None)
+        information[own, own] += SETTINGS.prior_information * np.eye(poses + landmarks)
+        cov = np.linalg.inv(information[own, own])
+        coupling = information[own, rest]
+        self.system = cov, coupling, gradient[own]
+        return information[rest, rest] - coupling.T @ cov @ coupling, gradient[rest] - coupling.T @ cov @ gradient[own]
+
+    def move(self, step: Float[np.ndarray, " 2"]) -> None:
+        """Change reflectors and poses after a step of the two parameters."""
+        if self.system is None:
+            return
+        cov, coupling, gradient = self.system
+        change = cov @ (gradient - coupling @ step)
+        self.correction += change[: self.correction.size].reshape(-1, 3)
+        self.landmark += change[self.correction.size :].reshape(-1, 2)
+
+
+def _odometry_information(pose: Float[np.ndarray, "scans 3"]) -> Float[np.ndarray, "corrections corrections"]:
+    """Information of the corrections of consecutive poses with odometry between them; the middle one is fixed."""
+    total = np.zeros((3 * len(pose), 3 * len(pose)))
+    middle = 3 * (len(pose) // 2) + np.arange(3)
+    total[middle, middle] = 1 / np.array(SETTINGS.odometry_floor)[[0, 0, 1]] ** 2
+    for k, (before, after) in enumerate(pairwise(pose)):
+        way = after[:2] - before[:2]
+        travelled, turn = np.hypot(*way), abs(wrap_angle(after[2] - before[2]))
+        place = SETTINGS.odometry_floor[0] ** 2 + SETTINGS.odometry[0] ** 2 * travelled
+        angle = SETTINGS.odometry_floor[1] ** 2 + SETTINGS.odometry[1] ** 2 * travelled + (SETTINGS.slip * turn) ** 2
+        jacobian = np.zeros((3, 6))
+        jacobian[:, 3:] = np.eye(3)
+        jacobian[:, :3] = -np.eye(3)
+        jacobian[:2, 2] = -perpendicular(way)
+        total[3 * k : 3 * k + 6, 3 * k : 3 * k + 6] += (
+            jacobian.T @ np.diag([1 / place, 1 / place, 1 / angle]) @ jacobian
+        )
+    return total
 
 
 def _solution(
@@ -140,26 +218,21 @@ def _solution(
     return np.clip(step, -np.array(SETTINGS.largest_step), SETTINGS.largest_step)
 
 
-def _jackknife(
+def _errors(
     information: Float[np.ndarray, "groups 2 2"],
     gradient: Float[np.ndarray, "groups 2"],
     value: Float[np.ndarray, " 2"],
     free: Bool[np.ndarray, " 2"],
 ) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
-    """Estimates, and their standard errors from the estimates without one group each; NaN where not observable."""
-    total, pull = information.sum(axis=0), gradient.sum(axis=0)
-    count = len(information)
-    left = np.array([_solution(total - a, pull - g, free) for a, g in zip(information, gradient, strict=True)])
-    error = np.sqrt((count - 1) / count * ((left - left.mean(axis=0)) ** 2).sum(axis=0))
-    known = ~free | (np.diag(total) > SETTINGS.min_information)
-    return np.where(known, value, np.nan), np.where(known, error, np.nan)
+    """Estimates and standard errors; NaN where not observable.
 
-
-def _outer(a: Float[np.ndarray, "rows n"], b: Float[np.ndarray, "rows m"]) -> Float[np.ndarray, "rows n m"]:
-    return a[:, :, None] * b[:, None, :]
-
-
-def _sum_by(group: np.ndarray, values: np.ndarray, groups: int) -> np.ndarray:
-    total = np.zeros((groups, *values.shape[1:]))
-    np.add.at(total, group, values)
-    return total
+    The errors of the least squares grow if the groups contradict each other more than these errors allow (Birge ratio).
+    """
+    total, of_group = information.sum(axis=0), np.diagonal(information, axis1=1, axis2=2)
+    known = np.diag(total) > SETTINGS.min_information
+    which, error = np.flatnonzero(free & known), np.zeros(2)
+    error[which] = np.sqrt(np.diag(np.linalg.inv(total[np.ix_(which, which)])))
+    pull = np.divide(gradient**2, of_group, out=np.zeros_like(gradient), where=of_group > SETTINGS.min_information)
+    dispersion = pull.sum(axis=0) / max(len(information) - 1, 1)
+    error *= np.sqrt(np.maximum(dispersion, 1))
+    return np.where(known | ~free, value, np.nan), np.where(known | ~free, error, np.nan)

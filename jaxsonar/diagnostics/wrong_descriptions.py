@@ -164,8 +164,7 @@ def _mounted(ring: Ring, log: Log) -> Iterator[Description]:
         yield Description(
             "rotated ring",
             f"the ring is mounted {abs(signed):g} deg too far {side}{steps}",
-            f"add {signed:g} deg to the ring's first_heading_deg, or rotate its sensors, unless the axes of the poses are "
-            "turned",
+            f"rotate the ring's sensors by {signed:g} deg (first_heading_deg), or turn the axes of the poses",
             replace(ring, position=rotate(position, np.array(turn)), heading=heading + turn),
             log,
         )
