@@ -92,11 +92,11 @@ class Alternative:
 
     def implausibilities(self) -> Iterator[Implausibility]:
         """The mistakes in words."""
-        support = f"{self.given.mean_support:.0%} of the scans around an echo agree with it"
-        what = f"only {support}, but {self.corrected.mean_support:.0%} if {self.mistake}"
+        what = f"only {self.given.mean_support:.0%} of the scans around an echo agree with it"
         for one in self.corrections:
-            names = [one.mistake, *one.equivalents, *(tie.mistake for tie in self.ties)]
-            yield Implausibility(one.kind, what, f"probably {', or '.join(names)}", one.remedy)
+            others = [*one.equivalents, *(tie.mistake for tie in self.ties)]
+            cause = f"probably {self.mistake} ({self.corrected.mean_support:.0%} agree)"
+            yield Implausibility(one.kind, what, ", or ".join([cause, *others]), one.remedy)
 
 
 def find_mistakes(ring: Ring, log: Log) -> list[Alternative]:

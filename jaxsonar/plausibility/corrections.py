@@ -44,46 +44,39 @@ class Correction:
 
 def heading_corrections() -> list[Correction]:
     """Headings in degrees, clockwise, or as a compass shows them."""
-    tables = "of a table, give --angle-unit deg"
-    degrees = "give them in radians (log x pi / 180)"
-    found = []
-    for kind, mistake, remedy, unit, sign, offset in (
-        ("heading unit", "the headings are in degrees", f"{degrees}; {tables}", np.pi / 180, 1, 0.0),
+    degrees, clockwise, compass = np.pi / 180, "clockwise", "compass headings"
+    rows = (
+        ("heading unit", "in degrees", "give radians", "--angle-unit deg", degrees, 0.0),
+        ("heading direction", f"{clockwise}", "negate theta", "--clockwise", -1.0, 0.0),
         (
             "heading direction",
-            "the headings grow clockwise",
-            "negate theta; of a table, give --clockwise",
-            1.0,
-            -1,
-            0.0,
-        ),
-        (
-            "heading direction",
-            "the headings are compass headings, clockwise from the y axis",
-            "give pi / 2 - theta; of a table, give --compass",
-            1.0,
-            -1,
+            f"{compass}, {clockwise} from the y axis",
+            "give pi / 2 - theta",
+            "--compass",
+            -1.0,
             np.pi / 2,
         ),
         (
             "heading unit",
-            "the headings are in degrees and grow clockwise",
-            f"negate them and {degrees}; {tables} --clockwise",
-            np.pi / 180,
-            -1,
+            f"in degrees and {clockwise}",
+            "give radians, counter-clockwise",
+            "--angle-unit deg --clockwise",
+            -degrees,
             0.0,
         ),
         (
             "heading unit",
-            "the headings are compass headings in degrees, clockwise from the y axis",
-            f"subtract them from 90 and {degrees}; {tables} --compass",
-            np.pi / 180,
-            -1,
+            f"{compass} in degrees, {clockwise} from the y axis",
+            "give radians, counter-clockwise from x",
+            "--angle-unit deg --compass",
+            -degrees,
             np.pi / 2,
         ),
-    ):
-        found.append(Correction(kind, mistake, remedy, _headings(unit * sign, offset)))
-    return found
+    )
+    return [
+        Correction(kind, f"the headings are {what}", f"{remedy} (of a table: {option})", _headings(scale, offset))
+        for kind, what, remedy, option, scale, offset in rows
+    ]
 
 
 def axis_corrections() -> list[Correction]:
@@ -97,7 +90,7 @@ def axis_corrections() -> list[Correction]:
         Correction(
             "axes",
             "y of the poses is negated",
-            "y must grow to the left of x: negate it; of a table, give --y-right",
+            "give y that grows to the left of x (of a table: --y-right)",
             positions([[1.0, 0.0], [0.0, -1.0]]),
         ),
         Correction("axes", "x of the poses is negated", "negate it", positions([[-1.0, 0.0], [0.0, 1.0]])),
@@ -112,7 +105,7 @@ def pose_unit_corrections(log: Log) -> list[Correction]:
     for unit, name, short in ((1e-3, "millimetres", "mm"), (1e-2, "centimetres", "cm")):
         if extent * unit >= SETTINGS.least_extent:
             scale = np.array([unit, unit, 1.0])
-            remedy = f"give metres: divide x and y by {1 / unit:g}; of a table, give --pose-unit {short}"
+            remedy = f"give metres: divide x and y by {1 / unit:g} (of a table: --pose-unit {short})"
             apply = _poses(lambda pose, scale=scale: pose * scale)
             found.append(Correction("pose unit", f"x and y of the poses are in {name}", remedy, apply))
     return found

@@ -60,7 +60,7 @@ def _distant_scans(ring: Ring, log: Log) -> list[Implausibility]:
         return []
     what = f"the robot moves by {np.median(step):.3g} m from scan to scan, but the sensors reach {ring.max_range:g} m"
     cause = "x and y of the poses are probably in millimetres or centimetres"
-    return [Implausibility("pose unit", what, cause, "give metres; of a table, give --pose-unit")]
+    return [Implausibility("pose unit", what, cause, "give metres (of a table: --pose-unit)")]
 
 
 def _unexplained_echoes(ring: Ring, log: Log) -> list[Implausibility]:

@@ -149,8 +149,8 @@ def _check_numbering(filename: str | os.PathLike[str], log: Log, ring: "Ring | N
         return
     first = min(int(log.tx.min()), int(log.rx.min()))
     last = max(int(log.tx.max()), int(log.rx.max()))
-    if first == 1 and last == ring.count:
-        came = f"the sensors 1 to {last} came, so the log seems to count from 1"
+    if first >= 1 and last == ring.count:
+        came = f"the sensors {first} to {last} came, so the log seems to count from 1"
         raise SonarError(f"{shown(filename)}: {came}; allowed are 0 to {ring.count - 1}, the sensors of '{ring.name}'")
 
 
