@@ -137,18 +137,22 @@ def main() -> None:
     options = options.parse_args()
     logs = options.logs or (3 if options.quick else 30)
     outcomes, stderr = [], Console(stderr=True)
-    for cause in options.only:
-        for seed in range(options.seed, options.seed + logs):
+    make_folder(options.output)
+    for seed in range(options.seed, options.seed + logs):
+        for cause in options.only:
             one = outcome(case(cause, seed))
             outcomes.append(one)
             text = f"{cause} {seed} ({one.detail}): {one.result}, {one.seconds:.1f} s" + "".join(
                 f"\n    {sentence}" for sentence in one.sentences
             )
             stderr.print(text, highlight=False, soft_wrap=True, markup=False)
-    make_folder(options.output)
-    with atomic_write(options.output / "confusion.json") as file:
-        json.dump({"versions": environment(), "outcomes": [asdict(one) for one in outcomes]}, file, indent=1)
+        _write(outcomes, options.output / "confusion.json")
     Console(width=160).print(table(outcomes))
+
+
+def _write(outcomes: Sequence[Outcome], filename: Path) -> None:
+    with atomic_write(filename) as file:
+        json.dump({"versions": environment(), "outcomes": [asdict(one) for one in outcomes]}, file, indent=1)
 
 
 if __name__ == "__main__":

@@ -147,8 +147,8 @@ _WRONG_LOGS: dict[str, tuple[Callable[[Scene], Log], str, tuple[str, ...]]] = {
 _WRONG_RINGS: dict[str, tuple[Callable[[Ring], dict[str, object]], str]] = {
     "beam in radians": (lambda ring: {"beam": np.radians(np.asarray(ring.beam))}, r"radian"),
     "half the beam": (lambda ring: {"beam": np.asarray(ring.beam) / 2}, r"half"),
-    "speed in cm/s": (lambda ring: {"speed_of_sound": 34320.0}, r"cm/s"),
-    "speed in km/h": (lambda ring: {"speed_of_sound": 1235.5}, r"km/h"),
+    "speed in cm/s": (lambda ring: {"speed_of_sound": 34320.0}, r"cm/s|centimetres per second"),
+    "speed in km/h": (lambda ring: {"speed_of_sound": 1235.5}, r"km/h|kilometres per hour"),
     "speed in ft/s": (lambda ring: {"speed_of_sound": 1126.0}, r"ft/s|feet"),
     "radius in mm": (lambda ring: {"position": 1000 * np.asarray(ring.position)}, r"\bmm\b|millimetre"),
     "radius in cm": (lambda ring: {"position": 100 * np.asarray(ring.position)}, r"\bcm\b|centimetre"),
