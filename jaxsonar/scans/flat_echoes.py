@@ -123,7 +123,7 @@ class FlatEchoes:
         sensor = np.maximum(log.tx, log.rx)
         if (sensor >= ring.count).any():
             k = int(np.argmax(sensor >= ring.count))
-            from_one = min(log.tx.min(), log.rx.min()) >= 1 and sensor.max() == ring.count
+            from_one = bool(min(log.tx.min(), log.rx.min()) >= 1 and sensor.max() == ring.count)
             raise SonarError(
                 f"scan {log.scan[log.echo_scan[k]]}: echo of sensors tx {log.tx[k]}, rx {log.rx[k]}; allowed are 0 to "
                 f"{ring.count - 1}, the sensors of {ring.name!r}" + "; the log seems to count from 1" * from_one
