@@ -12,11 +12,13 @@ from jaxsonar.calibration.autofocus import autofocus_ring
 from jaxsonar.calibration.beam_headings import estimate_headings
 from jaxsonar.calibration.calibration_result import Calibration
 from jaxsonar.calibration.settings import SETTINGS
-from jaxsonar.detection.extract import check_sigma
+from jaxsonar.detection.extract import check_sigma, local_models
 from jaxsonar.estimation.estimation_log import estimation_log
 from jaxsonar.estimation.explained_share import ExplainedShare
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import build_map
+from jaxsonar.plausibility.implausible_poses import implausible_poses
+from jaxsonar.plausibility.range_units import find_range_unit
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import check_window
 from jaxsonar.sensors.ring import Ring, speed_of_sound
@@ -60,13 +62,16 @@ def calibrate(
         on_step: called with a description of each step.
 
     Raises:
-        SonarError: an invalid choice, a speed of sound that air does not have, trusted logs without poses, too few
-            walls or explained echoes, a result outside the plausible range.
+        SonarError: an invalid choice, a speed of sound that air does not have, trusted logs without poses, a log that
+            agrees better with other units, axes or numbers of the sensors, too few walls or explained echoes, a result
+            outside the plausible range.
     """
     logs = [estimation_log(one) for one in ([log] if isinstance(log, Log) else log)]
     progress = on_step or (lambda text: None)
     _check_arguments(ring, logs, free, poses, odometry, temperature, sigma, window)
     poses_free = poses == "estimate"
+    for one in logs:
+        _check_plausible(ring, one)
     # 1. Priors: the speed of sound of the measured temperature, and a basis of the free parameters.
     prior_ring, speed_sd = ring, PRIOR.speed_sd
     if temperature is not None:
@@ -86,8 +91,12 @@ def calibrate(
     # 4. The mean range offset, if second-order echoes determine it.
     fit, mean_held = problem.fit_mean_offset(fit) if "offset" in free else (fit, "")
     covariance = problem.parameter_covariance(fit.adjustment)
-    explained = ExplainedShare(fit.explained_count / max(fit.data.echo_count, 1), SETTINGS.min_explained)
-    _check_result(problem, fit, explained)
+    _check_result(problem, fit)
+    explained = _explained(problem, fit)
+    if not explained.suffices:
+        raise SonarError(
+            f"calibration: walls and corners {explained.shortfall}: is it the right ring, are poses and units right?"
+        )
     calibrated, heading_sd = problem.ring_at(fit.adjustment.state), np.zeros(ring.count)
     # 5. Headings, from the directions in which echoes are received at all; ranges do not depend on them.
     if "heading" in free:
@@ -165,13 +174,40 @@ def _check_arguments(
     check_speed_of_sound(ring)
 
 
-def _check_result(problem: CalibrationProblem, fit: CalibrationFit, explained: ExplainedShare) -> None:
+def _check_plausible(ring: Ring, log: Log) -> None:
+    """Raise a SonarError for a log whose echoes agree better with another description, or not with its poses.
+
+    Walls and a ring that fit a part of the echoes by chance can be found for a wrong log, too.
+    """
+    unit = find_range_unit(ring, log)
+    for found in [unit.implausibility] if unit else implausible_poses(ring, log):
+        raise SonarError(f"calibration: refused, because {found}")
+
+
+def _explained(problem: CalibrationProblem, fit: CalibrationFit) -> ExplainedShare:
+    """Share of the echoes that the walls and corners of all scans explain.
+
+    Walls and corners of single scans do not depend on the poses. If they explain much more, the poses are wrong.
+    """
+    measured, required = fit.explained_count / max(fit.data.echo_count, 1), SETTINGS.min_explained
+    if problem.window is None:
+        alone = max(_explained_alone(problem.ring_at(fit.adjustment.state), log) for log in fit.logs)
+        required = max(required, SETTINGS.min_explained_of_alone * alone)
+    return ExplainedShare(measured, required)
+
+
+def _explained_alone(ring: Ring, log: Log) -> float:
+    """Share of the echoes of some scans that walls and corners of the same scan explain."""
+    posed = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
+    rows = posed[:: max(1, len(posed) // SETTINGS.judged_scans)]
+    some = Log.from_scans([log[row] for row in rows.tolist()])
+    features = [(*model.lines, *model.points) for model in local_models(ring, some)]
+    return sum(one.echoes for found in features for one in found) / max(some.echo_count, 1)
+
+
+def _check_result(problem: CalibrationProblem, fit: CalibrationFit) -> None:
     """Raise a SonarError for a result outside the plausible range."""
     count = problem.ring.count
-    if not explained.suffices:
-        raise SonarError(
-            f"calibration: walls and corners {explained.shortfall}: is it the right ring, are poses and units right?"
-        )
     change = problem.basis.columns @ fit.adjustment.state.coordinates
     offset, log_speed = change[:count], float(change[count])
     worst = int(np.argmax(np.abs(offset)))

@@ -34,6 +34,11 @@ class CalibrationSettings:
     """Largest change of a range offset, metres; beyond, scans were registered wrongly."""
     min_explained: float = 0.15
     """Smallest fraction of echoes that the map must explain."""
+    min_explained_of_alone: float = 0.4
+    """Smallest fraction of echoes that the map must explain, relative to the fraction that single scans explain. With
+    right poses it is about 1, with poses in a wrong order 0.2."""
+    judged_scans: int = 50
+    """Number of scans, evenly selected, of which that is determined."""
     unobserved_sd: float = 0.7
     """A parameter is reported as unobserved if its standard deviation exceeds this fraction of its prior one."""
 

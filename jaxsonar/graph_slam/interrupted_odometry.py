@@ -118,10 +118,9 @@ def _bridge(log: Log, jump: OdometryJump) -> Log:
     earlier, later = posed[max(at - 1, 0)], posed[min(at + 2, len(posed) - 1)]
     before, within, after = _steps(log, jump)
     # Half of the jump at the velocity before it, half at the velocity after it.
-    half = [within / (2 * duration) if duration > 0 else 0.0 for duration in (before, after)]
-    first, last = log.pose[jump.before], log.pose[jump.after]
-    middle = interpolate(log.pose[earlier], first, np.array(1 + half[0]))
-    middle_of_new = interpolate(last, log.pose[later], np.array(-half[1]))
+    share = [within / (2 * duration) if duration > 0 else 0.0 for duration in (before, after)]
+    start, end = log.pose[[earlier, jump.after]], log.pose[[jump.before, later]]
+    middle, middle_of_new = interpolate(start, end, np.array([1 + share[0], -share[1]]))
     old_from_new = compose(middle, inverse(middle_of_new))
     pose = log.pose.copy()
     pose[jump.after :] = compose(old_from_new, pose[jump.after :])

@@ -150,13 +150,16 @@ def _confirmed_points(observations: PointLandmarks, min_scans: int, systematic_e
 
 
 def _as_global_map(walls: WallSegments, points: PointLandmarks) -> GlobalMap:
-    """Walls and points with standard deviations that include the observed scatter, sorted by number of echoes."""
+    """Walls and points with standard deviations that include the observed scatter, sorted by number of echoes.
+
+    A single observation has no scatter; the covariance that its local model states is a lower bound, and left out.
+    """
     walls = walls.take(np.lexsort((walls.center[:, 1], walls.center[:, 0], -walls.echoes)))
     points = points.take(np.lexsort((points.position[:, 1], points.position[:, 0], -points.echoes)))
     rho = (walls.normal * walls.center).sum(-1)
     moment_arm = (walls.tangent * walls.center).sum(-1)
     # The variance factor comes from the scatter of the segments about their wall; the expected one counts once more.
-    variance_factor = (walls.chi_squared + 2) / (2 * walls.count)
+    variance_factor = np.where(walls.count > 1, (walls.chi_squared + 2) / (2 * walls.count), np.nan)
     sigma_theta = np.sqrt(variance_factor / walls.info_theta)
     sigma_rho = np.sqrt(variance_factor / walls.info_offset + (moment_arm * sigma_theta) ** 2)
     theta = np.where(rho < 0, walls.theta + np.pi, walls.theta)
@@ -170,7 +173,7 @@ def _as_global_map(walls: WallSegments, points: PointLandmarks) -> GlobalMap:
         scans=walls.scan_lists(),
         points=points.position,
         point_kinds=points.kinds,
-        point_cov=points.inflated_cov,
+        point_cov=np.where((points.count > 1)[:, None, None], points.inflated_cov, np.nan),
         point_echoes=points.echoes,
         point_scans=points.scan_lists(),
     )

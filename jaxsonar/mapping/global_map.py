@@ -25,8 +25,8 @@ class GlobalMap:
     theta: Float[np.ndarray, " segments"]
     """Direction of the line's normal, radians, in [-pi, pi)."""
     sigma_rho: Float[np.ndarray, " segments"]
-    """Standard deviation of rho, metres, from the scatter of the fused lines. For a single line it is that of its
-    covariance, or 10 mm and 3 degrees if it has none. NaN where it is unknown."""
+    """Standard deviation of rho, metres, from the scatter of the fused lines; NaN where it is unknown, as for a single
+    line."""
     sigma_theta: Float[np.ndarray, " segments"]
     """Standard deviation of theta, radians; NaN where it is unknown."""
     echoes: Int[np.ndarray, " segments"]

@@ -24,7 +24,7 @@ from support.adjustment_problem import (
 )
 
 from jaxsonar import kernels
-from jaxsonar.estimation.sparse_adjustment import marginal_covariances, solve_adjustment
+from jaxsonar.estimation.sparse_adjustment import absorbed_freedom, marginal_covariances, solve_adjustment
 
 
 @pytest.fixture(autouse=True)
@@ -86,6 +86,19 @@ def test_dense_solvers_find_the_same(rng, odometry, odometry_scale):
     assert found.cost < 1e-2 * found.initial_cost
     np.testing.assert_allclose(found.initial_cost, kernels.cost(problem, start), rtol=1e-12)
     np.testing.assert_allclose(found.cost, kernels.cost(problem, found.unknowns), rtol=1e-12)
+
+
+@pytest.mark.parametrize("poses_free", [False, True])
+def test_the_absorbed_freedom_is_the_trace_of_the_hat_matrix_of_the_echoes(rng, odometry, poses_free):
+    problem, _, true = problem_with_truth(rng, odometry=odometry)
+    found = absorbed_freedom(problem, true, poses_free=poses_free)
+    jacobian, size = np.asarray(dense_jacobian(true, problem)), problem.basis.shape[1]
+    if not poses_free:
+        jacobian = np.delete(jacobian, slice(size, size + 3 * SCANS), axis=1)
+    echoes = jacobian[: SCANS * ECHOES]
+    expected = np.trace(echoes @ np.linalg.inv(jacobian.T @ jacobian) @ echoes.T)
+    assert found == pytest.approx(expected, rel=0.2)
+    assert found < jacobian.shape[1]
 
 
 @pytest.mark.slow
