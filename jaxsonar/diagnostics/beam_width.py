@@ -1,5 +1,7 @@
 """Width and direction of the detection cones, from which walls were detected at which off-axis angle."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize
@@ -90,30 +92,43 @@ def fit_cone(
     return best, error
 
 
+class EachCone(NamedTuple):
+    """The cone of each sensor. NaN where there are too few echoes."""
+
+    half_width: Float[np.ndarray, "sensors 2"]
+    """Half width and its standard deviation, radians."""
+    direction: Float[np.ndarray, "sensors 2"]
+    """Direction of the middle relative to the sensor's heading, counter-clockwise, and its standard deviation,
+    radians."""
+    nats: Float[np.ndarray, " sensors"]
+    """Log-likelihood ratio of the best direction to the sensor's heading."""
+
+
 def fit_each_cone(
     expected: Int[np.ndarray, "sensors bins"],
     detected: Int[np.ndarray, "sensors bins"],
     curve: Float[np.ndarray, " 4"],
-) -> tuple[Float[np.ndarray, "sensors 2"], Float[np.ndarray, "sensors 2"]]:
-    """Half width and direction of each sensor's cone, with standard deviations, radians.
+) -> EachCone:
+    """The cone of each sensor, with the roll-off of the common curve.
 
-    Both are means over their posterior on a grid. The roll-off is that of the common curve. NaN where there are too few
-    echoes.
+    Widths and directions are means over their posterior on a grid.
     """
     sensors = len(expected)
     if not np.isfinite(curve).all():
-        return np.full((sensors, 2), np.nan), np.full((sensors, 2), np.nan)
+        return EachCone(*np.full((2, sensors, 2), np.nan), np.full(sensors, np.nan))
     half_width = np.radians(np.arange(3, 90, 1.0))
-    direction = np.radians(np.arange(-30, 30.5, 0.5))
+    direction = np.radians(np.arange(-_CONES.most_turn_deg, _CONES.most_turn_deg + 1, 1.0))
     outside = np.abs(BIN_CENTERS - direction[:, None])[None] - half_width[:, None, None]
     rolloff = 1 / (1 + np.exp(np.clip(outside / max(curve[1], _CONES.bin_width / 2), -50, 50)))
     # A sensor that detects less in all directions does not have a narrower cone: scale its curve.
     usual = expected @ detection_probability(curve, BIN_CENTERS)
     level = np.clip(detected.sum(axis=1) / np.maximum(usual, 1), 0.2, 1 / curve[2]) * curve[2]
     estimates: tuple[list[tuple[float, float]], list[tuple[float, float]]] = ([], [])
-    for n, k, inside in zip(expected, detected, level, strict=True):
+    nats = np.full(sensors, np.nan)
+    for k, (n, found, inside) in enumerate(zip(expected, detected, level, strict=True)):
         p = np.clip(curve[3] + (inside - curve[3]) * rolloff, 1e-3, 1 - 1e-3)
-        log_likelihood = np.log(p) @ k + np.log(1 - p) @ (n - k)
+        log_likelihood = np.log(p) @ found + np.log(1 - p) @ (n - found)
+        nats[k] = log_likelihood.max() - log_likelihood[:, len(direction) // 2].max()
         posterior = np.exp(log_likelihood - log_likelihood.max())
         posterior /= posterior.sum()
         for values, axis, estimate in ((half_width, 1, estimates[0]), (direction, 0, estimates[1])):
@@ -124,4 +139,4 @@ def fit_each_cone(
     widths, directions = (
         np.where((enough & (x[:, 1] < _CONES.max_error))[:, None], x, np.nan) for x in map(np.array, estimates)
     )
-    return widths, directions
+    return EachCone(widths, directions, np.where(np.isfinite(directions[:, 0]), nats, np.nan))

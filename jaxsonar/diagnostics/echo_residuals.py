@@ -64,13 +64,11 @@ def predict_and_match(ring: Ring, scene: ReferenceScene, log: Log) -> ResidualTa
     flat, _ = FlatEchoes.from_log(ring, log)
     # Only a log that marks neither silence nor ages needs a guess which readings are new.
     unmarked = len(log.asked) > 0 and not log.age.any()
-    fresh = is_fresh_reading(flat) if scene.from_map and unmarked else np.ones(len(flat.scan), bool)
-    wall_number = np.cumsum(scene.is_wall).reshape(scene.is_wall.shape) - 1
+    fresh = is_fresh_reading(flat) if scene.by_poses and unmarked else np.ones(len(flat.scan), bool)
     size = SETTINGS.reference.block_scans
     blocks = [slice(first, min(first + size, len(log))) for first in range(0, max(1, len(log)), size)]
     tables = [
-        _match_block(ring, scene, block, flat, *_dense_ranges(flat, block, fresh, len(ring.paths)), wall_number)
-        for block in blocks
+        _match_block(ring, scene, block, flat, *_dense_ranges(flat, block, fresh, len(ring.paths))) for block in blocks
     ]
     return ResidualTable(*(np.concatenate(column) for column in zip(*tables, strict=True)))
 
@@ -82,7 +80,6 @@ def _match_block(
     flat: FlatEchoes,
     reported: Float[np.ndarray, "block paths slots"],
     is_new: Bool[np.ndarray, "block paths"],
-    wall_number: Int[np.ndarray, "scans reflectors"],
 ) -> ResidualTable:
     """The table of one block of scans, from reported ranges and whether they are new readings."""
     tx, rx = ring.paths.T
@@ -100,7 +97,7 @@ def _match_block(
     start, end = np.moveaxis(scene.extent[block], -1, 0)
     beyond_end = np.maximum(start[..., None] - predicted.footpoint, predicted.footpoint - end[..., None])
     unobstructed = ~_is_behind_wall(scene, block, predicted.footpoint) & is_new[:, None]
-    if scene.from_map:
+    if scene.by_poses:
         midpoint = np.broadcast_to(ring.exact_paths.midpoint, (len(is_wall), len(tx), 2))
         if flat.path_pose is not None:
             midpoint = transform_points(flat.path_pose[block], midpoint)
@@ -111,16 +108,21 @@ def _match_block(
     if flat.measured is not None:
         kept &= flat.measured[block][:, None]
     row = s, r, p = np.nonzero(kept)
-    own = np.where(tx[p] == rx[p], scene.echoes_of_sensor[block][s, r, tx[p]], 2)
+    of_tx, of_rx = (scene.echoes_of_sensor[block][s, r, sensor[p]] for sensor in (tx, rx))
+    own = np.minimum(of_tx, of_rx)  # at least the echoes of the path, both ways
+    if not scene.by_poses:
+        own = np.where(tx[p] == rx[p], own, 2)
     scale = REFERENCE_SPEED_OF_SOUND / float(ring.speed_of_sound)
+    by_wall = predicted.d_range_d_landmark[row].astype(np.float64)
+    by_wall[:, 1] -= by_wall[:, 0] * scene.shift[block][s, r]
     scan, path, slot = np.nonzero(np.isfinite(reported) & np.any(is_wall, axis=1)[:, None, None])
     return ResidualTable(
-        wall=wall_number[block][s, r],
+        wall=scene.number[block][s, r],
         tx=tx[p],
         rx=rx[p],
         residual=residual[row],
         is_nearest=np.equal(owner[row], r),
-        d_range_d_wall=predicted.d_range_d_landmark[row] * scale * (not scene.from_map),
+        d_range_d_wall=(by_wall * scale).astype(np.float32),
         visibility=predicted.visibility[row],
         off_axis=predicted.departure_angle[row],
         beyond_end=np.maximum(beyond_end, 0)[row],

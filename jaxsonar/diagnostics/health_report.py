@@ -28,8 +28,8 @@ class Health:
     walls: int
     """Number of reference walls, counted once per scan."""
     source: str
-    """Source of the reference walls: "scans" (each scan alone), "map" (a map by the log's poses; residuals then include
-    pose errors and delays of the sensors), or "" (no walls)."""
+    """Source of the reference walls: "scans" (each scan alone), "poses" (pieces of the trajectory, by the log's poses;
+    residuals then include their errors), or "" (no walls)."""
     empty: str
     """Reason why there are no reference walls; empty if there are."""
     left_out: int
@@ -106,3 +106,18 @@ class Health:
         special = {"ring", *found}
         measured = {field.name: plain(getattr(self, field.name)) for field in fields(self) if field.name not in special}
         return {"ring": self.ring.name, "nominal_beam": self.nominal} | measured | found
+
+
+OF_SENSORS = (
+    "expected",
+    "heard",
+    "fits",
+    "offset",
+    "offset_error",
+    "median",
+    "quartiles",
+    "spread",
+    "beam_each",
+    "centre",
+)
+"""Measurements of each sensor by the walls."""

@@ -39,6 +39,7 @@ def estimate_offsets(table: ResidualTable, sensors: int, min_noise: float) -> Of
         & (table.visibility > settings.min_visibility)
         & table.unobstructed
         & (table.beyond_end <= SETTINGS.reference.end_margin)
+        & (table.independent_echoes >= settings.min_independent_echoes)
     )
     tx, rx, residual = table.tx[row], table.rx[row], table.residual[row]
     _, wall = np.unique(table.wall[row], return_inverse=True)

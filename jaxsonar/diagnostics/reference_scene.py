@@ -1,4 +1,4 @@
-"""Reference reflectors around the robot in every scan, from each scan alone or from a map."""
+"""Reference reflectors around the robot in every scan, and what the sensors should hear of them."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +15,6 @@ from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.geometry.se2 import rotate, tangent_of, unit
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.kernels.detection_cones import predict_all_echoes
-from jaxsonar.mapping.build_map import build_map
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -38,12 +37,17 @@ class ReferenceScene(NamedTuple):
     """Number of those echoes that each sensor sent or received."""
     sigma: Float[np.ndarray, " scans"]
     """Standard deviation of the ranges, metres; NaN where it is unknown."""
-    from_map: bool
-    """Whether the reflectors come from a map, so that the echoes of one scan do not change them."""
+    number: Int[np.ndarray, "scans reflectors"]
+    """Number of each reflector; scans of one piece of the trajectory share them. -1 for no reflector."""
+    shift: Float[np.ndarray, "scans reflectors"]
+    """Minus the derivative of a wall's rho by its theta, both in the frame in which it was estimated, metres: where the
+    robot is along the wall in that frame."""
+    by_poses: bool
+    """Whether the poses of the log gather the echoes of several scans."""
 
     def at(self, rows: Int[np.ndarray, " rows"]) -> "ReferenceScene":
         """The given scans."""
-        return ReferenceScene(*(column[rows] for column in self[:-1]), from_map=self.from_map)
+        return ReferenceScene(*(column[rows] for column in self[:-1]), by_poses=self.by_poses)
 
     def noise(self, *, default: float) -> float:
         """Median standard deviation of the ranges in scans with walls, metres; ``default`` where it is unknown."""
@@ -88,7 +92,18 @@ def scene_from_scans(
         is_wall = (batch.decided == kernels.PLANE) & (echoes >= least) & ((of_sensor > 0).sum(axis=-1) >= least)
         extent = _extent_along(theta, found.segment)
         scenes.append(
-            ReferenceScene(kind, found.parameters, is_wall, extent, echoes, of_sensor, found.sigma, from_map=False)
+            ReferenceScene(
+                kind,
+                found.parameters,
+                is_wall,
+                extent,
+                echoes,
+                of_sensor,
+                found.sigma,
+                number=np.zeros_like(kind),
+                shift=np.zeros(kind.shape),
+                by_poses=False,
+            )
         )
         order.append(batch.batch.scans)
         if progress is not None:
@@ -97,7 +112,8 @@ def scene_from_scans(
         return empty_scene(ring, len(log))
     back = np.argsort(np.concatenate(order))
     columns = list(zip(*scenes, strict=True))[:-1]
-    return ReferenceScene(*(np.concatenate(column)[back] for column in columns), from_map=False)
+    scene = ReferenceScene(*(np.concatenate(column)[back] for column in columns), by_poses=False)
+    return scene._replace(number=np.arange(scene.kind.size).reshape(scene.kind.shape))
 
 
 def empty_scene(ring: Ring, scans: int) -> ReferenceScene:
@@ -110,42 +126,9 @@ def empty_scene(ring: Ring, scans: int) -> ReferenceScene:
         echoes=np.zeros((scans, 1), np.int64),
         echoes_of_sensor=np.zeros((scans, 1, ring.count), np.int64),
         sigma=np.full(scans, np.nan),
-        from_map=False,
-    )
-
-
-def scene_from_map(ring: Ring, log: Log) -> ReferenceScene:
-    """The nearest walls of a map of the log, in the robot frame of each scan with a pose."""
-    settings = SETTINGS.reference
-    segments = np.asarray(build_map(ring, log, window=settings.window).segments, np.float64)
-    if not len(segments):
-        return empty_scene(ring, len(log))
-    has_pose = np.all(np.isfinite(log.pose), axis=1)
-    pose = np.where(has_pose[:, None], log.pose, 0.0)
-    p_robot = rotate(segments[None] - pose[:, None, None, :2], -pose[:, None, None, 2])
-    along = p_robot[:, :, 1] - p_robot[:, :, 0]
-    theta = np.arctan2(-along[..., 0], along[..., 1])
-    rho = (p_robot[:, :, 0] * unit(theta)).sum(axis=-1)
-    theta, rho = np.where(rho < 0, theta + np.pi, theta), np.abs(rho)
-    extent = _extent_along(theta, p_robot)
-    # Sort by the distance of the nearest point of each wall.
-    distance = np.hypot(rho, np.maximum(np.maximum(extent[..., 0], -extent[..., 1]), 0))
-    order = np.argsort(distance, axis=1, kind="stable")[:, : settings.map_walls]
-    near = np.take_along_axis(distance, order, axis=1) < ring.max_range + settings.map_distance
-    is_wall = near & has_pose[:, None]
-
-    def nearest(values: np.ndarray) -> np.ndarray:
-        return np.take_along_axis(values, order.reshape(order.shape + (1,) * (values.ndim - 2)), axis=1)
-
-    return ReferenceScene(
-        kind=np.where(is_wall, kernels.PLANE, -1),
-        parameters=np.stack([nearest(rho), nearest(theta)], axis=-1),
-        is_wall=is_wall,
-        extent=nearest(extent),
-        echoes=np.full(order.shape, 10**6),  # many: no sensor matters for a wall of the map
-        echoes_of_sensor=np.zeros((*order.shape, ring.count), np.int64),
-        sigma=np.full(len(log), np.nan),
-        from_map=True,
+        number=np.full((scans, 1), -1),
+        shift=np.zeros((scans, 1)),
+        by_poses=False,
     )
 
 

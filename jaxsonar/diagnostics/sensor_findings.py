@@ -1,11 +1,13 @@
 """Findings about single sensors and the ring, from the measurements of the health check."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from jaxsonar.diagnostics.cross_counts import one_sided_sensors
 from jaxsonar.diagnostics.findings import Finding, confidence_of
 from jaxsonar.diagnostics.health_report import Health
 from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
@@ -17,33 +19,73 @@ _ROLES = (
     ("deaf", "it hears no other sensor", "check its receiver and the amplifier, clean it, and replace it"),
 )
 """Cause, meaning and remedy if a sensor has no cross echo as transmitter, as receiver."""
-_EXCLUSIVE = frozenset({"dead", "deaf", "mute", "swapped", "stale"})
-"""Faults that make findings about offset, rate and direction of the same sensors meaningless."""
 _REPLACE = "check its plug, its cable and its membrane, and replace it"
 
 
-def describe_findings(
-    health: Health,
-    measured: MeasuredSensors,
-    pairs: Int[np.ndarray, " sensors"],
-    sigma: float | None,
-    faults: Sequence[Finding] = (),
-) -> tuple[tuple[str, ...], tuple[Finding, ...]]:
-    """A remark for each sensor, and all findings, the most severe first.
+class SensorEvidence(NamedTuple):
+    """Measurements of the sensors that ``Health`` does not hold."""
+
+    pairs: Int[np.ndarray, " sensors"]
+    """Number of direct ranges of each sensor that were compared with the previous scan."""
+    without_worst: Int[np.ndarray, "sensors 2"]
+    """``SensorMeasurements.without_worst``."""
+    turn_nats: Float[np.ndarray, " sensors"]
+    """Log-likelihood ratio of the measured direction of each cone to its heading."""
+    cross: Int[np.ndarray, "sensors sensors"]
+    """``cross_counts``."""
+
+
+class GradedFinding(NamedTuple):
+    """A finding about one sensor."""
+
+    nats: float
+    """Its log-likelihood ratio to a sound sensor."""
+    finding: Finding
+
+
+def sensor_findings(
+    health: Health, measured: MeasuredSensors, evidence: SensorEvidence, sigma: float | None, known: set[int]
+) -> list[GradedFinding]:
+    """Faults of single sensors that the walls show, the most certain first; at most one for each sensor.
 
     Args:
         health: the measurements.
         measured: what was measured at all.
-        pairs: number of direct ranges of each sensor that were compared with the previous scan.
+        evidence: more measurements.
         sigma: standard deviation of the ranges, metres, if it is known.
-        faults: findings about the log as a whole, which come first.
+        known: sensors whose fault is known already.
     """
-    found = [*faults, *_silent_sensors(health, measured), *_exchanged_sensors(health), *_stuck_sensors(health, pairs)]
-    excluded = {k for finding in found if finding.cause in _EXCLUSIVE for k in finding.sensors}
-    minor = (*_range_offsets(health, sigma), *_weak_or_turned_sensors(health))
-    found += [finding for finding in minor if not excluded & set(finding.sensors)]
-    found += _ring_findings(health, measured)
-    return _remarks(health, found), tuple(found)
+    found: list[GradedFinding] = []
+    # What explains the others comes first: an offset or a rotation explains missing echoes, not the other way round.
+    for one in (
+        *_range_offsets(health, sigma),
+        *_turned_sensors(health, evidence),
+        *_silent_sensors(health, measured),
+        *_weak_sensors(health, evidence),
+    ):
+        if not known & set(one.finding.sensors):
+            known = known | set(one.finding.sensors)
+            found.append(one)
+    return sorted(found, key=lambda one: -one.nats)
+
+
+def plain_findings(
+    health: Health, measured: MeasuredSensors, evidence: SensorEvidence, faults: Sequence[Finding]
+) -> list[Finding]:
+    """Findings that need no walls, and exchanged sensors; the given ones about the log as a whole come first."""
+    found = [*faults, *_exchanged_sensors(health)]
+    named = {k for one in faults for k in one.sensors}
+    for one in (*_stuck_sensors(health, evidence.pairs), *_one_sided_sensors(measured, evidence)):
+        if not named & set(one.sensors):
+            named |= set(one.sensors)
+            found.append(one)
+    return found
+
+
+def described(health: Health, measured: MeasuredSensors, found: Sequence[Finding]) -> Health:
+    """The health with these findings, those about the ring as a whole, and remarks for each sensor."""
+    found = [*found, *_ring_findings(health, measured, found)]
+    return replace(health, remarks=_remarks(health, found), findings=tuple(found))
 
 
 def _remarks(health: Health, found: Sequence[Finding]) -> tuple[str, ...]:
@@ -57,34 +99,19 @@ def _remarks(health: Health, found: Sequence[Finding]) -> tuple[str, ...]:
     return tuple("; ".join(remark(one, k) for one in found if k in one.sensors) for k in range(health.ring.count))
 
 
-def _silent_sensors(health: Health, measured: MeasuredSensors) -> Iterator[Finding]:
-    """Sensors that are dead, deaf (do not receive) or mute (do not transmit).
+def _silent_sensors(health: Health, measured: MeasuredSensors) -> Iterator[GradedFinding]:
+    """Sensors that hear nothing, or nothing of the walls.
 
     If the log does not mark paths that heard nothing, sensors that are never heard are named with both explanations.
     """
     usual = _usual_rates(health)
     echoes = health.direct + health.cross
-    others, others_cross = float(np.median(echoes)), float(np.median(health.cross))
+    others = float(np.median(echoes))
     for k in range(health.ring.count):
-        expected, detected = health.expected[k], health.heard[k]
-        low = _is_low(expected, detected, usual, _FINDINGS.dead_rate)
-        few_cross = expected[1:].min() < _FINDINGS.min_expected
-        if low[0] and (np.isnan(usual[1]) or low[1:].all() or few_cross):
-            amount = "nothing" if detected.sum() == 0 else "hardly anything"
-            elsewhere = (
-                f", and reports {echoes[k]} echoes elsewhere" if echoes[k] > _FINDINGS.min_elsewhere * others else ""
-            )
-            yield Finding(
-                "dead",
-                (k,),
-                f"sensor {k} hears {amount}: {detected[0]} of {expected[0]} expected direct echoes, the others "
-                f"{100 * usual[0]:.0f} %{elsewhere}",
-                *_rate_evidence(expected[0], detected[0], usual[0]),
-                _REPLACE,
-            )
-        elif echoes[k] == 0 and others >= _FINDINGS.min_echoes and (measured.any[k] or not measured.certain):
+        expected, detected = health.expected[k, 0], health.heard[k, 0]
+        if echoes[k] == 0 and others >= _FINDINGS.min_echoes and (measured.any[k] or not measured.certain):
             doubt = "" if measured.any[k] else "; it is dead, or was not measured"
-            yield Finding(
+            finding = Finding(
                 "dead",
                 (k,),
                 f"sensor {k} hears nothing: no echo in the log, the others {others:.0f} each{doubt}",
@@ -92,46 +119,52 @@ def _silent_sensors(health: Health, measured: MeasuredSensors) -> Iterator[Findi
                 "a working sensor would have echoes of the walls that its neighbors hear",
                 _REPLACE,
             )
-        elif _never_in_one_role(measured, k) and others_cross >= _FINDINGS.min_echoes:
-            cause, meaning, remedy = _ROLES[int(measured.cross[k, 0])]
-            yield Finding(
-                cause,
-                (k,),
-                f"sensor {k} is {cause}, {meaning}: no such echo in the log, unless these paths were not measured",
-                0.5,
-                "its other echoes are there; the log does not mark paths that heard nothing",
-                remedy,
+            yield GradedFinding(others, finding)
+        elif _is_low(expected, detected, usual[0], _FINDINGS.dead_rate):
+            amount = "nothing" if detected == 0 else "hardly anything"
+            elsewhere = (
+                f", and reports {echoes[k]} echoes elsewhere" if echoes[k] > _FINDINGS.min_elsewhere * others else ""
             )
-        elif low[1] != low[2] and np.isfinite(usual[1:]).all():
-            role = 1 if low[1] else 2
-            cause, meaning, remedy = _ROLES[role - 1]
-            yield Finding(
-                cause,
+            nats = _rate_nats(expected, detected, usual[0])
+            finding = Finding(
+                "dead",
                 (k,),
-                f"sensor {k} is {cause}, {meaning}: {detected[role]} of {expected[role]} expected cross echoes, the "
-                f"others {100 * usual[role]:.0f} %",
-                *_rate_evidence(expected[role], detected[role], usual[role]),
-                remedy,
+                f"sensor {k} hears {amount}: {detected} of {expected} expected direct echoes, the others "
+                f"{100 * usual[0]:.0f} %{elsewhere}",
+                confidence_of(nats),
+                f"log-likelihood ratio to the usual rate {_nats(nats)}",
+                _REPLACE,
             )
+            yield GradedFinding(nats, finding)
 
 
-def _rate_evidence(expected: Any, detected: Any, usual: float) -> tuple[float, str]:
-    """Confidence that these numbers of echoes do not come from the usual rate, and the evidence as text."""
+def _one_sided_sensors(measured: MeasuredSensors, evidence: SensorEvidence) -> Iterator[Finding]:
+    """Deaf and mute sensors."""
+    for one in one_sided_sensors(evidence.cross):
+        cause, meaning, remedy = _ROLES[int(one.is_deaf)]
+        fewer, more = sorted((one.sent, one.received))
+        never = fewer == 0 and not measured.certain
+        doubt = ", unless these paths were not measured" if never else ""
+        yield Finding(
+            cause,
+            (one.sensor,),
+            f"sensor {one.sensor} is {cause}, {meaning}: {fewer} cross echoes, {more} in the other direction{doubt}",
+            confidence_of(one.nats),
+            "an echo between two sensors has the same path in both directions; log-likelihood ratio to equal rates "
+            f"{_nats(one.nats)}",
+            remedy,
+        )
+
+
+def _rate_nats(expected: Any, detected: Any, usual: float) -> float:
+    """Log-likelihood ratio of the observed rate of echoes to the usual one, nats."""
     p = float(np.clip(usual, 0.01, 0.99))
     own = float(np.clip(detected / max(expected, 1), 1e-3, 1 - 1e-3))
-    nats = detected * np.log(own / p) + (expected - detected) * np.log((1 - own) / (1 - p))
-    evidence = f"log-likelihood ratio to a sensor with the usual rate {_nats(nats)}"
-    return confidence_of(float(nats)), evidence
+    return float(detected * np.log(own / p) + (expected - detected) * np.log((1 - own) / (1 - p)))
 
 
 def _nats(value: float) -> str:
     return f"{value:.0f} nats" if value < 1000 else "over 1000 nats"
-
-
-def _never_in_one_role(measured: MeasuredSensors, sensor: int) -> bool:
-    """Whether the cross echoes of a sensor are all received or all sent, in a log that does not mark silence."""
-    sends, receives = measured.cross[sensor]
-    return not measured.certain and bool(sends != receives)
 
 
 def _exchanged_sensors(health: Health) -> Iterator[Finding]:
@@ -180,7 +213,8 @@ def _stuck_sensors(health: Health, pairs: Int[np.ndarray, " sensors"]) -> Iterat
                 (k,),
                 f"sensor {k} repeats the range of the scan before in {100 * health.repeats[k]:.0f} % of the scans, the "
                 f"others in {100 * usual:.0f} %",
-                *_rate_evidence(pairs[k], round(health.repeats[k] * pairs[k]), usual),
+                confidence_of(nats := _rate_nats(pairs[k], round(health.repeats[k] * pairs[k]), usual)),
+                f"log-likelihood ratio to the usual rate {_nats(nats)}",
                 "let the driver report a reading only when it is new, or give it an age",
             )
         elif constant > max(_FINDINGS.min_constant, 4 * usual_constant):
@@ -195,16 +229,17 @@ def _stuck_sensors(health: Health, pairs: Int[np.ndarray, " sensors"]) -> Iterat
             )
 
 
-def _range_offsets(health: Health, sigma: float | None) -> Iterator[Finding]:
+def _range_offsets(health: Health, sigma: float | None) -> Iterator[GradedFinding]:
     """Range offsets, the largest first."""
     threshold = max(_FINDINGS.min_offset, sigma if sigma is not None else float(np.nan_to_num(health.sigma)))
-    threshold = max(threshold, _FINDINGS.min_offset_from_map) if health.source == "map" else threshold
+    threshold = max(threshold, _FINDINGS.min_offset_by_poses) if health.source == "poses" else threshold
     size = np.abs(health.offset)
-    off = np.flatnonzero((size > 3 * health.offset_error) & (size > threshold))
+    sigmas = _FINDINGS.offset_sigmas[health.source == "poses"]
+    off = np.flatnonzero((size > sigmas * health.offset_error) & (size > threshold))
     for k in off[np.argsort(-size[off], kind="stable")].tolist():
         direction = "much" if health.offset[k] > 0 else "little"
         z = float(size[k] / health.offset_error[k])
-        yield Finding(
+        finding = Finding(
             "offset",
             (k,),
             f"sensor {k} reports {1e3 * size[k]:.1f} ± {1e3 * health.offset_error[k]:.1f} mm too {direction}, relative "
@@ -213,41 +248,52 @@ def _range_offsets(health: Health, sigma: float | None) -> Iterator[Finding]:
             f"the offset is {z:.0f} standard errors, estimated jointly with all other offsets and all walls",
             "calibrate the ring (jaxsonar calibrate), or give the sensor this range_offset",
         )
+        yield GradedFinding(z**2 / 2, finding)
 
 
-def _weak_or_turned_sensors(health: Health) -> Iterator[Finding]:
-    """Sensors that detect little, or point in another direction."""
-    usual = _usual_rates(health)
+def _weak_sensors(health: Health, evidence: SensorEvidence) -> Iterator[GradedFinding]:
+    """Sensors that detect little, at more than one wall."""
+    usual = _usual_rates(health)[0]
     for k in range(health.ring.count):
-        expected, detected = health.expected[k], health.heard[k]
-        if _is_low(expected, detected, usual, _FINDINGS.weak_rate)[0] and expected[0] >= 2 * _FINDINGS.min_expected:
-            yield Finding(
+        expected, detected = health.expected[k, 0], health.heard[k, 0]
+        rest = evidence.without_worst[k]
+        if _is_low(expected, detected, usual, _FINDINGS.weak_rate) and _is_low(
+            *rest, usual, _FINDINGS.weak_rate, least=_FINDINGS.min_weak, sigmas=3.0
+        ):
+            nats = _rate_nats(*rest, usual)
+            finding = Finding(
                 "weak",
                 (k,),
-                f"sensor {k} hears {detected[0]} of {expected[0]} expected direct echoes, the others "
-                f"{100 * usual[0]:.0f} %",
-                *_rate_evidence(expected[0], detected[0], usual[0]),
+                f"sensor {k} hears {detected} of {expected} expected direct echoes, the others {100 * usual:.0f} %",
+                confidence_of(nats),
+                f"without the wall of which it misses the most, log-likelihood ratio to the usual rate {_nats(nats)}",
                 "clean its membrane, and check what covers it, its supply and its gain",
             )
+            yield GradedFinding(nats, finding)
+
+
+def _turned_sensors(health: Health, evidence: SensorEvidence) -> Iterator[GradedFinding]:
+    """Sensors that point in another direction."""
+    for k in range(health.ring.count):
         turn, error = np.degrees(health.centre[k])
-        # Not against a map: its walls end where they were detected.
-        if abs(turn) > max(_FINDINGS.min_turn_deg, 4 * error) and health.source == "scans":
+        nats = float(evidence.turn_nats[k])
+        if abs(turn) > max(_FINDINGS.min_turn_deg, 4 * error) and nats > _FINDINGS.min_turn_nats:
             side = "left" if turn > 0 else "right"
-            z = float(abs(turn) / error)
-            yield Finding(
+            finding = Finding(
                 "turned",
                 (k,),
                 f"sensor {k} points {abs(turn):.0f} ± {error:.0f} deg too far to the {side}",
-                confidence_of(z**2 / 2 - np.log(health.ring.count)),
-                f"the middle of its cone is {z:.0f} standard deviations off its heading",
+                confidence_of(nats - np.log(health.ring.count)),
+                f"it hears walls in these directions; log-likelihood ratio to its heading {_nats(nats)}",
                 "turn the sensor in its mount, or calibrate the ring (jaxsonar calibrate)",
             )
+            yield GradedFinding(nats, finding)
 
 
-def _ring_findings(health: Health, measured: MeasuredSensors) -> Iterator[Finding]:
+def _ring_findings(health: Health, measured: MeasuredSensors, faults: Sequence[Finding]) -> Iterator[Finding]:
     """Findings about the ring as a whole."""
     explained = health.fits[:, 1][np.isfinite(health.fits[:, 1])]
-    if health.source == "scans" and len(explained) and np.median(explained) < _FINDINGS.min_explained:
+    if health.source == "scans" and not faults and len(explained) and np.median(explained) < _FINDINGS.min_explained:
         yield Finding(
             "unexplained echoes",
             (),
@@ -258,7 +304,7 @@ def _ring_findings(health: Health, measured: MeasuredSensors) -> Iterator[Findin
             "check the ring, the unit of the ranges, and the sensor numbers",
         )
     width, error, nominal = np.degrees([*health.beam, health.nominal])
-    if abs(width - nominal) > max(_FINDINGS.min_beam_deg, 3 * error):
+    if abs(width - nominal) > max(_FINDINGS.min_beam_deg, _FINDINGS.min_beam * nominal, 3 * error):
         yield Finding(
             "beam width",
             (),
@@ -317,10 +363,16 @@ def _usual_rates(health: Health) -> Float[np.ndarray, " 3"]:
 
 
 def _is_low(
-    expected: Int[np.ndarray, " 3"], detected: Int[np.ndarray, " 3"], usual: Float[np.ndarray, " 3"], fraction: float
-) -> Bool[np.ndarray, " 3"]:
-    """Whether the detection rates are below this fraction of the usual ones, and significantly (4 sigma, binomial)."""
-    usual = np.minimum(usual, 0.9)
-    sigma = np.sqrt(usual * (1 - usual) * np.maximum(expected, 1))
-    enough = expected >= _FINDINGS.min_expected
-    return enough & (detected < fraction * usual * expected) & (usual * expected - detected > 4 * sigma)
+    expected: Any,
+    detected: Any,
+    usual: float,
+    fraction: float,
+    *,
+    least: int = _FINDINGS.min_expected,
+    sigmas: float = 4.0,
+) -> bool:
+    """Whether a detection rate is significantly (binomial) below this fraction of the usual one."""
+    usual = min(usual, 0.9)
+    sigma = np.sqrt(usual * (1 - usual) * max(expected, 1))
+    lost = usual * expected - detected  # NaN if the usual rate is unknown
+    return bool(expected >= least and detected < fraction * usual * expected and lost > sigmas * sigma)

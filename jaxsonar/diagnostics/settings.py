@@ -15,16 +15,16 @@ class ReferenceSettings:
     """Number of scans that are analysed; longer logs are sampled evenly."""
     block_scans: int = 32
     """Scans per compiled step."""
-    window: float = 1.5
-    """Length of trajectory gathered into one local model where single scans show too few walls, metres."""
+    group_scans: int = 40
+    """Largest number of scans of one piece of the trajectory, spread over it."""
+    min_share: float = 0.6
+    """Walls of single scans as a share of those that the poses gather, from which on the poses are not used."""
     min_echoes: int = 3
     """Echoes that support a reference wall, and sensors that took part in them."""
     min_walls: int = 5
     """Number of reference walls below which single scans are not used. One wall per ten scans is needed, too."""
-    map_walls: int = 10
-    """Number of walls of a map that each scan is compared with, the nearest ones."""
-    map_distance: float = 0.5
-    """Walls of a map farther than the maximum range by more than this are left out, metres."""
+    reflectors: int = 8
+    """Largest number of reflectors of one piece of the trajectory."""
     default_sigma: float = 0.01
     """Standard deviation of the ranges where it is unknown, metres."""
     min_sigma: float = MIN_SIGMA
@@ -72,6 +72,8 @@ class OffsetSettings:
     """An echo farther than this from the expected range of a wall does not come from it, metres."""
     min_visibility: float = 0.2
     """Least visibility of a wall whose echo is used."""
+    min_independent_echoes: int = 2
+    """Echoes of other sensors that support such a wall: one that only the sensor itself hears tells nothing."""
     iterations: int = 12
     """Iterations of the reweighted least squares."""
     initial_noise: float = 0.01
@@ -103,6 +105,8 @@ class SwapSettings:
     exchanged sensors spoil the walls, which favors their wrong positions."""
     min_gain: float = 30.0
     """Log-likelihood ratio that an exchange must reach, also against rival exchanges, nats."""
+    min_gain_each: float = 8.0
+    """Log-likelihood ratio that each of the exchanged sensors must reach, nats."""
     extra_sigma: float = 0.002
     """Errors of walls and sensor positions, added to the noise in quadrature, metres; they must not look like an
     exchange."""
@@ -128,6 +132,8 @@ class ConeSettings:
     """Expected echoes that the cone of a single sensor needs."""
     min_detected_each: int = 15
     """Detected echoes that it needs."""
+    most_turn_deg: int = 60
+    """Largest rotation of a single sensor that is tried, degrees."""
     lower_limits: tuple[float, float, float, float] = (float(np.radians(2)), float(np.radians(0.6)), 0.05, 0.0)
     """Lower limits of the fitted curve: half width and roll-off, radians; probability inside and outside the cone."""
     upper_limits: tuple[float, float, float, float] = (np.pi / 2, float(np.radians(15)), 1.0, 0.4)
@@ -144,18 +150,31 @@ class ConeSettings:
 class FindingSettings:
     """Thresholds of the findings."""
 
+    most_faulty: float = 0.34
+    """Largest share of the sensors of which faults are sought one after another."""
+    certain: float = 0.99
+    """Confidence of what a strict test of its own has proven."""
+    fine_resolution: float = 0.002
+    """Ranges with a finer resolution than this do not stay the same by chance, metres."""
+    floor_range: float = 0.5
+    """A single sensor with a constant echo at more than this hears the floor rather than its own robot, metres, ..."""
+    floor_sigma: float = 0.006
+    """... if its ranges scatter by more than this, metres."""
     min_offset: float = 0.002
     """Smaller range offsets are never reported, metres."""
-    min_offset_from_map: float = 0.015
-    """The same if the walls come from a map, metres: pose errors and delays of a moving robot add to the residuals."""
+    min_offset_by_poses: float = 0.015
+    """The same if the poses gather the walls, metres: their errors add to the residuals."""
+    offset_sigmas: tuple[float, float] = (4.0, 6.0)
+    """Range offsets that are reported are at least this many standard errors; the second one counts if the poses gather
+    the walls, whose errors are common to many echoes."""
     min_explained: float = 0.3
     """Fraction of echoes that reflectors must explain; below, the ring or the units are probably wrong."""
     min_expected: int = 8
     """Expected echoes that a detection rate needs."""
     min_echoes: int = 10
     """Echoes of the median sensor from which on a sensor without any is reported."""
-    dead_rate: float = 0.15
-    """A sensor with less than this fraction of the usual detection rate is dead, deaf or mute."""
+    dead_rate: float = 0.05
+    """A sensor with less than this fraction of the usual detection rate is dead."""
     min_elsewhere: float = 0.3
     """Echoes relative to the median sensor from which on a sensor without expected echoes is not dead."""
     weak_rate: float = 0.6
@@ -168,8 +187,20 @@ class FindingSettings:
     """Fraction of identical ranges above which a sensor saturates; at least four times the usual fraction, too."""
     min_turn_deg: float = 10.0
     """Rotation of a sensor that is reported, degrees; at least four standard deviations, too."""
+    min_turn_nats: float = 10.0
+    """Least log-likelihood ratio of that rotation to none."""
+    min_weak: int = 6
+    """Expected direct echoes that tell a weak sensor, besides those of the wall of which it missed the most."""
+    min_asymmetry: float = 8.0
+    """Least log-likelihood ratio of a deaf or mute sensor to one that sends and receives equally well, nats."""
+    min_reciprocal: float = 0.5
+    """Share of the pairs of sensors with echoes in both directions that this comparison needs."""
+    deaf_rate: float = 0.25
+    """A sensor is deaf or mute if it has less than this fraction of cross echoes in one role."""
     min_beam_deg: float = 5.0
-    """Deviation of the cone width that is reported, degrees; at least three standard deviations, too."""
+    """Deviation of the cone width that is reported, degrees; at least three standard deviations, too, ..."""
+    min_beam: float = 0.15
+    """... and at least this share of the width."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Exchanged sensors: their echoes are more likely at the position of another sensor."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +15,6 @@ from jaxsonar.diagnostics.reference_scene import (
     move_scene,
     predict_reports,
     renumber,
-    scene_from_scans,
     select_scans,
 )
 from jaxsonar.diagnostics.settings import SETTINGS
@@ -42,9 +42,18 @@ class _Hypothesis(NamedTuple):
         """Sensors that are not at their own position."""
         return set(np.flatnonzero(self.place != np.arange(len(self.place))).tolist())
 
+    def least_gain(self, before: Int[np.ndarray, " sensors"]) -> float:
+        """Least log-likelihood ratio of the new to the earlier position among the sensors that changed it.
+
+        Both sensors of an exchange fit better at the new position. If one does not, the other is only turned.
+        """
+        changed = np.flatnonzero(self.place != before)
+        own, other = self.place[changed], before[changed]
+        return float((self.log_likelihood[own, own] - self.log_likelihood[own, other]).min())
+
 
 def find_exchanged_sensors(
-    ring: Ring, log: Log, scene: ReferenceScene, *, sigma: float | None
+    ring: Ring, log: Log, scene: ReferenceScene, detect: Callable[[Log], ReferenceScene]
 ) -> Int[np.ndarray, " sensors"]:
     """The position of the ring at which each sensor seems to be; its own position where that is not certain.
 
@@ -52,15 +61,16 @@ def find_exchanged_sensors(
         ring: the ring as it should be.
         log: the log with its original sensor numbers.
         scene: reference reflectors of this log.
-        sigma: standard deviation of the ranges, metres; None estimates it.
+        detect: gives the reflectors of a log.
     """
-    rows = evenly_spaced(len(log), SETTINGS.swaps.max_scans)
-    log, scene = select_scans(log, rows), scene.at(rows)
+    if not scene.by_poses:
+        rows = evenly_spaced(len(log), SETTINGS.swaps.max_scans)
+        log, scene = select_scans(log, rows), scene.at(rows)
 
     def evaluate(place: Int[np.ndarray, " sensors"]) -> _Hypothesis:
         # Detect the walls again with the exchanged numbers: they improve if the hypothesis is right.
         renumbered = renumber(log, place)
-        improved = scene if scene.from_map else scene_from_scans(ring, renumbered, sigma, None)
+        improved = detect(renumbered)
         return _Hypothesis(place, position_log_likelihood(ring, improved, renumbered))
 
     current = _Hypothesis(np.arange(ring.count), position_log_likelihood(ring, scene, log))
@@ -71,6 +81,8 @@ def find_exchanged_sensors(
         # The best one must beat the present numbering, and every exchange of other sensors.
         rivals = [other for other in hypotheses if other is current or not other.moved & best.moved]
         if best is current or any(best.total < rival.total + SETTINGS.swaps.min_gain for rival in rivals):
+            break
+        if best.least_gain(current.place) < SETTINGS.swaps.min_gain_each:
             break
         current = best
     return current.place

@@ -38,7 +38,7 @@ def health_figure(health: Health) -> Figure:
         _draw_beam_pattern(beam_pattern, health)
         _draw_ring(ring, health)
         _write_findings(text, health)
-        walls = "observations of a map's walls" if health.source == "map" else "walls from single scans"
+        walls = "observations of walls by the poses" if health.source == "poses" else "walls from single scans"
         figure.suptitle(
             f"{health.ring.name}: {health.scans} scans, {health.walls} {walls}", x=0.01, ha="left", parse_math=False
         )
@@ -182,8 +182,8 @@ def _write_findings(axes: Axes, health: Health) -> None:
         findings.insert(0, f"sensors are not compared with walls: {health.empty}")
     if health.unmeasured:
         findings.append(f"not measured: {', '.join(health.unmeasured)}")
-    if health.source == "map":
-        findings.append("walls from a map: residuals include errors of the poses and the delay of the sensors")
+    if health.source == "poses":
+        findings.append("walls by the poses of the log: residuals include errors of the poses")
     lines = [line for text in findings if text for line in textwrap.wrap(f"• {text}", 150, subsequent_indent="   ")]
     if len(lines) > _MAX_LINES:
         lines = [*lines[: _MAX_LINES - 1], f"… and more: {len(health.findings)} findings in all"]

@@ -161,7 +161,7 @@ def _health_caption(health: Health) -> str:
         scans += f", {health.used} of them compared with walls"
     walls = {
         "scans": f"{health.walls} walls from single scans",
-        "map": f"{health.walls} observations of a map's walls; residuals include errors of the poses and delays",
+        "poses": f"{health.walls} observations of walls by the poses; residuals include errors of the poses",
         "": health.empty,
     }[health.source]
     width, error = np.degrees(health.beam)

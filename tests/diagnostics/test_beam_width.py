@@ -30,6 +30,8 @@ def test_a_turned_cone_is_found(rng):
     asked = np.full((3, len(BIN_CENTERS)), 5)
     turn = np.radians([0.0, 12.0, -9.0])[:, None]
     answered = rng.binomial(asked, detection_probability(truth, BIN_CENTERS - turn))
-    half, center = fit_each_cone(asked, answered, truth)
+    half, center, nats = fit_each_cone(asked, answered, truth)
     assert (np.abs(center[:, 0] - turn[:, 0]) < 4 * center[:, 1]).all()
     assert (np.abs(half[:, 0] - truth[0]) < 4 * half[:, 1]).all()
+    assert (nats[1:] > 5).all()
+    assert nats[0] < 3

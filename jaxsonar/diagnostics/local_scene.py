@@ -1,0 +1,83 @@
+"""Reference walls around the robot from short pieces of its trajectory, for rings that see few walls in one scan."""
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxsonar import kernels
+from jaxsonar.diagnostics.local_reflectors import find_reflectors, group_echoes
+from jaxsonar.diagnostics.reference_scene import ReferenceScene, empty_scene
+from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.geometry.se2 import rotate, tangent_of, unit
+from jaxsonar.plausibility.pose_agreement import select_groups
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.sliding_windows import has_moved
+from jaxsonar.sensors.range_models import plane_footpoint
+from jaxsonar.sensors.ring import Ring
+
+
+def groups_of_scans(log: Log) -> list[Int[np.ndarray, "_"]]:
+    """Rows of the scans of each piece of the trajectory: ``select_groups`` with the scans in between."""
+    moved, most = has_moved(log.pose), SETTINGS.reference.group_scans
+    groups = []
+    for group in select_groups(log):
+        rows = group[0] + np.flatnonzero(moved[group[0] : group[-1] + 1])
+        groups.append(rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64))])
+    return groups
+
+
+def scene_from_groups(ring: Ring, log: Log) -> ReferenceScene:
+    """The reflectors that several scans of a piece of the trajectory support, in the robot frame of each of them.
+
+    Args:
+        ring: the sensors.
+        log: scans with poses; the others have no reflectors.
+    """
+    groups = groups_of_scans(log)
+    echoes = group_echoes(ring, log, groups)
+    found = find_reflectors(echoes, echoes.pose)
+    if not len(found.kind):
+        return empty_scene(ring, len(log))
+    tx, rx = ring.paths[echoes.path[found.echo]].T
+    of_sensor = np.zeros((len(found.kind), ring.count), np.int64)
+    np.add.at(of_sensor, (found.reflector, tx), 1)
+    np.add.at(of_sensor, (found.reflector, rx), tx != rx)
+    count = np.bincount(found.reflector, minlength=len(found.kind))
+    # The extent of each wall: where it reflected the sound.
+    is_wall = found.kind == kernels.PLANE
+    midpoint, baseline = echoes.geometry(echoes.pose[found.echo], echoes.path[found.echo])
+    along = plane_footpoint(found.parameters[found.reflector], midpoint, baseline, min_height=1e-3)
+    start, end = np.full(len(found.kind), np.inf), np.full(len(found.kind), -np.inf)
+    np.minimum.at(start, found.reflector, along)
+    np.maximum.at(end, found.reflector, along)
+    extent = np.stack([start, end], axis=-1)
+    # The reflectors of each scan are those of its group, in its own frame.
+    group_of_scan, origin = np.full(len(log), -1), np.zeros((len(log), 2))
+    for number, rows in enumerate(groups):
+        group_of_scan[rows], origin[rows] = number, log.pose[rows, :2].mean(axis=0)
+    group_of_reflector = np.full(len(found.kind), -1)
+    group_of_reflector[found.reflector] = group_of_scan[echoes.scan[found.echo]]
+    rank = np.arange(len(found.kind)) - np.searchsorted(group_of_reflector, group_of_reflector)
+    reflector = np.full((len(groups) + 1, SETTINGS.reference.reflectors), -1)
+    reflector[group_of_reflector, rank] = np.arange(len(found.kind))
+    reflector = reflector[group_of_scan]  # the last row, of scans without a group, is empty
+    exists, pose = reflector >= 0, log.pose - np.pad(origin, ((0, 0), (0, 1)))
+    pose = np.where(exists.any(axis=1)[:, None], pose, 0.0)
+    wall = exists & is_wall[reflector]
+    plane = found.parameters[reflector]
+    theta = plane[..., 1] - pose[:, None, 2]
+    rho = plane[..., 0] - (pose[:, None, :2] * unit(plane[..., 1])).sum(axis=-1)
+    shift = (pose[:, None, :2] * tangent_of(plane[..., 1])).sum(axis=-1)
+    point = rotate(plane - pose[:, None, :2], -pose[:, None, 2])
+    exists &= ~wall | (rho > 0)  # not walls behind the robot
+    return ReferenceScene(
+        kind=np.where(exists, found.kind[reflector], -1),
+        parameters=np.where(wall[..., None], np.stack([rho, theta], axis=-1), point),
+        is_wall=wall & exists,
+        extent=extent[reflector] - shift[..., None],
+        echoes=count[reflector] * exists,
+        echoes_of_sensor=of_sensor[reflector] * exists[..., None],
+        sigma=np.full(len(log), np.nan),
+        number=reflector,
+        shift=shift,
+        by_poses=True,
+    )

@@ -1,0 +1,101 @@
+"""The log as the health check needs it, and findings about what was removed: marks, held and constant readings."""
+
+from typing import NamedTuple
+
+from jaxsonar.diagnostics.findings import Finding
+from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.plausibility.constant_ranges import range_resolution
+from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
+from jaxsonar.plausibility.robot_echoes import RobotEcho, RobotEchoes, find_robot_echoes, without_robot_echoes
+from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
+from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.single_firings import group_firings
+from jaxsonar.sensors.ring import Ring
+
+_FINDINGS = SETTINGS.findings
+
+
+class CheckedLog(NamedTuple):
+    """A log without readings that are no echoes of the surroundings."""
+
+    log: Log
+    """Without marks for no echo and without echoes of the robot; old readings have an age."""
+    reported: Log
+    """The same with the echoes of the robot."""
+    findings: tuple[Finding, ...]
+    """What was found."""
+
+
+def checked_log(ring: Ring, log: Log) -> CheckedLog:
+    """Remove readings that are no echoes of the surroundings.
+
+    Args:
+        ring: the sensors.
+        log: the scans, as they were recorded.
+    """
+    findings = []
+    if values := find_no_echo_values(log):
+        listed = ", ".join(map(str, values))
+        exact = " ".join(f"--no-echo {one.value:.6g}" for one in values if not one.sigma)
+        findings.append(
+            Finding(
+                "no-echo value",
+                (),
+                f"most sensors read {listed}, wherever the robot is: a mark for no echo, which counts as silence",
+                _FINDINGS.certain,
+                "most sensors share the value, and it does not change while the robot moves",
+                f"confirm with {exact}" if exact else "let the driver report nothing instead",
+            )
+        )
+        log = without_no_echo_values(log, values)
+    log = group_firings(log)
+    if held := find_held_readings(ring, log):
+        findings.append(
+            Finding(
+                "held readings",
+                (),
+                held.describe(),
+                _FINDINGS.certain,
+                "no wall or point in the detection cones can keep its range during these motions",
+                "let the driver report nothing instead of the last range",
+            )
+        )
+    log = with_ages(log, held)
+    robot = find_robot_echoes(ring, log)
+    findings += _robot_findings(log, robot)
+    return CheckedLog(without_robot_echoes(log, robot), log, tuple(findings))
+
+
+def _robot_findings(log: Log, found: RobotEchoes) -> list[Finding]:
+    """Echoes that move with the robot: of its body, a cable, or the floor."""
+    remedy = "mount {} so that {} not hear the robot or the floor; maps leave these echoes out"
+    if found.is_floor:
+        ranges = [one.range for one in found.echoes]
+        text = f"{len(found.sensors)} sensors hear the floor: a range of {min(ranges):.2f} to {max(ranges):.2f} m"
+        sentence = f"{text}, wherever the robot is"
+        evidence = "no wall has the same range in all directions and at all places"
+        return [
+            Finding("floor echo", (), sentence, _confidence(found.echoes), evidence, remedy.format("them", "they do"))
+        ]
+    is_fine = range_resolution(log.range) < _FINDINGS.fine_resolution
+    findings = []
+    for one in found.echoes:
+        # A value that never changes at all is no echo: the sensor is stuck, which its repetitions tell.
+        if (one.sigma == 0 and is_fine) or (one.tx != one.rx and {one.tx, one.rx} & set(found.sensors)):
+            continue
+        who = f"sensor {one.tx}" if one.tx == one.rx else f"path {one.tx} to {one.rx}"
+        floor = one.range > _FINDINGS.floor_range and one.sigma > _FINDINGS.floor_sigma
+        what = "the floor" if floor else "its own robot (body, mount or cable)"
+        sentence = f"{who} hears {what}: it reads {one.range:.3f} ± {one.sigma:.3f} m wherever the robot is"
+        evidence = f"in {one.share:.0%} of its measurements"
+        if one.places:
+            evidence += f", at {one.places} poses at which no common wall or point can have this range"
+        sensors = (one.tx,) if one.tx == one.rx else ()
+        cause = "floor echo" if floor else "own echo"
+        findings.append(Finding(cause, sensors, sentence, _confidence([one]), evidence, remedy.format("it", "it does")))
+    return findings
+
+
+def _confidence(echoes: "tuple[RobotEcho, ...] | list[RobotEcho]") -> float:
+    """Each further place halves the probability of a wall."""
+    return 1 - 0.5 ** (1 + max(one.places for one in echoes))
