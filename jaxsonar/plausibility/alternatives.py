@@ -31,7 +31,7 @@ class AlternativeSettings:
 
     gain: float = 0.02
     """Least gain in the mean support of the echoes."""
-    z: float = 4.0
+    z: float = 3.5
     """Least gain in standard errors."""
     tie: float = 2.0
     """An alternative that is worse than the best one by less than this many standard errors may be true, too, ..."""
@@ -201,10 +201,10 @@ def _candidates(comparison: _Comparison) -> list[tuple[Correction, ...]]:
     clockwise, from_one = renumbering(ring, 0, clockwise=True), renumbering(ring, ring.count - 1, clockwise=False)
     common = [*headings, clockwise, from_one] if ring.count > 2 else headings
     candidates = [(one,) for one in [*common, *axis_corrections(), *turned_rings(ring), *_renumberings(comparison)]]
-    for unit in pose_unit_corrections(log):
-        candidates += [(unit,), *((unit, heading) for heading in headings)]
-    if ring.count > 2:  # with headings in another unit, no numbering of the sensors alone agrees
-        candidates += [(one, clockwise) for one in headings if one.kind == "heading unit"]
+    units = pose_unit_corrections(log)
+    candidates += [(unit,) for unit in units] + [(unit, heading) for unit in units for heading in headings]
+    if ring.count > 2:  # in a wrong unit, nothing else agrees
+        candidates += [(one, clockwise) for one in [*units, *headings] if one.kind.endswith("unit")]
     return candidates
 
 

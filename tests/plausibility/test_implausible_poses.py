@@ -146,5 +146,5 @@ def test_scans_without_anything_in_common():
 def test_sensors_counted_from_one_are_an_error_that_says_so():
     poses = trajectory(60)
     log = from_one(log_of(ranges(poses), poses))
-    with pytest.raises(SonarError, match="allowed are 0 to 11, .*; the log seems to count from 1"):
+    with pytest.raises(SonarError, match=r"allowed are 0 to 11, .*; the log seems to count from 1"):
         FlatEchoes.from_log(RING, log)
