@@ -14,7 +14,7 @@ from jaxsonar.sensors.ring import Ring
 class RingSettings:
     """What is possible for ultrasonic sensors in air on a robot. Chosen by hand."""
 
-    narrowest: float = float(np.pi)
+    narrowest: float = 3.15
     """Beam width in degrees that any width in radians stays below; no ultrasonic transducer has such a narrow beam."""
     slowest: float = 280.0
     """Speed of sound in air at -78 deg C, metres per second."""

@@ -24,6 +24,8 @@ class TrajectorySettings:
     """Share of such poses from which on the trajectory is implausible."""
     inside: float = 0.9
     """Share of the poses that are within the room in the right unit."""
+    fill: float = 0.02
+    """Size of a trajectory relative to its room, at least."""
     rays: int = 24
     """Directions in which a pose looks for walls."""
     open_rays: float = 0.45
@@ -105,15 +107,10 @@ def _implausible_positions(room: Room, points: Float[np.ndarray, "poses 2"]) -> 
         what = f"{beside.mean():.0%} of the poses are outside of the room: they go from ({near[0]:.4g}, {near[1]:.4g}) "
         what += f"to ({far[0]:.4g}, {far[1]:.4g}) m, the room from ({low[0]:.4g}, {low[1]:.4g}) to "
         what += f"({high[0]:.4g}, {high[1]:.4g}) m"
-        for scale, name in _UNITS:
-            if _share_inside(points / scale, low, high) >= SETTINGS.inside:
-                cause, remedy = f"the positions are probably in {name}", f"give metres: divide x and y by {scale:g}"
-                break
-            if _share_inside(points, low / scale, high / scale) >= SETTINGS.inside:
-                cause, remedy = f"the room is probably in {name}", f"give metres: divide its coordinates by {scale:g}"
-                break
-        else:
-            cause, remedy = "room and trajectory probably have different origins", "give both in one frame, in metres"
+        cause, remedy = "room and trajectory probably have different origins", "give both in one frame, in metres"
+        fill, scale, name = max((_fill(points / scale, low, high), scale, name) for scale, name in _UNITS)
+        if fill > SETTINGS.fill:
+            cause, remedy = f"the positions are probably in {name}", f"give metres: divide x and y by {scale:g}"
         yield Implausibility("trajectory", what, cause, remedy)
         return
     sampled = points[np.unique(np.linspace(0, len(points) - 1, SETTINGS.samples).astype(int))]
@@ -125,12 +122,10 @@ def _implausible_positions(room: Room, points: Float[np.ndarray, "poses 2"]) -> 
         yield Implausibility("trajectory", what, cause, "give both in one frame, in metres")
 
 
-def _share_inside(
-    points: Float[np.ndarray, "poses 2"], low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"]
-) -> float:
-    """Share of points within a box that they fill at least a little."""
-    fills = np.ptp(points, axis=0).max() > 0.02 * (high - low).max() or len(points) == 1
-    return float(((points >= low) & (points <= high)).all(axis=1).mean()) if fills else 0.0
+def _fill(points: Float[np.ndarray, "poses 2"], low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"]) -> float:
+    """Size of a trajectory relative to a room that holds most of it; 0 for a room that does not."""
+    inside = ((points >= low) & (points <= high)).all(axis=1).mean()
+    return float(np.ptp(points, axis=0).max() / (high - low).max()) if inside >= SETTINGS.inside else 0.0
 
 
 def _is_closed(room: Room, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"]) -> bool:

@@ -19,6 +19,10 @@ from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.sensors.ring import Ring
 
+_EMPTY = Implausibility(
+    "empty log", "the log has no scan", "the recording probably ended before the first scan", "record it again"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class PreparedLog:
@@ -46,6 +50,8 @@ class PreparedLog:
             ring: the sensors.
             log: the scans, as they were recorded.
         """
+        if not len(log):
+            return cls(log, (_EMPTY,), ())
         warnings, notes = [*implausible_stamps(log)], []
         if values := find_no_echo_values(log):
             warnings.append(_no_echo_warning(values))

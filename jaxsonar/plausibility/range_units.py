@@ -3,11 +3,10 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int
 
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.plausibility.implausibility import Implausibility
-from jaxsonar.plausibility.pose_agreement import Agreement, agreement, gain, select_groups
+from jaxsonar.plausibility.pose_agreement import Agreement, agreement, gain, part_of_groups, select_groups
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -27,6 +26,12 @@ class RangeUnitSettings:
     """No sensor has nearly all of its echoes below this range, metres: the share ``fits``."""
     nearest: float = 0.05
     """In the right unit, the farthest echoes are at least this far away, metres."""
+    farther: float = 2.0
+    """In the right unit, the same share is within this many maximum ranges, for poses to tell units apart; ..."""
+    usual: float = 0.25
+    """... without poses, it is within the maximum range and fills this share of it, or within ..."""
+    slightly: float = 1.5
+    """... this many maximum ranges."""
     reach: float = 4.0
     """Ranges up to this many times the maximum range are compared with the poses as they are."""
     gain: float = 0.1
@@ -87,7 +92,7 @@ def find_range_unit(ring: Ring, log: Log) -> RangeUnit | None:
         return None
     beyond = float(np.mean(distance > ring.max_range))
     most = float(np.quantile(distance, SETTINGS.fits))
-    candidates = [unit for unit in _UNITS if SETTINGS.nearest <= most * unit[0] <= 1.02 * ring.max_range]
+    candidates = [unit for unit in _UNITS if SETTINGS.nearest <= most * unit[0] <= SETTINGS.farther * ring.max_range]
     if most < SETTINGS.too_near:
         what = f"{SETTINGS.fits:.0%} of the echoes are nearer than {most * 1000:.2g} mm"
         candidates = [unit for unit in candidates if unit[0] > 1]
@@ -108,9 +113,23 @@ def find_range_unit(ring: Ring, log: Log) -> RangeUnit | None:
     if not candidates:
         cause = "the ranges have another unit, or the ring is another one"
         return RangeUnit(np.nan, Implausibility("range unit", what, cause, "give half path lengths in metres"))
-    scale, name = candidates[0]
+    scale, name = _by_reach(most / ring.max_range, candidates)
     cause = f"the ranges are probably {name}, or the ring is another one"
     return RangeUnit(scale, Implausibility("range unit", what, cause, _remedy(scale)))
+
+
+def _by_reach(most: float, candidates: list[tuple[float, str]]) -> tuple[float, str]:
+    """The unit in which most ranges are within the maximum range and fill it.
+
+    Args:
+        most: range that hardly any echo exceeds, in the unit of the log, divided by the maximum range.
+        candidates: units, from the largest one.
+    """
+    within = [unit for unit in candidates if most * unit[0] <= 1.02]
+    beyond = [unit for unit in candidates if 1.02 < most * unit[0] <= SETTINGS.slightly]
+    if beyond and not (within and most * within[0][0] >= SETTINGS.usual):
+        return beyond[-1]
+    return (within or candidates)[0]
 
 
 def _best_by_poses(ring: Ring, log: Log, most: float, candidates: list[tuple[float, str]]) -> RangeUnit | None:
@@ -125,12 +144,14 @@ def _best_by_poses(ring: Ring, log: Log, most: float, candidates: list[tuple[flo
     groups = select_groups(log)
     if not groups or not candidates:
         return None
-    log, groups = _part_of_groups(log, groups)
+    log, groups = part_of_groups(log, groups)
     given = None
     if most <= SETTINGS.reach * ring.max_range and most >= SETTINGS.nearest:
         # With a larger maximum range, so that the same echoes are compared.
         wide = replace(ring, max_range=min(max(most * 1.02, ring.max_range), 100.0))
         given = agreement(wide, log, groups)
+    reach = max(ring.max_range, *(most * scale * 1.02 for scale, _ in candidates))
+    ring = replace(ring, max_range=min(reach, 100.0))
     others = [agreement(ring, replace(log, range=log.range * scale), groups) for scale, _ in candidates]
     index = int(np.argmax([other.share for other in others]))
     (scale, name), best = candidates[index], others[index]
@@ -153,12 +174,6 @@ def _best_by_poses(ring: Ring, log: Log, most: float, candidates: list[tuple[flo
 def _is_clear(one: Agreement) -> bool:
     """Whether poses explain echoes, and not by chance."""
     return one.share >= SETTINGS.share and one.share >= one.chance + SETTINGS.above_chance
-
-
-def _part_of_groups(log: Log, groups: list[Int[np.ndarray, "_"]]) -> tuple[Log, list[Int[np.ndarray, "_"]]]:
-    """The scans of these groups alone, and their rows in this part, so that alternatives of a long log are cheap."""
-    rows = np.sort(np.concatenate(groups))
-    return log._part(rows), [np.searchsorted(rows, group) for group in groups]
 
 
 def _remedy(scale: float) -> str:

@@ -119,13 +119,12 @@ def interrupted_content(filename: str | os.PathLike[str]) -> FileContent:
 
 
 def check_suffix(filename: str | os.PathLike[str], content: FileContent) -> str | None:
-    """A note if the suffix of a file promises something else than the file holds; None if both agree."""
+    """A warning if the suffix of a file promises something else than the file holds; None if both agree."""
     suffix = Path(filename).suffix.lower()
     if suffix not in SUFFIXES or content.format in SUFFIXES[suffix]:
         return None
-    return (
-        f"{shown(filename)}: this is {content.description}, not {DESCRIPTIONS[SUFFIXES[suffix][0]]}; it is read as such"
-    )
+    what = f"{shown(filename)}: this is {content.description}, not {DESCRIPTIONS[SUFFIXES[suffix][0]]}"
+    return f"warning: {what}; it is read as such, because its name is probably wrong; rename it"
 
 
 def _head(filename: str | os.PathLike[str]) -> bytes:

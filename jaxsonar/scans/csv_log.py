@@ -120,8 +120,8 @@ def csv_header(filename: str | os.PathLike[str], line: bytes) -> tuple[str, ...]
     if len(names) == 1 and (found := re.search("[;\t]", text)):
         came = "tabs" if found[0] == "\t" else "semicolons"
         raise SonarError(
-            f"{shown(filename)}: row 1: {came} between the columns came; allowed are commas between columns and points "
-            f"in numbers (save the table in an English format); {wanted}"
+            f"{shown(filename)}: row 1: {came} between the columns came; allowed are commas between columns and "
+            f"points, not decimal commas, in numbers (save the table in an English format); {wanted}"
         )
     for k, name in enumerate(names):
         if name not in COLUMNS + OPTIONAL:
@@ -238,6 +238,8 @@ class _CsvBody:
                 wanted = f"{len(self.columns)}, {','.join(self.columns)}"
                 last = self.is_cut and row == first + len(lines) - 1 and len(fields) < len(self.columns)
                 cure = "; the file ends within this row: delete the rows of its last scan" if last else ""
+                if len(fields) > len(self.columns):
+                    cure = "; are these decimal commas? allowed are points in numbers"
                 raise SonarError(f"{place}: {len(fields) if line else 'no'} columns came; allowed are {wanted}{cure}")
             for column, field in zip(self.columns, fields, strict=True):
                 if column == "scan" and not is_scan_number(field):

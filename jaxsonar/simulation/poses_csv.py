@@ -47,6 +47,12 @@ def load_poses(
     header = [name.strip() for name in rows[0][1]] if rows else []
     if sorted(header) not in (["theta", "x", "y"], ["stamp", "theta", "x", "y"]):
         came = shown(",".join(header), 80) or "nothing"
+        if len(header) == 1 and (found := re.search("[;\t]", header[0])):
+            came = "tabs between the columns" if found[0] == "\t" else "semicolons between the columns"
+            raise SonarError(
+                f"{shown(filename)}: row 1: {came} came; allowed are commas between columns and points, not decimal "
+                "commas, in numbers: x, y, theta and optionally stamp"
+            )
         raise SonarError(
             f"{shown(filename)}: row 1: {came} came; allowed are the columns x, y, theta and optionally stamp"
         )
@@ -55,6 +61,7 @@ def load_poses(
         if len(row) != len(header):
             raise SonarError(
                 f"{shown(filename)}: row {number}: {len(row)} values came; allowed are {len(header)}, as in row 1"
+                + "; are these decimal commas? allowed are points in numbers" * (len(row) > len(header))
             )
         for column, text in enumerate(row):
             values[index, column] = float(text) if NUMBER.fullmatch(text.strip()) else np.nan

@@ -46,7 +46,6 @@ def test_a_ring_that_trusts_half_of_the_ranges_is_sound():
 def test_sound_logs_have_no_warning():
     assert warnings(RING, LOG) == []
     assert warnings(RING, replace(LOG, pose=np.full((len(LOG), 3), np.nan))) == []
-    assert warnings(RING, LOG[:0]) == []
     office = load_office()
     log = simulate(office.ring, office.room, office.poses, sigma=0.003).as_log(office.ring, office.poses)
     assert warnings(office.ring, log) == []
