@@ -32,7 +32,7 @@ def may_stay(
     distance: Float[np.ndarray, " pairs"],
     before: Float[np.ndarray, "pairs 3"],
     after: Float[np.ndarray, "pairs 3"],
-    margin: float,
+    margin: Float[np.ndarray, " pairs"] | float,
 ) -> Bool[np.ndarray, " pairs"]:
     """Whether a reflector may have the same range, up to the margin (metres), at two poses of the robot.
 
@@ -43,6 +43,7 @@ def may_stay(
     half = SETTINGS.cone_factor * geometry.width[path] / 2 + SETTINGS.cone_margin
     center = geometry.start[path] + geometry.width[path] / 2
     midpoint = np.asarray(geometry.midpoint)[path]
+    margin = np.broadcast_to(margin, distance.shape)[:, None]
     origin, to = transform_points(before, midpoint), transform_points(after, midpoint)
     angle = (before[:, 2] + center)[:, None] + half[:, None] * np.linspace(-1, 1, SETTINGS.directions)
     way, axis = to - origin, (after[:, 2] + center)[:, None]
@@ -63,5 +64,5 @@ def may_stay(
 def range_resolution(reported: Float[np.ndarray, " readings"]) -> float:
     """Step between the values of readings, metres; too large for few readings."""
     steps = np.diff(np.unique(reported))
-    steps = steps[steps > 1e-6 * reported.max()]  # larger than the rounding of 32-bit floats
+    steps = steps[steps > 1e-6 * reported.max(initial=0)]  # larger than the rounding of 32-bit floats
     return float(np.quantile(steps, SETTINGS.resolution_quantile)) if len(steps) else 0.0

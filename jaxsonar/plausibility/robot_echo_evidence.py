@@ -14,11 +14,16 @@ class RobotEchoEvidenceSettings:
     """Constants of the evidence for echoes of the robot. Chosen by hand on simulated rooms and rings."""
 
     min_change: float = 0.03
-    """Change of the range of a wall from which on it must show, metres; larger than the errors of odometry within a few
-    scans."""
+    """Change of the range of a wall from which on it must show, metres, ..."""
+    drift: float = 0.03
+    """... and its growth with the distance that the robot has driven between two poses, because odometry drifts. With
+    0 to 0.01, a robot that drives three times along the walls of a room seems to hear itself."""
     places: int = 6
     """Number of poses, none of which shares a possible wall or point with another, at which the echo must be. A robot
     that drives along the walls of a room at a fixed distance reaches fewer."""
+    places_per_metre: float = 0.15
+    """For each metre that the robot drove between them, there must be this many more: the errors of odometry in the
+    headings add up, too."""
     enough: int = 18
     """The search ends after this many."""
     returned: float = 0.6
@@ -63,7 +68,7 @@ def independent_places(
         pose: world_from_robot of the measurements of the path.
         has_echo: whether each measurement has the echo.
     """
-    margin = max(SETTINGS.min_change, half_width)
+    driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
     explained, places, lost, k = np.zeros(len(pose), bool), [], 0, 0
     while len(places) < SETTINGS.enough and len(fresh := np.flatnonzero(~explained[k:])):
         k += int(fresh[0])
@@ -72,13 +77,15 @@ def independent_places(
             k += 1
             continue
         places.append(k)
-        here = np.broadcast_to(pose[k], pose[k:].shape)
-        count = len(here)
-        explained[k:] |= may_stay(ring, np.full(count, path), np.full(count, distance), here, pose[k:], margin)
+        margin = max(SETTINGS.min_change, half_width) + SETTINGS.drift * (driven[k:] - driven[k])
+        here, same = np.broadcast_to(pose[k], pose[k:].shape), np.ones(len(margin))
+        explained[k:] |= may_stay(ring, np.full(len(same), path), distance * same, here, pose[k:], margin)
         explained[k] = True
     if not _is_enough(len(places), lost, float(has_echo.mean())):
         return 0
-    return len(places) if float(np.hypot(*np.ptp(pose[places, :2], axis=0))) >= SETTINGS.extent else 0
+    extent = float(np.hypot(*np.ptp(pose[places, :2], axis=0)))
+    least = SETTINGS.places + SETTINGS.places_per_metre * (driven[places[-1]] - driven[places[0]])
+    return len(places) if extent >= SETTINGS.extent and len(places) >= min(least, SETTINGS.enough) else 0
 
 
 def distinct_views(

@@ -239,8 +239,7 @@ class _Search:
     def with_poses(self) -> Iterator[RobotEcho]:
         """Constant ranges of paths; ``places`` is 0 if they may be of walls."""
         for one in self.windows():
-            tx, rx = self.ring.paths[one.path]
-            distance = float(self.ring.corrected(one.echo.range, tx, rx))
+            distance = self._corrected(one)
             places = independent_places(self.ring, one.path, distance, one.echo.half_width, one.pose, one.has_echo)
             yield replace(one.echo, places=places)
 
@@ -265,7 +264,7 @@ class _Search:
             alike = int((np.abs(direct - one.echo.range) <= _tolerance(one.echo.range)).sum())
             around = alike >= max(SETTINGS.floor_sensors, SETTINGS.most_without_poses * sensors)
             hidden = (first[self.chosen] < one.echo.range).sum(axis=0) > SETTINGS.hidden * number
-            near = float(self.ring.corrected(one.echo.range, one.echo.tx, one.echo.rx)) < SETTINGS.near * reach
+            near = self._corrected(one) < SETTINGS.near * reach
             clear = near and is_contradicted(self.ring, one.path, of_path, measured & ~hidden)
             if not around and not clear:
                 yield one.echo
@@ -274,6 +273,11 @@ class _Search:
             tells[one.scan], has_echo[one.scan] = True, one.has_echo
             places = distinct_views(first[self.chosen], tells[self.chosen], has_echo[self.chosen])
             yield replace(one.echo, places=places)
+
+    def _corrected(self, one: _Window) -> float:
+        """Half path length of a constant range, metres."""
+        pair = self.ring.paths[one.path : one.path + 1]
+        return float(self.ring.corrected(np.array([one.echo.range]), *pair.T)[0])
 
     def windows(self) -> Iterator[_Window]:
         """Constant ranges of all paths."""
