@@ -43,7 +43,7 @@ class CommonCauseSettings:
     """Searches for a time offset, each around the last estimate."""
     odometry_scale: float = 0.003
     """Standard deviation of the scale of odometry, which has the same effect as the scale of the ranges."""
-    min_scale: float = 0.017
+    min_scale: float = 0.018
     """Smaller errors of the scale are not reported: 10 K of the air's temperature, or odometry."""
     scale_errors: float = 3.0
     """A scale error must be this many standard errors."""

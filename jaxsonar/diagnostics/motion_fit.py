@@ -101,7 +101,7 @@ def _solve(
     groups: EchoGroups, found: LocalReflectors, start: Float[np.ndarray, " 2"], free: Bool[np.ndarray, " 2"]
 ) -> MotionFit:
     """Robust least squares over reflectors, poses and the two parameters."""
-    value, parts = start.copy(), [_Part(groups, found, number) for number in np.unique(found.group)]
+    value, parts = start.copy(), [_Part(groups, found, number) for number in np.unique(found.group).tolist()]
     noise, residual = SETTINGS.first_noise, np.zeros(0)
     reduced: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(SETTINGS.iterations):

@@ -30,7 +30,7 @@ class DescriptionSettings:
     """Echoes that a comparison needs."""
     min_gain: float = 0.04
     """Least gain in the mean support of the echoes, ..."""
-    min_z: float = 4.5
+    min_z: float = 3.0
     """... in standard errors, ..."""
     max_loss: float = 0.02
     """... and largest loss in the share of explained echoes."""
