@@ -21,6 +21,8 @@ class RobotEchoEvidenceSettings:
     places: int = 6
     """Number of poses, none of which shares a possible wall or point with another, at which the echo must be. A robot
     that drives along the walls of a room at a fixed distance reaches fewer."""
+    places_if_contradicted: int = 3
+    """Number of these poses if other sensors that look in the same directions contradict a wall."""
     places_per_metre: float = 0.15
     """For each metre that the robot drove between them, there must be this many more: the errors of odometry in the
     headings add up, too."""
@@ -57,6 +59,8 @@ def independent_places(
     half_width: float,
     pose: Float[np.ndarray, "measurements 3"],
     has_echo: Bool[np.ndarray, " measurements"],
+    *,
+    contradicted: bool = False,
 ) -> int:
     """Number of poses at which an echo cannot have come from a common wall or point; 0 if they prove nothing.
 
@@ -67,6 +71,7 @@ def independent_places(
         half_width: tolerance of the range, metres.
         pose: world_from_robot of the measurements of the path.
         has_echo: whether each measurement has the echo.
+        contradicted: whether other sensors contradict a wall (``is_contradicted``); fewer poses are enough then.
     """
     driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
     explained, places, lost, k = np.zeros(len(pose), bool), [], 0, 0
@@ -81,11 +86,12 @@ def independent_places(
         here, same = np.broadcast_to(pose[k], pose[k:].shape), np.ones(len(margin))
         explained[k:] |= may_stay(ring, np.full(len(same), path), distance * same, here, pose[k:], margin)
         explained[k] = True
-    if not _is_enough(len(places), lost, float(has_echo.mean())):
+    if not places or not _is_found_again(len(places), lost, float(has_echo.mean())):
         return 0
     extent = float(np.hypot(*np.ptp(pose[places, :2], axis=0)))
     least = SETTINGS.places + SETTINGS.places_per_metre * (driven[places[-1]] - driven[places[0]])
-    return len(places) if extent >= SETTINGS.extent and len(places) >= min(least, SETTINGS.enough) else 0
+    least = SETTINGS.places_if_contradicted if contradicted else min(least, SETTINGS.enough)
+    return len(places) if extent >= SETTINGS.extent and len(places) >= least else 0
 
 
 def distinct_views(
@@ -117,7 +123,7 @@ def distinct_views(
         views += 1
         same = (difference <= SETTINGS.same_range).sum(axis=1)
         explained[k:] |= (common < SETTINGS.common_paths) | (same >= SETTINGS.same_view * common)
-    return views if _is_enough(views, lost, float(has_echo[tells].mean())) else 0
+    return views if views >= SETTINGS.places and _is_found_again(views, lost, float(has_echo[tells].mean())) else 0
 
 
 def is_contradicted(
@@ -142,7 +148,6 @@ def is_contradicted(
     return bool(geometry.width[path] > 0 and seen.any(axis=0).mean() >= SETTINGS.covered and not seen_by_constant)
 
 
-def _is_enough(found: int, lost: int, share: float) -> bool:
+def _is_found_again(found: int, lost: int, share: float) -> bool:
     """Whether an echo was found again often enough, compared with its share of all measurements."""
-    least = max(SETTINGS.returned, SETTINGS.returned_relative * share)
-    return found >= SETTINGS.places and found >= least * (found + lost)
+    return found >= max(SETTINGS.returned, SETTINGS.returned_relative * share) * (found + lost)

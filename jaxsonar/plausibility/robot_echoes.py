@@ -8,6 +8,7 @@ Without poses, only the other echoes tell how far the robot has moved.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -238,41 +239,52 @@ class _Search:
 
     def with_poses(self) -> Iterator[RobotEcho]:
         """Constant ranges of paths; ``places`` is 0 if they may be of walls."""
-        for one in self.windows():
-            distance = self._corrected(one)
-            places = independent_places(self.ring, one.path, distance, one.echo.half_width, one.pose, one.has_echo)
-            yield replace(one.echo, places=places)
+        windows = list(self.windows())
+        for one, contradicted in zip(windows, self._contradicted(windows), strict=True):
+            path, distance, width = one.path, self._corrected(one), one.echo.half_width
+            found = independent_places(
+                self.ring, path, distance, width, one.pose, one.has_echo, contradicted=contradicted
+            )
+            yield replace(one.echo, places=found)
 
     def without_poses(self) -> Iterator[RobotEcho]:
         """As ``with_poses``, for a log without poses."""
         windows = list(self.windows())
-        if not windows:
-            return
-        # The first echo of each path that is not constant.
-        constant = np.unique(np.concatenate([one.rows for one in windows]))
-        row = np.setdiff1d(self.row, constant)
-        first = np.full((len(self.log), len(self.ring.paths)), np.inf)
-        np.minimum.at(first, (self.log.echo_scan[row], self.path[row]), self.log.range[row])
-        first = np.where(np.isfinite(first), first, np.nan)
-        of_path = np.zeros(len(self.ring.paths), bool)
-        of_path[[one.path for one in windows]] = True
-        number, reach = self.measured[self.chosen].sum(axis=0), self.ring.max_range
-        measured = number > 0
+        first = self._first_echoes(windows)
         direct = np.array([one.echo.range for one in windows if one.echo.tx == one.echo.rx])
-        sensors = int(measured[: self.ring.count].sum())  # the first paths are the direct ones
-        for one in windows:
+        sensors = int((self._measurements[: self.ring.count] > 0).sum())  # the first paths are the direct ones
+        for one, contradicted in zip(windows, self._contradicted(windows), strict=True):
             alike = int((np.abs(direct - one.echo.range) <= _tolerance(one.echo.range)).sum())
             around = alike >= max(SETTINGS.floor_sensors, SETTINGS.most_without_poses * sensors)
-            hidden = (first[self.chosen] < one.echo.range).sum(axis=0) > SETTINGS.hidden * number
-            near = self._corrected(one) < SETTINGS.near * reach
-            clear = near and is_contradicted(self.ring, one.path, of_path, measured & ~hidden)
-            if not around and not clear:
+            if not around and not contradicted:
                 yield one.echo
                 continue
             tells, has_echo = np.zeros(len(self.log), bool), np.zeros(len(self.log), bool)
             tells[one.scan], has_echo[one.scan] = True, one.has_echo
-            places = distinct_views(first[self.chosen], tells[self.chosen], has_echo[self.chosen])
-            yield replace(one.echo, places=places)
+            yield replace(one.echo, places=distinct_views(first, tells[self.chosen], has_echo[self.chosen]))
+
+    def _contradicted(self, windows: list[_Window]) -> Iterator[bool]:
+        """Whether other sensors contradict that the cause of each constant range is a wall."""
+        first, number = self._first_echoes(windows), self._measurements
+        constant = np.zeros(len(self.ring.paths), bool)
+        constant[[one.path for one in windows]] = True
+        for one in windows:
+            hidden = (first < one.echo.range).sum(axis=0) > SETTINGS.hidden * number
+            near = self._corrected(one) < SETTINGS.near * self.ring.max_range
+            yield near and is_contradicted(self.ring, one.path, constant, (number > 0) & ~hidden)
+
+    def _first_echoes(self, windows: list[_Window]) -> Float[np.ndarray, "chosen paths"]:
+        """Range of the first echo of each path that is not constant, metres; NaN without one."""
+        row = np.setdiff1d(self.row, np.concatenate([np.zeros(0, np.int64), *(one.rows for one in windows)]))
+        first = np.full((len(self.chosen), len(self.ring.paths)), np.inf)
+        scan = np.searchsorted(self.chosen, self.log.echo_scan[row])
+        np.minimum.at(first, (scan, self.path[row]), self.log.range[row])
+        return np.where(np.isfinite(first), first, np.nan)
+
+    @cached_property
+    def _measurements(self) -> Int[np.ndarray, " paths"]:
+        """Number of measurements of each path in the scans that are compared."""
+        return self.measured[self.chosen].sum(axis=0)
 
     def _corrected(self, one: _Window) -> float:
         """Half path length of a constant range, metres."""
@@ -284,7 +296,7 @@ class _Search:
         if len(self.chosen) < SETTINGS.min_scans:
             return
         path, reported, pose = self.path[self.row], self.log.range, reading_poses(self.log)
-        number, resolution = self.measured[self.chosen].sum(axis=0), range_resolution(reported[self.row])
+        number, resolution = self._measurements, range_resolution(reported[self.row])
         edges = np.searchsorted(path, np.arange(len(self.ring.paths) + 1))
         for one in np.flatnonzero(number >= SETTINGS.min_scans).tolist():
             rest = rows = self.row[edges[one] : edges[one + 1]]
