@@ -117,7 +117,7 @@ class LocalReflectors:
     """The reflector that explains it."""
 
 
-def group_echoes(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, " group"]]) -> EchoGroups:
+def group_echoes(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -> EchoGroups:
     """The echoes of groups of scans.
 
     Args:
