@@ -101,7 +101,7 @@ def _degrees_of_freedom(
     parameters = int(np.linalg.matrix_rank(basis.columns)) if basis.columns.any() else 0
     unknowns = 2 * len(np.unique(landmarks)) + parameters + 3 * data.scan_count * poses_free
     if unknowns <= settings.max_unknowns * echoes:
-        return echoes - unknowns
+        return float(echoes - unknowns)
     return echoes - absorbed_freedom(found.problem, found.solution.unknowns, poses_free=poses_free)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.estimation.odometry_noise import OdometryNoise
-from jaxsonar.geometry.se2 import compose, interpolate, inverse
+from jaxsonar.geometry.se2 import compose
+from jaxsonar.plausibility.jump_bridging import bridging_transform
 from jaxsonar.plausibility.odometry_jumps import OdometryJump, find_odometry_jumps
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -21,7 +22,7 @@ class InterruptionSettings:
     bridged_fraction: float = 0.5
     """The same of a robot that moves, as a fraction of its displacement and rotation."""
     max_bridged_steps: float = 5.0
-    """Longest jump without enough echoes that is bridged, in durations of the step before it."""
+    """Longest jump about which the echoes tell nothing that is bridged, in scans and in usual durations of a step."""
 
 
 SETTINGS = InterruptionSettings()
@@ -95,33 +96,15 @@ def _is_bridged(log: Log, jump: OdometryJump) -> bool:
     """Whether the robot was at nearly the same place before and after a jump."""
     if jump.ranges_continue is not None:
         return jump.ranges_continue
-    step = _steps(log, jump)[0]
-    return jump.after - jump.before <= SETTINGS.max_bridged_steps and (
-        np.isnan(jump.seconds) or jump.seconds <= SETTINGS.max_bridged_steps * step
+    usual = np.nanmedian(np.diff(log.stamp)) if np.isfinite(jump.seconds) else np.inf
+    return jump.after - jump.before <= SETTINGS.max_bridged_steps and not (
+        jump.seconds > SETTINGS.max_bridged_steps * usual  # False for NaN
     )
-
-
-def _steps(log: Log, jump: OdometryJump) -> tuple[float, float, float]:
-    """Durations of the step before a jump, of the jump, and of the step after it; in scans if times are unknown."""
-    posed = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
-    at = int(np.searchsorted(posed, jump.before))
-    rows = posed[np.clip([at - 1, at, at + 1, at + 2], 0, len(posed) - 1)]
-    time = log.stamp[rows] if np.isfinite(jump.seconds) else rows.astype(np.float64)
-    before, within, after = np.maximum(np.diff(time), 0).tolist()
-    return before, within, after
 
 
 def _bridge(log: Log, jump: OdometryJump) -> Log:
     """The log with poses after a jump moved to where the motion before and after it leads."""
-    posed = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
-    at = int(np.searchsorted(posed, jump.before))
-    earlier, later = posed[max(at - 1, 0)], posed[min(at + 2, len(posed) - 1)]
-    before, within, after = _steps(log, jump)
-    # Half of the jump at the velocity before it, half at the velocity after it.
-    share = [within / (2 * duration) if duration > 0 else 0.0 for duration in (before, after)]
-    start, end = log.pose[[earlier, jump.after]], log.pose[[jump.before, later]]
-    middle, middle_of_new = interpolate(start, end, np.array([1 + share[0], -share[1]]))
-    old_from_new = compose(middle, inverse(middle_of_new))
+    old_from_new = bridging_transform(log, jump.before, jump.after)
     pose = log.pose.copy()
     pose[jump.after :] = compose(old_from_new, pose[jump.after :])
     return replace(log, pose=pose, odometry=_moved_samples(log, jump, old_from_new))

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar.geometry.se2 import relative, wrap_angle
 from jaxsonar.plausibility.implausibility import Implausibility
+from jaxsonar.plausibility.jump_bridging import jump_support
 from jaxsonar.scans.measured_paths import path_rows
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -19,10 +20,8 @@ class OdometryJumpSettings:
 
     least: tuple[float, float] = (0.12, float(np.radians(20.0)))
     """Least displacement or rotation of a jump, metres and radians."""
-    ratio: float = 4.0
-    """Least speed of a jump, in speeds of the other steps."""
-    ratio_without_stamps: float = 8.0
-    """Least displacement of a jump in a log without times, in displacements of the other steps."""
+    ratio: float = 3.0
+    """Least speed of a jump, in speeds of the other steps; in a log without times, of displacement and rotation."""
     other_quantile: float = 0.98
     """Quantile of the speeds of all steps that stands for the other steps."""
     neighbors: int = 3
@@ -31,12 +30,16 @@ class OdometryJumpSettings:
     """Least displacement or rotation of a jump to the pose (0, 0, 0), or to the first pose, metres and radians."""
     restart_ratio: float = 2.0
     """Least speed of such a jump, in speeds of the other steps."""
-    speed: tuple[float, float] = (0.0, float(np.radians(180.0)))
-    """Least speed of a jump during which the ranges do not change, metres and radians per second."""
     speed_without_echoes: tuple[float, float] = (1.5, float(np.radians(360.0)))
-    """The same if too few paths are heard before and after it."""
+    """Least speed of a jump if the echoes tell nothing about it, metres and radians per second."""
     impossible_speed: tuple[float, float] = (5.0, float(np.radians(1080.0)))
-    """Speeds that no robot with such sensors reaches; then it is a jump even if the ranges change, too."""
+    """Speeds that no robot with such sensors reaches; then the robot was carried if no motion explains the echoes."""
+    agree: float = 0.8
+    """Least support of scans on both sides of a step, as a fraction of that of each side alone, if they agree."""
+    disagree: float = 0.75
+    """Largest such support if they do not agree."""
+    contrast: float = 0.1
+    """Least difference between the support of two motions, as the same fraction, to prefer one of them."""
     least_paths: int = 4
     """Paths heard before and after a step, for a statement about their ranges."""
     kept_paths: float = 0.5
@@ -101,9 +104,9 @@ class OdometryJump:
 def find_odometry_jumps(ring: Ring, log: Log) -> tuple[OdometryJump, ...]:
     """Steps at which the odometry jumps or begins again.
 
-    A jump is much faster than all steps around it, and than most steps of the log. If the sensors hear the same ranges
-    before and after it, the robot did not move. If the ranges change, too, the robot did move, and only an impossible
-    speed is a jump. A long time between two scans, or scans at distant places, are no jumps.
+    A jump is much faster than all steps around it, and than most steps of the log. Scans before and after it agree if
+    the robot went on as before and after it, but not with the step itself. If they agree with the step, the robot made
+    it. If they agree with neither, only an impossible speed is a jump: the robot was carried.
 
     Args:
         ring: the sensors.
@@ -121,10 +124,7 @@ def find_odometry_jumps(ring: Ring, log: Log) -> tuple[OdometryJump, ...]:
     other = np.maximum(_most(speed), _fastest_neighbor(speed))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(speed / other, nan=0.0, posinf=np.inf)
-    # A log without times may lack scans, and a robot may turn on the spot between two scans.
-    is_large = (size > SETTINGS.least) & (ratio > (SETTINGS.ratio if timed else SETTINGS.ratio_without_stamps))
-    if not timed:
-        is_large[:, 1] = False
+    is_large = (size > SETTINGS.least) & (ratio > SETTINGS.ratio)
     restarts = _begins_again(pose) & ((size > SETTINGS.restart) & (_ratio(size) > SETTINGS.restart_ratio)).any(axis=1)
     candidates = np.flatnonzero(is_large.any(axis=1) | restarts)
     if not 0 < len(candidates) <= SETTINGS.most_candidates:
@@ -132,17 +132,20 @@ def find_odometry_jumps(ring: Ring, log: Log) -> tuple[OdometryJump, ...]:
     changes = _RangeChanges(ring, log, posed)
     jumps = []
     for k in candidates.tolist():
-        arm = size[k, 0] + SETTINGS.arm * size[k, 1]
-        continues = changes.are_small(k, arm)
-        if not restarts[k]:
-            least = {True: SETTINGS.speed, None: SETTINGS.speed_without_echoes, False: SETTINGS.impossible_speed}
-            is_fast = is_large[k] & (speed[k] >= least[continues])
-            if not (is_fast.any() if timed else continues):
+        before, after = int(posed[k]), int(posed[k + 1])
+        verdict = _verdict(ring, log, before, after)
+        if verdict == "step":
+            continue
+        continues = {"jump": True, "carried": False}.get(verdict)
+        if verdict == "unknown":
+            continues = changes.are_small(k, size[k, 0] + SETTINGS.arm * size[k, 1])
+        if not (restarts[k] or continues):
+            least = SETTINGS.speed_without_echoes if continues is None else SETTINGS.impossible_speed
+            if not (timed and (is_large[k] & (speed[k] >= least)).any()):
                 continue
-        elif continues is False and changes.over(0, k + 1)[1] <= SETTINGS.same_range:
+        if verdict == "unknown" and continues is False and changes.over(0, k + 1)[1] <= SETTINGS.same_range:
             continue  # the robot is indeed where it began
         duration = float(stamp[k + 1] - stamp[k]) if timed else np.nan
-        before, after = int(posed[k]), int(posed[k + 1])
         scan = int(log.scan[after])
         jumps.append(OdometryJump(before, after, scan, pose[k + 1], step[k], duration, bool(restarts[k]), continues))
     return tuple(jumps)
@@ -161,6 +164,19 @@ def implausible_odometry(ring: Ring, log: Log) -> Iterator[Implausibility]:
         cause = "the robot was moved by hand, or logs were joined"
     remedy = "split the log there, or estimate the poses with slam, which does not use this step"
     yield Implausibility("odometry jump", what, cause, remedy)
+
+
+def _verdict(ring: Ring, log: Log, before: int, after: int) -> str:
+    """What the echoes tell: "step": the robot made it; "jump": it went on as before and after; "carried": neither."""
+    support = jump_support(ring, log, before, after)
+    if support is None or not support.sides:
+        return "unknown"
+    given, bridged = support.given / support.sides, support.bridged / support.sides
+    if given >= SETTINGS.agree and given > bridged - SETTINGS.contrast:
+        return "step"
+    if bridged >= SETTINGS.agree:
+        return "jump"
+    return "carried" if max(given, bridged) < SETTINGS.disagree else "unknown"
 
 
 def _durations(

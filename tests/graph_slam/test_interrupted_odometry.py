@@ -62,7 +62,7 @@ def test_odometry_at_its_own_rate_goes_on_as_well():
 def test_a_robot_that_was_carried_leaves_two_parts():
     pose = trajectory(300)
     pose = np.concatenate([pose[:60], pose[200:]])
-    found = continue_odometry(WIDE, heard(pose, pose))
+    found = continue_odometry(WIDE, heard(pose, restarted(pose, 60, (2.0, 1.0, 0.5))))
     assert found.parts == (slice(0, 60), slice(60, 160))
     assert found.largest_part == slice(60, 160)
     assert not len(found.bridged)
@@ -82,6 +82,7 @@ def log_with(odometry, poses):
     return simulate(RING, ROOM, poses, sigma=SIGMA, seed=1).as_log(RING, odometry)
 
 
+@pytest.mark.slow
 def test_slam_is_as_accurate_with_a_restart_as_without():
     pose = truth()[:24]
     odometry = simulate_odometry(pose, distance=0.02, turn=float(np.radians(1.0)), seed=2)

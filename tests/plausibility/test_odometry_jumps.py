@@ -76,7 +76,7 @@ def test_every_jump_is_found_and_the_warning_names_the_first_one():
 def test_a_robot_that_is_carried_while_the_log_goes_on_is_found_by_its_impossible_speed():
     truth = trajectory(300)
     truth = np.concatenate([truth[:100], truth[200:]])
-    log = log_of(ranges(truth), truth, period=0.1)
+    log = log_of(ranges(truth), restarted(truth, 100, (2.0, 1.0, 0.5)), period=0.1)
     (jump,) = find_odometry_jumps(RING, log)
     assert (jump.after, jump.ranges_continue) == (100, False)
     assert "moved by hand" in str(next(implausible_odometry(RING, log)))
@@ -106,6 +106,8 @@ def sound_logs():
     lacks[60:200:3] = np.nan
     lacks[100:160] = np.nan
     yield "poses are missing", truth, lacks, time
+    apart = np.concatenate([truth[:100], truth[200:]])
+    yield "two runs with poses in one frame", apart, apart, time[:200]
     twice = np.concatenate([truth[:150], truth[:150]])
     yield "driven twice from the start", twice, twice, time
     places = np.random.default_rng(4).uniform([-2.5, -1.5, -3], [2.5, 1.5, 3], (60, 3))
