@@ -17,6 +17,8 @@ from jaxsonar.diagnostics.motion_fit import LAG, SCALE, MotionFit, fit_motion
 from jaxsonar.diagnostics.time_offset import search_step, search_time_offsets, with_later_poses
 from jaxsonar.diagnostics.wrong_descriptions import Comparison, best_description
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
+from jaxsonar.plausibility.implausibility import Implausibility
+from jaxsonar.plausibility.odometry_jumps import implausible_odometry
 from jaxsonar.plausibility.pose_agreement import select_groups
 from jaxsonar.plausibility.range_noise import range_noise
 from jaxsonar.scans.scan_log import Log
@@ -31,6 +33,8 @@ class CommonCauseSettings:
 
     mistakes: int = 2
     """Wrong descriptions that are sought one after the other."""
+    min_explained: float = 0.4
+    """Share of the echoes that walls and points must explain before scale and time offset are judged."""
     min_lag: float = 0.03
     """Smaller time offsets are not reported, seconds; ..."""
     lag_steps: float = 0.15
@@ -46,7 +50,9 @@ class CommonCauseSettings:
     min_scale: float = 0.018
     """Smaller errors of the scale are not reported: 10 K of the air's temperature, or odometry."""
     scale_errors: float = 3.0
-    """A scale error must be this many standard errors."""
+    """A scale error must be this many standard errors, ..."""
+    max_scale_error: float = 0.02
+    """... of at most this size."""
     air: tuple[float, float] = (312.0, 360.5)
     """Speeds of sound in air of -31 to 50 deg C, m/s."""
     noise_ratio: float = 2.5
@@ -82,7 +88,7 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
         log: full scans, without marks for no echo.
         sigma: the stated standard deviation of the ranges, metres; None if it is unknown.
     """
-    findings: list[Finding] = []
+    findings = [_jump_finding(one) for one in implausible_odometry(ring, log)]
     groups = select_groups(log)
     for _ in range(SETTINGS.mistakes if groups else 0):
         if (comparison := best_description(ring, log, groups)) is None:
@@ -92,6 +98,8 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
     if groups:
         echoes, step = group_echoes(ring, log, groups), search_step(log)
         fit = _search_motion(ring, log, groups, echoes, step)
+        if fit is not None and fit.explained < SETTINGS.min_explained * fit.echoes:
+            fit = None
         if fit is not None and (found := _lag_finding(echoes, fit, step)) is not None:
             findings.append(found)
             log = with_later_poses(log, float(fit.estimate[LAG]))
@@ -117,7 +125,7 @@ def _lag_finding(echoes: EchoGroups, fit: MotionFit, step: float) -> Finding | N
         "time offset",
         (),
         "echoes and poses do not go together in time: the poses are "
-        f"{abs(lag):.2f} ± {error:.2f} s {'late' if lag > 0 else 'early'}",
+        f"{abs(lag):.2f} ± {max(error, 0.01):.2f} s {'late' if lag > 0 else 'early'}",
         confidence_of(nats / SETTINGS.echoes_per_fact),
         f"so shifted, walls and points explain {_share(fit)} of the echoes; as recorded, with any scale of the ranges, "
         f"{_share(without)}",
@@ -128,15 +136,15 @@ def _lag_finding(echoes: EchoGroups, fit: MotionFit, step: float) -> Finding | N
 def _scale_finding(ring: Ring, fit: MotionFit) -> Finding | None:
     """The finding about the scale of the ranges; None if it is right."""
     scale, error = float(fit.estimate[SCALE]), float(np.hypot(fit.error[SCALE], SETTINGS.odometry_scale))
-    if not abs(scale) > max(SETTINGS.min_scale, SETTINGS.scale_errors * error):
+    if error > SETTINGS.max_scale_error or not abs(scale) > max(SETTINGS.min_scale, SETTINGS.scale_errors * error):
         return None
     speed = float(ring.speed_of_sound) / (1 + scale)
     size = f"{100 * abs(scale):.1f} ± {100 * error:.1f} % too {'long' if scale > 0 else 'short'}"
     confidence = confidence_of((scale / error) ** 2 / 2)
-    other = f"{100 * abs(scale):.1f} % too {'short' if scale > 0 else 'long'}"
+    other, more = f"{100 * abs(scale):.1f} % too {'short' if scale > 0 else 'long'}", "more" if scale > 0 else "less"
     evidence = (
-        f"so the ranges of {fit.explained} echoes change while the robot moves, {abs(scale) / error:.0f} standard "
-        f"errors off the stated scale; odometry that is {other} would look the same"
+        f"while the robot moves, the ranges of {fit.explained} echoes change by that much {more} than its motion, "
+        f"{abs(scale) / error:.0f} standard errors; odometry that is {other} would look the same"
     )
     if SETTINGS.air[0] < speed < SETTINGS.air[1]:
         sentence = f"all ranges are {size}: the speed of sound is {speed:.1f} m/s, the ring has "
@@ -188,6 +196,12 @@ def _description_finding(comparison: Comparison) -> Finding:
         f"{comparison.given.mean_support:.0%}{rival}",
         best.remedy,
     )
+
+
+def _jump_finding(found: Implausibility) -> Finding:
+    """The finding about jumps of the odometry."""
+    evidence = "the step is much faster than all others, and the echoes before and after it do not show it"
+    return Finding("odometry jump", (), found.what, 0.99, evidence, found.remedy)
 
 
 def _noise_finding(sigma: float, measured: float) -> Finding:

@@ -109,6 +109,7 @@ def best_description(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]
 def _descriptions(ring: Ring, log: Log) -> Iterator[Description]:
     yield from _headings(ring, log)
     yield from _axes(ring, log)
+    yield from _units(ring, log)
     yield from _mounted(ring, log)
     if not _is_regular(ring):
         yield from _numbered(ring, log)
@@ -140,6 +141,13 @@ def _axes(ring: Ring, log: Log) -> Iterator[Description]:
         order, sign = np.array(columns), np.array(signs)
         changed = _with_poses(log, lambda pose, o=order, s=sign: np.column_stack([pose[:, o] * s, pose[:, 2]]))
         yield Description("axes", name, remedy, ring, changed)
+
+
+def _units(ring: Ring, log: Log) -> Iterator[Description]:
+    """Units of the positions."""
+    for unit, name in ((1e-3, "millimetres"), (1e-2, "centimetres")):
+        changed = _with_poses(log, lambda pose, unit=unit: pose * [unit, unit, 1])
+        yield Description("pose unit", f"x and y are in {name}", "give x and y in metres", ring, changed)
 
 
 def _mounted(ring: Ring, log: Log) -> Iterator[Description]:
