@@ -14,6 +14,8 @@ Design decisions:
   wrong wall rotates the robot.
 - A moved robot (kidnapped) is recognized by missed detections: most sensors that face known walls receive no echo of
   them. That all features of a scan are unknown proves nothing; around a corner this is normal.
+- Odometry that jumps (``interrupted_odometry``): the trajectory goes on by the motion before and after the jump if the
+  echoes of both sides agree then. Otherwise nothing ties the parts of the log, and only the largest one has poses.
 - With pose estimation the scans are kept by submap. Free space has directions and cannot be rotated, so the evidence of
   a submap that a loop closure moved is gathered again.
 """

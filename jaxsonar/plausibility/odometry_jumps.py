@@ -82,7 +82,7 @@ class OdometryJump:
     restarts: bool
     """Whether the poses begin again: at (0, 0, 0), or at the first pose of the log."""
     ranges_continue: bool | None
-    """Whether the echoes show that the robot was at nearly the same place before and after it; None: too few echoes."""
+    """Whether the echoes show that the robot went on as before and after it; False: it is elsewhere; None: unknown."""
 
     @property
     def displacement(self) -> float:
@@ -97,7 +97,7 @@ class OdometryJump:
         if self.restarts:
             x, y, theta = (self.pose.round(6) + 0.0).tolist()
             begins = f", to ({x:.3g}, {y:.3g}, {theta:.3g})"
-        echoes = ", while the ranges hardly change" if self.ranges_continue else ""
+        echoes = ", which the echoes do not confirm" if self.ranges_continue else ""
         return f"{size}{time} at scan {self.scan}{begins}{echoes}"
 
 
