@@ -1,4 +1,4 @@
-"""Floor plans: straight walls and thin poles in the world frame."""
+"""Floor plans: straight walls, thin poles and round columns in the world frame."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,13 +14,14 @@ from jaxsonar.hardware.errors import SonarError
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """A floor plan: straight thin walls and thin poles, world frame, metres.
+    """A floor plan: straight thin walls, thin poles and circles, world frame, metres.
 
     On construction, ends of walls within 1 mm of each other, or of another wall, are moved together, so that sound does
     not pass through gaps from rounded coordinates. The arrays are read-only.
 
     Raises:
-        SonarError: a wall or pole that is not finite, a wall without length, or a wrong number of names.
+        SonarError: a wall, pole or circle that is not finite, a wall or circle without size, or a wrong number of
+            names.
     """
 
     walls: Float[np.ndarray, "walls 2 2"]
@@ -29,10 +30,13 @@ class Room:
     """Name of each wall, "" for a wall without one; empty if no wall has a name."""
     poles: Float[np.ndarray, "poles 2"] = field(default_factory=lambda: np.zeros((0, 2)))
     """Centers of poles much thinner than a wavelength; they scatter and do not occlude."""
+    circles: Float[np.ndarray, "circles 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    """Center x, y and radius of round columns; they reflect outwards and occlude."""
 
     def __post_init__(self):
         walls = np.array(self.walls, dtype=np.float64).reshape(-1, 2, 2)
         poles = np.array(self.poles, dtype=np.float64).reshape(-1, 2)
+        circles = np.array(self.circles, dtype=np.float64).reshape(-1, 3)
         names = tuple(self.wall_names) or ("",) * len(walls)
         if len(names) != len(walls):
             raise SonarError(f"room: {len(names)} names for {len(walls)} walls; allowed is one each, or none")
@@ -43,6 +47,8 @@ class Room:
                 raise SonarError(f"room: wall {index} ({name}) is not finite; allowed are finite coordinates in metres")
         if not np.isfinite(poles).all():
             raise SonarError("room: a pole is not finite; allowed are finite coordinates in metres")
+        if not (np.isfinite(circles).all() and (circles[:, 2] > 0).all()):
+            raise SonarError("room: a circle is not finite, or has no radius; allowed are finite metres, above 0")
         walls = _close_gaps(walls)
         short = np.flatnonzero(np.linalg.norm(walls[:, 1] - walls[:, 0], axis=-1) <= TOUCH)
         if len(short):
@@ -52,6 +58,8 @@ class Room:
             raise SonarError(f"room: wall {short[0]} ({names[short[0]]}) has no length; {allowed}")
         walls.setflags(write=False)
         poles.setflags(write=False)
+        circles.setflags(write=False)
+        object.__setattr__(self, "circles", circles)
         object.__setattr__(self, "walls", walls)
         object.__setattr__(self, "poles", poles)
         object.__setattr__(self, "wall_names", names)
@@ -86,7 +94,7 @@ def walls_in_robot_frame(
 def laser_ranges(
     room: Room, world_from_laser: Float[np.ndarray, " 3"], bearing: Float[np.ndarray, " beams"]
 ) -> Float[np.ndarray, " beams"]:
-    """Ranges of a laser scanner along each beam, metres; NaN if the beam meets no wall.
+    """Ranges of a laser scanner along each beam, metres; NaN if the beam meets neither a wall nor a circle.
 
     Args:
         room: walls in the world frame.
@@ -99,6 +107,12 @@ def laser_ranges(
     distance, share = crossings(rays, room.walls)
     meets = (distance > 0) & (share >= 0) & (share <= 1)  # False for NaN, a parallel wall
     nearest = np.where(meets, distance, np.inf).min(axis=1, initial=np.inf)
+    offset = room.circles[:, :2] - world_from_laser[:2]
+    ahead, aside = beam @ offset.T, cross(beam[:, None], offset[None])
+    radius = room.circles[:, 2]
+    entry = ahead - np.sqrt(np.maximum(radius**2 - aside**2, 0))
+    hits = (np.abs(aside) <= radius) & (entry > 0)
+    nearest = np.minimum(nearest, np.where(hits, entry, np.inf).min(axis=1, initial=np.inf))
     return np.where(np.isfinite(nearest), nearest, np.nan)
 
 

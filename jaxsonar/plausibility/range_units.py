@@ -34,6 +34,8 @@ class RangeUnitSettings:
     """... this many maximum ranges."""
     reach: float = 4.0
     """Ranges up to this many times the maximum range are compared with the poses as they are."""
+    most_echoes: int = 40
+    """As many echoes of a scan are compared with poses."""
     gain: float = 0.1
     """The right unit explains at least this much more of the echoes than the given one, ..."""
     sigmas: float = 4.0
@@ -144,7 +146,7 @@ def _best_by_poses(ring: Ring, log: Log, most: float, candidates: list[tuple[flo
     groups = select_groups(log)
     if not groups or not candidates:
         return None
-    log, groups = part_of_groups(log, groups)
+    log, groups = part_of_groups(log, groups, most_echoes=SETTINGS.most_echoes)
     given = None
     if most <= SETTINGS.reach * ring.max_range and most >= SETTINGS.nearest:
         # With a larger maximum range, so that the same echoes are compared.

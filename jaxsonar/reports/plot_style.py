@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
 
 from jaxsonar.fileio.atomic_files import FIGURE_FORMATS, atomic_write, shown
 from jaxsonar.floor_plans.room import Room
@@ -122,7 +123,9 @@ def finish_plan_view(figure: Figure, axes: Axes, handles: list[Line2D], *, width
 
 
 def draw_room(axes: Axes, room: Room) -> None:
-    """Draw the true walls of a floor plan in grey, and its poles as crosses."""
+    """Draw the true walls and circles of a floor plan in grey, and its poles as crosses."""
+    for x, y, radius in room.circles:
+        axes.add_patch(Circle((x, y), radius, fill=False, color=WALL_COLOR, lw=1.4, zorder=3))
     axes.add_collection(LineCollection(list(room.walls), colors=WALL_COLOR, linewidths=1.4, zorder=3))
     if len(room.poles):
         axes.plot(*room.poles.T, "x", color=WALL_COLOR, ms=6, mew=1.6, zorder=3)

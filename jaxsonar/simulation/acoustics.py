@@ -51,6 +51,7 @@ def amplitudes(
     axis: Float[np.ndarray, "groups sensors 2"],
     half_beam: Float[np.ndarray, " sensors"],
     acoustics: Acoustics,
+    radius: Float[np.ndarray, " circles"],
 ) -> Float[np.ndarray, " found"]:
     """Amplitude of each echo: reflection or scattering, spreading, beam pattern and absorption.
 
@@ -61,18 +62,24 @@ def amplitudes(
         axis: (groups, sensors, 2) unit vectors of the sensor axes.
         half_beam: (sensors,) half the width of each cone, radians.
         acoustics: the acoustic model.
+        radius: radii of the circles of the room, metres.
     """
     tx, rx = pairs[found.pair].T
     distance_tx, angle_tx = _distance_and_angle(sensors[found.group, tx], axis[found.group, tx], found.first)
     distance_rx, angle_rx = _distance_and_angle(sensors[found.group, rx], axis[found.group, rx], found.last)
     with np.errstate(divide="ignore"):
         scattered = np.sqrt(2.0 / (distance_tx * distance_rx * (distance_tx + distance_rx)))
-    reflections = np.where(found.kind == EchoKind.PLANE, 1, 2)
+    single = (found.kind == EchoKind.PLANE) | (found.kind == EchoKind.CIRCLE)
+    reflections = np.where(single, 1, 2)
     strength = np.select(
         [found.kind == EchoKind.EDGE, found.kind == EchoKind.POLE],
         [acoustics.edge_strength * scattered, acoustics.pole_strength * scattered],
         acoustics.reflectivity**reflections / (found.length / 2),
     )
+    # A convex mirror widens the wave: at equal distances d, the amplitude falls by sqrt(radius / (radius + d)).
+    at = np.flatnonzero(found.kind == EchoKind.CIRCLE)
+    r, near, far = radius[found.reflector[at]], distance_tx[at], distance_rx[at]
+    strength[at] *= np.sqrt(r / (r + 2 * near * far / (near + far)))
     off_axis = (angle_tx / half_beam[tx]) ** 2 + (angle_rx / half_beam[rx]) ** 2
     loss_db = acoustics.beam_edge_db * off_axis + acoustics.absorption_db_per_m * (found.length - 2.0)
     return strength * 10 ** (-loss_db / 20)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.floor_plans.room import Room
+from jaxsonar.simulation.circle_echoes import trace_circles
 from jaxsonar.simulation.image_sources import trace_corners, trace_planes, trace_second_order
 from jaxsonar.simulation.point_scatterers import trace_edges, trace_poles
 from jaxsonar.simulation.traced_echoes import TracedEchoes
@@ -32,8 +33,10 @@ def trace_echoes(
       vertex c: the length is 2|m - c| with the midpoint m of the sensors. Both sensors lie inside the wedge.
     - Edge and pole: the length is |s_i - c| + |s_j - c|. At an edge both sensors lie inside its wedge.
 
-    No leg intersects a wall; poles do not occlude. With ``axis`` and ``half_beam`` the sound must leave tx and reach rx
-    within their cones, in its exact directions (no far-field approximation).
+    - Circle: one reflection at its outside, where the path over it is shortest.
+
+    No leg intersects a wall or a circle; poles do not occlude. With ``axis`` and ``half_beam`` the sound must leave tx
+    and reach rx within their cones, in its exact directions (no far-field approximation).
 
     Args:
         room: the reflectors.
@@ -51,6 +54,7 @@ def trace_echoes(
             trace_corners(scene, junctions),
             trace_edges(scene, junctions),
             trace_poles(scene, room.poles),
+            trace_circles(scene),
             trace_second_order(scene, junctions.right_angled),
         ]
     )

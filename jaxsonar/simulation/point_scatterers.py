@@ -54,7 +54,7 @@ def _trace_points(
     if scene.axis is not None:
         visible &= in_cone(leg, scene.axis[g], scene.cos_half_beam)
     row, sensor = np.nonzero(visible)
-    visible[row, sensor] = ~scene.walls.block(scene.sensors[g[row], sensor], points[point[row]])
+    visible[row, sensor] = ~scene.block(scene.sensors[g[row], sensor], points[point[row]])
     length = distance[:, i] + distance[:, j]
     row, pair = np.nonzero(visible[:, i] & visible[:, j] & (length <= 2 * scene.max_range))
     at = points[point[row]]

@@ -79,6 +79,8 @@ def _free(room: Room, points: np.ndarray, clearance: float) -> np.ndarray:
     """Points inside the room, with a wall in each of 64 directions, and with this clearance (metres)."""
     inside = (point_to_segments(points, room.walls) >= clearance).all(axis=1)
     inside &= (np.linalg.norm(points[:, None] - room.poles, axis=-1) >= clearance).all(axis=1)
+    away = np.linalg.norm(points[:, None] - room.circles[:, :2], axis=-1) - room.circles[:, 2]
+    inside &= (away >= clearance).all(axis=1)
     kept = np.flatnonzero(inside)
     angle = 2 * np.pi * np.arange(64) / 64
     towards = np.stack([np.cos(angle), np.sin(angle)], axis=-1)

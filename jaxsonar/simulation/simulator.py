@@ -235,7 +235,7 @@ def _detect(
     heading = poses[:, 2, None] + array.heading
     axis = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     found = trace_echoes(room, sensors, array.pairs, max_range=array.max_range, axis=axis, half_beam=array.half_beam)
-    amplitude = amplitudes(found, array.pairs, sensors, axis, array.half_beam, acoustics)
+    amplitude = amplitudes(found, array.pairs, sensors, axis, array.half_beam, acoustics, room.circles[:, 2])
     loud = amplitude >= acoustics.threshold
     found, amplitude = found[loud], amplitude[loud]
     order = np.lexsort((found.second, found.reflector, found.kind, found.length, found.pair, found.group))

@@ -23,6 +23,8 @@ class EchoKind(IntEnum):
     """Consecutive reflections at two walls that do not form a right-angled corner."""
     CLUTTER = 5
     """False echo without any reflector."""
+    CIRCLE = 6
+    """One reflection at a circle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +38,7 @@ class TracedEchoes:
     kind: Int[np.ndarray, " found"]
     """A value of ``EchoKind``."""
     reflector: Int[np.ndarray, " found"]
-    """Wall (plane, or first wall of a second-order path), vertex of ``Room.junctions`` (corner, edge), or pole."""
+    """Wall (plane, or first wall of a second-order path), vertex of ``Room.junctions`` (corner, edge), pole, circle."""
     second: Int[np.ndarray, " found"]
     """Second wall of a second-order path, otherwise -1."""
     length: Float[np.ndarray, " found"]

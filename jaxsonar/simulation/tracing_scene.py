@@ -78,6 +78,8 @@ class TracingScene:
     """Walls within range of any group."""
     index: Int[np.ndarray, " walls"]
     """Their indices in the room."""
+    circles: Float[np.ndarray, "circles 3"]
+    """Center and radius of circles."""
     separation: Float[np.ndarray, "walls walls"]
     """Distance between two walls, metres."""
     distance: Float[np.ndarray, "groups walls"]
@@ -110,7 +112,7 @@ class TracingScene:
         half_beam: Float[np.ndarray, " sensors"] | None,
     ) -> "TracingScene":
         """Prepare a room and groups of sensors in the world frame; arguments as ``echo_tracing.trace_echoes``."""
-        corners = np.concatenate([room.walls.reshape(-1, 2), room.poles])
+        corners = np.concatenate([room.walls.reshape(-1, 2), room.poles, room.circles[:, :2]])
         origin = corners.mean(0) if len(corners) else np.zeros(2)
         sensors = sensors - origin
         hub = sensors.mean(1)
@@ -127,6 +129,7 @@ class TracingScene:
             origin=origin,
             walls=WallFrames.of(walls),
             index=index,
+            circles=room.circles - np.append(origin, 0.0),
             separation=np.where(crossed, 0.0, np.minimum(ends, ends.T)),
             distance=distance[:, index],
             sensors=sensors,
@@ -148,8 +151,17 @@ class TracingScene:
                 found = found[in_cone(leg, self.axis[found.group, sensor], self.cos_half_beam[sensor])]
         for side, point in ((0, "first"), (1, "last")):
             start = self.sensors[found.group, self.pairs[found.pair, side]]
-            found = found[~self.walls.block(start, getattr(found, point))]
-        return found[~self.walls.block(found.first, found.last)]
+            found = found[~self.block(start, getattr(found, point))]
+        return found[~self.block(found.first, found.last)]
+
+    def block(self, p: Float[np.ndarray, "legs 2"], q: Float[np.ndarray, "legs 2"]) -> Bool[np.ndarray, " legs"]:
+        """Legs from p to q that a wall or a circle intersects; one that ends on it is not blocked by it."""
+        blocked = self.walls.block(p, q)
+        for x, y, radius in self.circles:
+            leg, to = q - p, np.array([x, y]) - p
+            share = np.clip((leg * to).sum(-1) / np.maximum((leg**2).sum(-1), TOLERANCE**2), 0, 1)
+            blocked |= np.linalg.norm(share[:, None] * leg - to, axis=-1) < radius - TOLERANCE
+        return blocked
 
     def points_in_range(
         self, points: Float[np.ndarray, "points 2"]
