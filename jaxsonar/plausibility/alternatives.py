@@ -20,7 +20,15 @@ from jaxsonar.plausibility.corrections import (
     turned_rings,
 )
 from jaxsonar.plausibility.implausibility import Implausibility
-from jaxsonar.plausibility.pose_agreement import Agreement, Gain, agreement, gain, part_of_groups, select_groups
+from jaxsonar.plausibility.pose_agreement import (
+    Agreement,
+    Gain,
+    agreement,
+    bounded,
+    gain,
+    part_of_groups,
+    select_groups,
+)
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -33,6 +41,9 @@ class AlternativeSettings:
     """Least gain in the mean support of the echoes."""
     z: float = 3.5
     """Least gain in standard errors."""
+    turned: float = 0.1
+    """A turned ring gains at least this share of what the given description lacks: late poses of a robot that turns
+    look like a slightly turned ring."""
     tie: float = 2.0
     """An alternative that is worse than the best one by less than this many standard errors may be true, too, ..."""
     tie_margin: float = 0.01
@@ -142,6 +153,8 @@ def best_alternative(ring: Ring, log: Log) -> Alternative | None:
         return None
     if agreed.share < agreed.chance + SETTINGS.above_chance:
         return None
+    if best[0].kind == "first sensor" and more.support < SETTINGS.turned * (1 - given.mean_support):
+        return None
     kinds = {one.kind for one in best}
     others = {one[0].kind: one[0] for one, _ in reversed(ties) if len(one) == 1 and one[0].kind not in kinds}
     return Alternative(best, given, agreed, more, tuple(others.values()))
@@ -186,7 +199,7 @@ def _moving_groups(log: Log, groups: list[Int[np.ndarray, "_"]]) -> list[Int[np.
     """Few groups in which the robot both drives and turns: most mistakes show only there."""
 
     def motion(group: Int[np.ndarray, "_"]) -> float:
-        steps = np.abs(np.diff(log.pose[group], axis=0))
+        steps = np.abs(np.diff(bounded(log.pose[group]), axis=0))
         length, turn = np.hypot(steps[:, 0], steps[:, 1]).sum(), np.abs(np.sin(steps[:, 2])).sum()
         return float(min(length, 1.0) + min(turn, 1.0) + min(length * turn, 1.0))
 

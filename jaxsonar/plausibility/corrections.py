@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.plausibility.pose_agreement import bounded
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -99,7 +100,7 @@ def axis_corrections() -> list[Correction]:
 
 def pose_unit_corrections(log: Log) -> list[Correction]:
     """Positions in millimetres or centimetres, if the robot moves at all in this unit."""
-    position = log.pose[np.isfinite(log.pose).all(axis=1), :2]
+    position = bounded(log.pose[np.isfinite(log.pose).all(axis=1)])[:, :2]
     extent = float(np.ptp(position, axis=0).max()) if len(position) else 0.0
     found = []
     for unit, name, short in ((1e-3, "millimetres", "mm"), (1e-2, "centimetres", "cm")):

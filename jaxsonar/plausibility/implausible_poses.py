@@ -8,7 +8,7 @@ import numpy as np
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.plausibility.alternatives import find_mistakes
 from jaxsonar.plausibility.implausibility import Implausibility
-from jaxsonar.plausibility.pose_agreement import agreement, part_of_groups, select_groups
+from jaxsonar.plausibility.pose_agreement import agreement, bounded, part_of_groups, select_groups
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -54,7 +54,7 @@ def implausible_poses(ring: Ring, log: Log) -> Iterator[Implausibility]:
 
 def _distant_scans(ring: Ring, log: Log) -> list[Implausibility]:
     """Scans so far apart that no two of them can hear the same wall."""
-    position = log.pose[np.isfinite(log.pose).all(axis=1), :2]
+    position = bounded(log.pose[np.isfinite(log.pose).all(axis=1)])[:, :2]
     step = np.hypot(*np.diff(position, axis=0).T)
     if len(step) < SETTINGS.least_steps or np.median(step) < SETTINGS.far * ring.max_range:
         return []

@@ -46,6 +46,8 @@ class PoseAgreementSettings:
     """In logs with more scans, only as many scans are looked at as the groups need."""
     nearest: float = 0.05
     """Echoes below this range are left out, metres."""
+    farthest: float = 1e9
+    """Positions are limited to this distance from the origin, metres, so that no number overflows."""
     by_chance: float = 0.95
     """Quantile of the votes by chance that an explained echo exceeds."""
     least_votes: int = 2
@@ -120,6 +122,12 @@ class Gain:
         return self.support / self.support_sigma
 
 
+def bounded(pose: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """The poses with limited positions (``SETTINGS.farthest``), with which one can calculate."""
+    limit = np.array([SETTINGS.farthest, SETTINGS.farthest, np.inf])
+    return np.clip(pose, -limit, limit)
+
+
 def select_groups(log: Log) -> list[Int[np.ndarray, "_"]]:
     """Groups of scans that are compared with each other: rows of the log, in order.
 
@@ -127,7 +135,7 @@ def select_groups(log: Log) -> list[Int[np.ndarray, "_"]]:
     adds no scan. The list is empty if the log has no poses or the robot hardly moves.
     """
     posed = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
-    pose = log.pose[posed]
+    pose = bounded(log.pose[posed])
     if len(posed) <= SETTINGS.long_log:
         row = _spaced(pose, len(pose))
         groups = [row[k : k + SETTINGS.group] for k in range(0, len(row), SETTINGS.group)]
@@ -205,14 +213,14 @@ def agreement(
     distance = np.asarray(ring.corrected(log.range[row], log.tx[row], log.rx[row]))
     near = (distance > SETTINGS.nearest) & (distance < ring.max_range)
     row, distance = row[near], distance[near]
-    pose = reading_poses(log)[row] if log.t.any() or log.age.any() else log.pose[scan[row]]
+    pose = bounded(reading_poses(log)[row] if log.t.any() or log.age.any() else log.pose[scan[row]])
     rng = np.random.default_rng(SETTINGS.seed)
     explained, lucky, support = np.zeros(len(row), bool), np.zeros(len(row), bool), np.zeros(len(row))
     bounds = np.searchsorted(scan[row], [[one[0], one[-1] + 1] for one in groups]) if len(groups) else []
     for group, (begin, end) in zip(groups, bounds, strict=True):
         one = slice(begin, end)
         place = np.searchsorted(group, scan[row[one]])
-        group_from_robot = relative(log.pose[group[len(group) // 2]], pose[one])
+        group_from_robot = relative(bounded(log.pose[group[len(group) // 2]]), pose[one])
         compared = path[row[one]], distance[one]
         turn = rng.uniform(-np.pi, np.pi, len(group))[place]
         if end == begin:
