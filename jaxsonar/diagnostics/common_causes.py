@@ -12,8 +12,6 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxsonar.diagnostics.findings import Finding, confidence_of
-from jaxsonar.diagnostics.local_reflectors import EchoGroups, group_echoes
-from jaxsonar.diagnostics.motion_fit import LAG, SCALE, MotionFit, fit_motion
 from jaxsonar.diagnostics.time_offset import search_step, search_time_offsets, with_later_poses
 from jaxsonar.diagnostics.wrong_descriptions import Comparison, best_description
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
@@ -21,6 +19,8 @@ from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.plausibility.odometry_jumps import implausible_odometry
 from jaxsonar.plausibility.pose_agreement import select_groups
 from jaxsonar.plausibility.range_noise import range_noise
+from jaxsonar.registration.local_reflectors import PosedEchoes, group_echoes
+from jaxsonar.registration.motion_fit import LAG, SCALE, MotionFit, fit_motion
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -113,7 +113,7 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
     return CommonCauses(ring, log, sigma, tuple(findings))
 
 
-def _lag_finding(echoes: EchoGroups, fit: MotionFit, step: float) -> Finding | None:
+def _lag_finding(echoes: PosedEchoes, fit: MotionFit, step: float) -> Finding | None:
     """The finding about a time offset; None if there is none."""
     lag, error = float(fit.estimate[LAG]), float(fit.error[LAG])
     if not abs(lag) > max(SETTINGS.min_lag, SETTINGS.lag_steps * step, SETTINGS.lag_errors * error):
@@ -161,7 +161,7 @@ def _share(fit: MotionFit) -> str:
     return f"{fit.explained / fit.echoes:.0%} (within {1e3 * fit.noise:.1f} mm)"
 
 
-def _search_motion(ring: Ring, log: Log, groups: _Groups, echoes: EchoGroups, step: float) -> MotionFit | None:
+def _search_motion(ring: Ring, log: Log, groups: _Groups, echoes: PosedEchoes, step: float) -> MotionFit | None:
     """Time offset and scale: the most likely fit among those from several time offsets; None without walls."""
     if not np.isfinite(step):
         return fit_motion(echoes, free=(True, False))

@@ -4,11 +4,11 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxsonar import kernels
-from jaxsonar.diagnostics.local_reflectors import find_reflectors, group_echoes
 from jaxsonar.diagnostics.reference_scene import ReferenceScene, empty_scene
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.geometry.se2 import rotate, tangent_of, unit
 from jaxsonar.plausibility.pose_agreement import select_groups
+from jaxsonar.registration.local_reflectors import find_reflectors, group_echoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import has_moved
 from jaxsonar.sensors.range_models import plane_footpoint

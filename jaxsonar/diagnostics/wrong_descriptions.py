@@ -4,13 +4,14 @@ All sensors keep their numbers, so that findings about single sensors hold for t
 by a ring whose sensors stand elsewhere.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from jaxsonar.geometry.se2 import rotate
+from jaxsonar.plausibility.corrections import axis_corrections, heading_corrections, pose_unit_corrections
 from jaxsonar.plausibility.pose_agreement import Agreement, agreement, gain, part_of_groups
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -107,47 +108,12 @@ def best_description(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]
 
 
 def _descriptions(ring: Ring, log: Log) -> Iterator[Description]:
-    yield from _headings(ring, log)
-    yield from _axes(ring, log)
-    yield from _units(ring, log)
+    for one in (*heading_corrections(), *axis_corrections(), *pose_unit_corrections(log)):
+        cause = "headings" if one.kind.startswith("heading") else one.kind
+        yield Description(cause, one.mistake, one.remedy, ring, one.apply(log))
     yield from _mounted(ring, log)
     if not _is_regular(ring):
         yield from _numbered(ring, log)
-
-
-def _headings(ring: Ring, log: Log) -> Iterator[Description]:
-    """Units and directions of headings."""
-    radians = "give theta in radians, counter-clockwise from x"
-    kinds: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
-        ("in degrees", np.radians),
-        ("clockwise", np.negative),
-        ("in degrees, clockwise", lambda theta: -np.radians(theta)),
-        ("those of a compass, clockwise from y", lambda theta: np.pi / 2 - theta),
-        ("those of a compass, clockwise from y in degrees", lambda theta: np.pi / 2 - np.radians(theta)),
-    )
-    for name, undo in kinds:
-        changed = _with_poses(log, lambda pose, undo=undo: np.column_stack([pose[:, :2], undo(pose[:, 2])]))
-        yield Description("headings", f"the headings are {name}", radians, ring, changed)
-
-
-def _axes(ring: Ring, log: Log) -> Iterator[Description]:
-    """Mirrored positions. Rotated ones have the same effect as a rotated ring."""
-    remedy = "give x and y of a right-handed frame, in which theta turns from x to y"
-    for name, columns, signs in (
-        ("x and y are swapped", [1, 0], [1, 1]),
-        ("x has the wrong sign", [0, 1], [-1, 1]),
-        ("y has the wrong sign", [0, 1], [1, -1]),
-    ):
-        order, sign = np.array(columns), np.array(signs)
-        changed = _with_poses(log, lambda pose, o=order, s=sign: np.column_stack([pose[:, o] * s, pose[:, 2]]))
-        yield Description("axes", name, remedy, ring, changed)
-
-
-def _units(ring: Ring, log: Log) -> Iterator[Description]:
-    """Units of the positions."""
-    for unit, name in ((1e-3, "millimetres"), (1e-2, "centimetres")):
-        changed = _with_poses(log, lambda pose, unit=unit: pose * [unit, unit, 1])
-        yield Description("pose unit", f"x and y are in {name}", "give x and y in metres", ring, changed)
 
 
 def _mounted(ring: Ring, log: Log) -> Iterator[Description]:
@@ -204,11 +170,3 @@ def _is_regular(ring: Ring) -> bool:
     turn = 2 * np.pi / ring.count
     same = np.allclose(rotate(position, np.array(turn)), np.roll(position, -1, axis=0), atol=1e-3)
     return bool(same and np.allclose(np.exp(1j * (heading + turn)), np.exp(1j * np.roll(heading, -1)), atol=1e-3))
-
-
-def _with_poses(log: Log, change: Callable[[Float[np.ndarray, "poses 3"]], Float[np.ndarray, "poses 3"]]) -> Log:
-    """The log with other poses of its scans and odometry."""
-    odometry = log.odometry
-    if odometry is not None:
-        odometry = np.column_stack([odometry[:, 0], change(odometry[:, 1:])])
-    return replace(log, pose=change(log.pose), odometry=odometry)

@@ -6,14 +6,14 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsonar.diagnostics.local_reflectors import (
-    EchoGroups,
+from jaxsonar.geometry.se2 import perpendicular, wrap_angle
+from jaxsonar.registration.local_reflectors import (
     LocalReflectors,
+    PosedEchoes,
     biweight,
     find_reflectors,
     residual_noise,
 )
-from jaxsonar.geometry.se2 import perpendicular, wrap_angle
 from jaxsonar.sensors.range_models import PredictedRange, predict_ranges
 
 SCALE, LAG = 0, 1
@@ -74,7 +74,7 @@ class MotionFit:
         return self.explained * float(np.log(self.max_range / (self.noise * np.sqrt(2 * np.pi * np.e))))
 
 
-def fit_motion(groups: EchoGroups, *, lag: float = 0.0, free: tuple[bool, bool] = (True, True)) -> MotionFit | None:
+def fit_motion(groups: PosedEchoes, *, lag: float = 0.0, free: tuple[bool, bool] = (True, True)) -> MotionFit | None:
     """Estimate the scale of the ranges and the time offset between echoes and poses.
 
     Args:
@@ -98,7 +98,7 @@ def fit_motion(groups: EchoGroups, *, lag: float = 0.0, free: tuple[bool, bool] 
 
 
 def _solve(
-    groups: EchoGroups, found: LocalReflectors, start: Float[np.ndarray, " 2"], free: Bool[np.ndarray, " 2"]
+    groups: PosedEchoes, found: LocalReflectors, start: Float[np.ndarray, " 2"], free: Bool[np.ndarray, " 2"]
 ) -> MotionFit:
     """Robust least squares over reflectors, poses and the two parameters."""
     value, parts = start.copy(), [_Part(groups, found, number) for number in np.unique(found.group).tolist()]
@@ -121,7 +121,7 @@ def _solve(
 class _Part:
     """One group of scans: its echoes, reflectors, and corrections of its poses."""
 
-    def __init__(self, groups: EchoGroups, found: LocalReflectors, number: int):
+    def __init__(self, groups: PosedEchoes, found: LocalReflectors, number: int):
         """Take the echoes and the reflectors of a group."""
         own = found.group == number
         self.groups, self.kind, self.landmark = groups, found.kind[own], found.parameters[own].copy()

@@ -53,7 +53,7 @@ SETTINGS = LocalReflectorSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class EchoGroups:
+class PosedEchoes:
     """Echoes of groups of consecutive scans. A group's frame has the axes of the world and its middle as origin."""
 
     ring: Ring
@@ -112,12 +112,12 @@ class LocalReflectors:
     group: Int[np.ndarray, " reflectors"]
     """Its group."""
     echo: Int[np.ndarray, " explained"]
-    """Echo of ``EchoGroups``."""
+    """Echo of ``PosedEchoes``."""
     reflector: Int[np.ndarray, " explained"]
     """The reflector that explains it."""
 
 
-def group_echoes(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -> EchoGroups:
+def group_echoes(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -> PosedEchoes:
     """The echoes of groups of scans.
 
     Args:
@@ -143,12 +143,12 @@ def group_echoes(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -
     samples = log.pose_samples
     samples = samples[np.isfinite(samples).all(axis=1)]
     _, first = np.unique(samples[:, 0], return_index=True)
-    return EchoGroups(
+    return PosedEchoes(
         ring, path[row], corrected[row], scan, group, pose, measurement_times(log)[row], origin[scan], samples[first]
     )
 
 
-def find_reflectors(groups: EchoGroups, pose: Float[np.ndarray, "echoes 3"]) -> LocalReflectors:
+def find_reflectors(groups: PosedEchoes, pose: Float[np.ndarray, "echoes 3"]) -> LocalReflectors:
     """Find walls and points in each group.
 
     Args:
@@ -168,7 +168,7 @@ def find_reflectors(groups: EchoGroups, pose: Float[np.ndarray, "echoes 3"]) -> 
 
 
 def _reflectors_of_group(
-    groups: EchoGroups, echo: Int[np.ndarray, " echoes"], pose: Float[np.ndarray, "all 3"]
+    groups: PosedEchoes, echo: Int[np.ndarray, " echoes"], pose: Float[np.ndarray, "all 3"]
 ) -> Iterator[tuple[int, Float[np.ndarray, " 2"], Int[np.ndarray, " explained"]]]:
     """Kind, parameters and echoes of the reflectors of a group, the one with the most scans first."""
     votes, start = _votes(groups, echo, pose[echo])
@@ -199,7 +199,7 @@ def _reflectors_of_group(
 
 
 def _votes(
-    groups: EchoGroups, echo: Int[np.ndarray, " echoes"], pose: Float[np.ndarray, "echoes 3"]
+    groups: PosedEchoes, echo: Int[np.ndarray, " echoes"], pose: Float[np.ndarray, "echoes 3"]
 ) -> tuple[Int[np.ndarray, "angles distances"], float]:
     """Number of scans that vote for each wall (theta, rho), and the first rho, metres."""
     paths, path = groups.ring.exact_paths, groups.path[echo]
