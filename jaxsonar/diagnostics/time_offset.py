@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from jaxsonar.diagnostics.wrong_descriptions import support
+from jaxsonar.diagnostics.wrong_descriptions import mean_support
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.scans.firing_poses import poses_at
 from jaxsonar.scans.scan_log import Log
@@ -68,12 +68,12 @@ def search_time_offsets(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "
         log: the scans.
         groups: rows of the scans that are compared.
     """
-    step, given, found = search_step(log), support(ring, log, groups).mean_support, []
+    step, given, found = search_step(log), mean_support(ring, log, groups), []
     for sign in (1, -1) if np.isfinite(step) else ():
         best, misses = given, 0
         for steps in SETTINGS.steps:
             lag = sign * steps * step
-            agrees = support(ring, with_later_poses(log, lag), groups).mean_support
+            agrees = mean_support(ring, with_later_poses(log, lag), groups)
             misses = 0 if agrees > best else misses + 1
             best = max(best, agrees)
             found.append((agrees, lag))

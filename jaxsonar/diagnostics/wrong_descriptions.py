@@ -73,8 +73,14 @@ class Comparison:
     """How much better the best one is than the next best one, standard errors."""
 
 
-def support(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -> Agreement:
-    """The agreement of some echoes of each scan, the same ones for every description of a log."""
+def mean_support(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -> float:
+    """The mean support of some echoes of each scan, the same ones for every description of a log."""
+    part = part_of_groups(log, groups, most_echoes=SETTINGS.most_echoes)
+    return agreement(ring, *part, support_only=True).mean_support
+
+
+def _agreement(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -> Agreement:
+    """The agreement of the same echoes."""
     return agreement(ring, *part_of_groups(log, groups, most_echoes=SETTINGS.most_echoes))
 
 
@@ -86,18 +92,18 @@ def best_description(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]
         log: the scans.
         groups: rows of the scans that are compared (``pose_agreement.select_groups``).
     """
-    given = support(ring, log, groups)
+    given = _agreement(ring, log, groups)
     if given.echoes < SETTINGS.min_echoes:
         return None
     some = np.unique(np.linspace(0, len(groups) - 1, min(len(groups), SETTINGS.screen_groups)).astype(int))
     screen = [groups[k] for k in some]
 
     def screened(one: Description) -> float:
-        return support(one.ring, one.log, screen).mean_support
+        return mean_support(one.ring, one.log, screen)
 
     finalists = sorted(_descriptions(ring, log), key=screened, reverse=True)[: SETTINGS.finalists]
     results = sorted(
-        ((one, support(one.ring, one.log, groups)) for one in finalists), key=lambda one: -one[1].mean_support
+        ((one, _agreement(one.ring, one.log, groups)) for one in finalists), key=lambda one: -one[1].mean_support
     )
     (best, result), (next_best, next_result) = results[:2]
     more = gain(given, result)
