@@ -139,7 +139,7 @@ _WRONG_LOGS: dict[str, tuple[Callable[[Scene], Log], str, tuple[str, ...]]] = {
     "held readings": (_of_fault("held readings"), r"repeats the last range|held", faults.SINGLE_ECHO),
     "own echo": (_of_fault("own echo"), r"robot", ()),
     "floor everywhere": (_of_fault("floor everywhere"), r"robot|floor", ()),
-    "unrelated echoes": (_any_ranges, r"explain", ()),
+    "unrelated echoes": (_any_ranges, r"explain|agree", ()),
     "direct echoes only": (_direct_only, r"never|heard|measured", ("cross",)),
 }
 """Wrong logs, the words of their warnings, and the styles of rings on which they occur."""
