@@ -14,9 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.se2 import wrap_angle
-from jaxsonar.plausibility.constant_ranges import range_resolution
+from jaxsonar.plausibility.constant_ranges import (
+    distinct_views,
+    independent_places,
+    is_contradicted,
+    range_resolution,
+)
 from jaxsonar.plausibility.implausibility import Implausibility
-from jaxsonar.plausibility.robot_echo_evidence import distinct_views, independent_places, is_contradicted
 from jaxsonar.scans.firing_poses import reading_poses
 from jaxsonar.scans.measured_paths import measured_paths, path_rows
 from jaxsonar.scans.readings import explicit_log, is_repeated, without_readings
