@@ -166,7 +166,7 @@ class _Comparison:
     def __init__(self, ring: Ring, log: Log):
         self.ring = ring
         self.log = log
-        self._parts: dict[str, tuple[tuple[Log, list[Int[np.ndarray, _]]], ...]] = {}
+        self._parts: dict[str, tuple[tuple[Log, list[np.ndarray]], ...]] = {}
         self._screened: dict[tuple[Correction, ...], float] = {}
 
     def screen(self, corrections: tuple[Correction, ...]) -> float:

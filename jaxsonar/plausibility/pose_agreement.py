@@ -306,8 +306,8 @@ def _votes_of_others(
     echo = np.repeat(np.arange(len(path)), count)
     angle = (first[echo] + np.arange(len(echo)) - begin[echo]) % _ANGLES
     # Distance of the wall from the origin of the group for each direction: the isorange arc of the echo.
-    midpoint = (pose[:, :2] + rotate(paths.midpoint[path], pose[:, 2])).astype(np.float32)[echo]
-    baseline = rotate(paths.half_baseline[path], pose[:, 2]).astype(np.float32)[echo]
+    midpoint = (pose[:, :2] + rotate(np.asarray(paths.midpoint)[path], pose[:, 2])).astype(np.float32)[echo]
+    baseline = rotate(np.asarray(paths.half_baseline)[path], pose[:, 2]).astype(np.float32)[echo]
     cos, sin = _COS[angle], _SIN[angle]
     across = baseline[:, 1] * cos - baseline[:, 0] * sin
     height = np.sqrt(np.maximum(distance.astype(np.float32)[echo] ** 2 - across**2, 0))

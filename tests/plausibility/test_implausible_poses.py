@@ -15,6 +15,7 @@ from jaxsonar.scans.flat_echoes import FlatEchoes
 
 SCENES = {8: (2, 8, 1), 12: (1, 12, 0), 16: (1, 16, 1)}
 """Seed, sensors and neighbors of the simulated logs."""
+scenes = pytest.mark.parametrize("count", [12, *(pytest.param(count, marks=pytest.mark.slow) for count in (8, 16))])
 
 
 def _poses(change):
@@ -53,7 +54,7 @@ def found(ring, log):
     return [one.kind for one in came], " ".join(map(str, came))
 
 
-@pytest.mark.parametrize("count", SCENES)
+@scenes
 @pytest.mark.parametrize("name", MISTAKES)
 def test_each_mistake_is_named(name, count):
     ring, log = driven_log(*SCENES[count])
@@ -63,7 +64,7 @@ def test_each_mistake_is_named(name, count):
     assert words in text
 
 
-@pytest.mark.parametrize("count", SCENES)
+@scenes
 def test_two_mistakes_at_once_are_named(count):
     ring, log = driven_log(*SCENES[count])
     units = with_poses(log, lambda x, y, theta: (1e3 * x, 1e3 * y, np.degrees(theta)))

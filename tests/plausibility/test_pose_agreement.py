@@ -77,7 +77,8 @@ def test_votes_agree_with_a_slow_oracle():
     poses = np.column_stack([rng.uniform(-0.2, 0.2, (6, 2)), rng.uniform(-0.5, 0.5, 6)])
     path = np.tile(np.arange(len(ring.paths)), 6)
     scan = np.repeat(np.arange(6), len(ring.paths))
-    log = Log.from_echoes(scan, *ring.paths[path].T, rng.uniform(1.0, 1.3, len(path)), stamp=np.arange(6.0), pose=poses)
+    tx, rx = ring.paths[path].T
+    log = Log.from_echoes(scan, tx, rx, rng.uniform(1.0, 1.3, len(path)), stamp=np.arange(6.0), pose=poses)
     group = np.arange(6)
     found = agreement(ring, log, [group])
     votes = np.round(found.support * 5).astype(int)
