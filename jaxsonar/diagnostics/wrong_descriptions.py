@@ -105,12 +105,13 @@ def best_description(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]
     results = sorted(
         ((one, _agreement(one.ring, one.log, groups)) for one in finalists), key=lambda one: -one[1].mean_support
     )
-    (best, result), (next_best, next_result) = results[:2]
+    best, result = results[0]
     more = gain(given, result)
     if more.support < SETTINGS.min_gain or more.support_z < SETTINGS.min_z or more.share < -SETTINGS.max_loss:
         return None
-    second, name = (next_result, next_best.mistake) if next_result.mean_support > given.mean_support else (given, "")
-    return Comparison(best, given, result, name, second.mean_support, gain(second, result).support_z)
+    rivals = [(one.mistake, other) for one, other in results if one.cause != best.cause]
+    second, next_best = max([("", given), *rivals], key=lambda one: one[1].mean_support)
+    return Comparison(best, given, result, second, next_best.mean_support, gain(next_best, result).support_z)
 
 
 def _descriptions(ring: Ring, log: Log) -> Iterator[Description]:
