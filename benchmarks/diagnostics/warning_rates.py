@@ -66,7 +66,7 @@ def warnings_about(one: Input) -> Iterator[str]:
         room, poses = one.room, one.poses
         yield from _texts("implausible_room", lambda of: of(room))
         if poses is not None:
-            yield from _texts("implausible_trajectory", lambda of: of(room, poses))
+            yield from _texts("implausible_room", lambda of: of(room, poses), function="implausible_trajectory")
     if one.noise is not None:
         noise = one.noise
         yield from _texts("implausible_noise", lambda of: of(noise))
@@ -76,10 +76,11 @@ def warnings_about(one: Input) -> Iterator[str]:
         yield from (text.removeprefix("warning: ") for text in notes if text.startswith("warning: "))
 
 
-def _texts(name: str, call: Callable[[Any], Iterable[Any]]) -> Iterator[str]:
+def _texts(module: str, call: Callable[[Any], Iterable[Any]], *, function: str = "") -> Iterator[str]:
     """Warnings of a function of the package ``plausibility``; none from a version that lacks it."""
-    if importlib.util.find_spec(f"jaxsonar.plausibility.{name}") is not None:
-        yield from map(str, call(getattr(importlib.import_module(f"jaxsonar.plausibility.{name}"), name)))
+    if importlib.util.find_spec(f"jaxsonar.plausibility.{module}") is not None:
+        found = importlib.import_module(f"jaxsonar.plausibility.{module}")
+        yield from map(str, call(getattr(found, function or module)))
 
 
 def wrong_of(name: str, seed: int) -> Warned:

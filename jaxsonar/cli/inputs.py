@@ -180,8 +180,7 @@ class InputMessages:
 
     def warn_of_room(self, room: "Room", poses: "np.ndarray | None" = None) -> None:
         """Warn of probable mistakes in a floor plan, and in the poses (x, y, theta) of a robot in it."""
-        from jaxsonar.plausibility.implausible_room import implausible_room
-        from jaxsonar.plausibility.implausible_trajectory import implausible_trajectory
+        from jaxsonar.plausibility.implausible_room import implausible_room, implausible_trajectory
 
         found = [*implausible_room(room)]
         if poses is not None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
+from jaxsonar.plausibility.alternatives import best_alternative
 from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.plausibility.pose_agreement import Agreement, agreement, gain, part_of_groups, select_groups
 from jaxsonar.scans.scan_log import Log
@@ -34,6 +35,9 @@ class RangeUnitSettings:
     """... this many maximum ranges."""
     reach: float = 4.0
     """Ranges up to this many times the maximum range are compared with the poses as they are."""
+    alternative: float = 0.1
+    """Other mistakes that explain at least as much as the unit, less this share, are preferred to a unit whose ranges
+    are within the maximum range."""
     most_echoes: int = 40
     """As many echoes of a scan are compared with poses."""
     gain: float = 0.1
@@ -71,6 +75,8 @@ class RangeUnit:
 
     scale: float
     """Metres per unit; NaN if no unit fits."""
+    share: float
+    """Share of the echoes that agree with the poses in this unit; NaN if unknown."""
     implausibility: Implausibility
     """The mistake in words."""
 
@@ -105,19 +111,23 @@ def find_range_unit(ring: Ring, log: Log) -> RangeUnit | None:
         # Units whose values can be within the maximum range.
         candidates = [unit for unit in candidates if _ROUND_TRIP >= unit[0] >= min(_ROUND_TRIP, 0.3 / most)]
         best = _best_by_poses(ring, log, most, candidates)
-        return best if best is None or best.scale != 1.0 else None
+        if best is None or best.scale == 1.0:
+            return None
+        # Wrong poses or numbers of sensors look like a wrong unit; the one that explains clearly more is the mistake.
+        other = best_alternative(ring, log)
+        return best if other is None or other.corrected.share < best.share - SETTINGS.alternative else None
     found = _best_by_poses(ring, log, most, candidates)
     if found is not None and found.scale == 1.0:
         cause = "the poses agree with metres, so the maximum range of the ring is too small"
-        return RangeUnit(np.nan, Implausibility("range unit", what, cause, "set max_range in the ring"))
+        return RangeUnit(np.nan, np.nan, Implausibility("range unit", what, cause, "set max_range in the ring"))
     if found is not None:
-        return RangeUnit(found.scale, replace(found.implausibility, what=what))
+        return RangeUnit(found.scale, found.share, replace(found.implausibility, what=what))
     if not candidates:
         cause = "the ranges have another unit, or the ring is another one"
-        return RangeUnit(np.nan, Implausibility("range unit", what, cause, "give half path lengths in metres"))
+        return RangeUnit(np.nan, np.nan, Implausibility("range unit", what, cause, "give half path lengths in metres"))
     scale, name = _by_reach(most / ring.max_range, candidates)
     cause = f"the ranges are probably {name}, or the ring is another one"
-    return RangeUnit(scale, Implausibility("range unit", what, cause, _remedy(scale)))
+    return RangeUnit(scale, np.nan, Implausibility("range unit", what, cause, _remedy(scale)))
 
 
 def _by_reach(most: float, candidates: list[tuple[float, str]]) -> tuple[float, str]:
@@ -158,7 +168,7 @@ def _best_by_poses(ring: Ring, log: Log, most: float, candidates: list[tuple[flo
     index = int(np.argmax([other.share for other in others]))
     (scale, name), best = candidates[index], others[index]
     if given is not None and _is_clear(given) and given.share >= best.share:
-        return RangeUnit(1.0, Implausibility("range unit", "", "", ""))
+        return RangeUnit(1.0, given.share, Implausibility("range unit", "", "", ""))
     if not _is_clear(best):
         return None
     what = f"{best.share:.0%} of the echoes agree with the poses"
@@ -170,7 +180,7 @@ def _best_by_poses(ring: Ring, log: Log, most: float, candidates: list[tuple[flo
         cause = f"the ranges are probably {name}, with which {best.share:.0%} agree"
     else:
         cause = f"the ranges are probably {name}, with which {best.share:.0%} agree with the poses"
-    return RangeUnit(scale, Implausibility("range unit", what, cause, _remedy(scale)))
+    return RangeUnit(scale, best.share, Implausibility("range unit", what, cause, _remedy(scale)))
 
 
 def _is_clear(one: Agreement) -> bool:

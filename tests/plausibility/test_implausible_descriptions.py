@@ -11,9 +11,8 @@ from jaxsonar import Ring, load_ring, random_room
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.plausibility.implausible_noise import implausible_noise
 from jaxsonar.plausibility.implausible_ring import implausible_ring
-from jaxsonar.plausibility.implausible_room import implausible_room
+from jaxsonar.plausibility.implausible_room import implausible_room, implausible_trajectory
 from jaxsonar.plausibility.implausible_stamps import implausible_stamps
-from jaxsonar.plausibility.implausible_trajectory import implausible_trajectory
 from jaxsonar.sensors.ring import speed_of_sound
 from jaxsonar.sensors.ring_toml import shipped_rings
 
