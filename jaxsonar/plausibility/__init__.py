@@ -1,8 +1,8 @@
 """Plausibility of inputs: what a recording, ring or room probably means where its values do not mean what they say.
 
 Entry points: ``prepared_log.prepared_log`` prepares a log for computations and names each change and each probable
-mistake in one line; ``implausible_input``, ``implausible_ring``, ``implausible_room`` and ``implausible_noise``, each in
-a module of its name, and ``implausible_room.implausible_trajectory`` give them as ``implausibility.Implausibility``;
+mistake in one line; ``implausible_input``, ``implausible_ring``, ``implausible_room`` and ``implausible_noise``, each
+in a module of its name, and ``implausible_room.implausible_trajectory`` give them as ``implausibility.Implausibility``;
 ``unused_echoes.EchoCounts`` says why no echo of a log can be used.
 
 Design decisions:
