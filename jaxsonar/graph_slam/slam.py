@@ -136,7 +136,7 @@ def slam(
         part = continued.largest_part
         options = {"sigma": sigma, "window": window, "odometry_noise": odometry_noise, "smooth": smooth}
         options |= {"speed": speed, "scale": scale, "live": live, "progress": progress}
-        return _of_whole_log(slam(ring, log[part], **options), log, part, continued.jumps)
+        return _of_whole_log(slam(ring, continued.log[part], **options), log, part, continued.jumps)
     log, odometry = continued.log, log.pose
     has_odometry = np.asarray(np.isfinite(log.pose).all(axis=1))
     if window is None and len(log) and _echoes_of_a_long_wall(ring, log) < SETTINGS.sparse_echoes:

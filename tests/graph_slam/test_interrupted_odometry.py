@@ -56,6 +56,7 @@ def test_odometry_at_its_own_rate_goes_on_as_well():
     samples = np.column_stack([100 + 0.05 * np.arange(400), odometry])
     found = continue_odometry(WIDE, replace(log, stamp=samples[::2, 0], odometry=samples))
     assert found.bridged.tolist() == [102]
+    assert found.log.odometry is not None
     assert np.hypot(*(found.log.odometry[:, 1:] - pose)[:, :2].T).max() < 0.03
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from support.wandering_robot import log_of, trajectory
 from support.wandering_robot import ranges as simulated_ranges
 
@@ -14,14 +15,13 @@ from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.wheel_odometry import simulate_odometry
 
 RING = Ring.circular(count=14, radius=0.2, beam=np.radians(40.0), neighbors=0, max_range=5.0)
-REST = np.zeros(3)
 
 
 def ranges(pose, **options):
     return simulated_ranges(pose, ring=RING, **options)
 
 
-def restarted(pose, row, at=REST):
+def restarted(pose, row, at: ArrayLike = (0.0, 0.0, 0.0)):
     """Odometry that begins again at a pose before the scan of a row."""
     again = compose(np.asarray(at, dtype=float), relative(pose[row], pose[row:]))
     return np.concatenate([pose[:row], again])
