@@ -111,7 +111,8 @@ def fit_each_cone(
 ) -> EachCone:
     """The cone of each sensor, with the roll-off of the common curve.
 
-    Widths and directions are means over their posterior on a grid.
+    Widths and directions are means over their posterior on a grid; directions, with the prior that the cones of a ring
+    have similar widths.
     """
     sensors = len(expected)
     if not np.isfinite(curve).all():
@@ -125,14 +126,18 @@ def fit_each_cone(
     level = np.clip(detected.sum(axis=1) / np.maximum(usual, 1), 0.2, 1 / curve[2]) * curve[2]
     estimates: tuple[list[tuple[float, float]], list[tuple[float, float]]] = ([], [])
     nats = np.full(sensors, np.nan)
+    alike = -0.5 * ((half_width / curve[0] - 1) / _CONES.alike)[:, None] ** 2
     for k, (n, found, inside) in enumerate(zip(expected, detected, level, strict=True)):
         p = np.clip(curve[3] + (inside - curve[3]) * rolloff, 1e-3, 1 - 1e-3)
         log_likelihood = np.log(p) @ found + np.log(1 - p) @ (n - found)
-        nats[k] = log_likelihood.max() - log_likelihood[:, len(direction) // 2].max()
-        posterior = np.exp(log_likelihood - log_likelihood.max())
-        posterior /= posterior.sum()
-        for values, axis, estimate in ((half_width, 1, estimates[0]), (direction, 0, estimates[1])):
-            marginal = posterior.sum(axis=axis)
+        nats[k] = (log_likelihood + alike).max() - (log_likelihood[:, len(direction) // 2] + alike[:, 0]).max()
+        # The cones of a ring are alike: this tells a turned cone from a wide one.
+        for values, axis, prior, estimate in (
+            (half_width, 1, 0.0, estimates[0]),
+            (direction, 0, alike, estimates[1]),
+        ):
+            posterior = np.exp(log_likelihood + prior - (log_likelihood + prior).max())
+            marginal = posterior.sum(axis=axis) / posterior.sum()
             mean = float(marginal @ values)
             estimate.append((mean, float(np.sqrt(marginal @ (values - mean) ** 2))))
     enough = (expected.sum(axis=1) >= _CONES.min_expected_each) & (detected.sum(axis=1) >= _CONES.min_detected_each)

@@ -24,7 +24,13 @@ from jaxsonar.diagnostics.reference_scene import (
     select_scans,
 )
 from jaxsonar.diagnostics.repeated_ranges import RepeatedRanges
-from jaxsonar.diagnostics.sensor_findings import SensorEvidence, described, plain_findings, sensor_findings
+from jaxsonar.diagnostics.sensor_findings import (
+    SensorEvidence,
+    described,
+    differs_from_nominal,
+    plain_findings,
+    sensor_findings,
+)
 from jaxsonar.diagnostics.sensor_measurements import measure_sensors
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.diagnostics.swapped_sensors import find_exchanged_sensors
@@ -72,11 +78,17 @@ def check(
         on_left_out(left_out)
     # Find reference walls, from each scan alone or from a map.
     part, scene, source, empty = _reference_walls(ring, log, sigma, progress)
-    detect = partial(_detect_walls, ring, sigma=sigma, by_poses=scene.by_poses)
+    as_numbered = measure_sensors(ring, part, scene, sigma)
+    # Cones of another width than the ring states are corrected, because walls seem to be missed then.
+    if differs_from_nominal(as_numbered.beam, nominal):
+        factor = as_numbered.beam[0] / float(np.mean(ring.beam))
+        ring = replace(ring, beam=np.minimum(np.asarray(ring.beam) * factor, SETTINGS.cones.largest_beam))
+        scene = _detect_walls(ring, part, sigma=sigma, by_poses=scene.by_poses)
+        as_numbered = measure_sensors(ring, part, scene, sigma)
     # Are sensors exchanged?
+    detect = partial(_detect_walls, ring, sigma=sigma, by_poses=scene.by_poses)
     place = find_exchanged_sensors(ring, part, scene, detect) if source else np.arange(ring.count)
     renumbered = renumber(part, place)
-    as_numbered = measure_sensors(ring, part, scene, sigma)
     repeated, measured = RepeatedRanges.of(reported, ring.count), MeasuredSensors.of(ring, log)
     heard = np.isfinite(log.range) & ~is_repeated(log)
     direct, cross = heard & (log.tx == log.rx), heard & (log.tx != log.rx)

@@ -16,11 +16,23 @@ from jaxsonar.sensors.ring import Ring
 
 
 def groups_of_scans(log: Log) -> list[Int[np.ndarray, "_"]]:
-    """Rows of the scans of each piece of the trajectory: ``select_groups`` with the scans in between."""
+    """Rows of the scans of each piece of the trajectory.
+
+    Pieces are twice as long as the groups of ``select_groups``, so that different sensors see the same walls, and
+    contain the scans in between.
+    """
     moved, most = has_moved(log.pose), SETTINGS.reference.group_scans
-    groups = []
-    for group in select_groups(log):
-        rows = group[0] + np.flatnonzero(moved[group[0] : group[-1] + 1])
+    selected = select_groups(log)
+    groups, k = [], 0
+    while k < len(selected):
+        group = selected[k]
+        following = selected[k + 1] if k + 1 < len(selected) else None
+        end = len(log) if following is None else int(following[0])
+        if following is not None and end - group[-1] <= 2 * np.diff(group).max():  # they are neighbors
+            last, k = int(following[-1]), k + 2
+        else:
+            last, k = min(int(2 * group[-1] - group[0]), end - 1), k + 1
+        rows = group[0] + np.flatnonzero(moved[group[0] : last + 1])
         groups.append(rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64))])
     return groups
 

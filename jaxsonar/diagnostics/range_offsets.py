@@ -72,7 +72,8 @@ def estimate_offsets(table: ResidualTable, sensors: int, min_noise: float) -> Of
     left = residual - (d_wall * correction[wall]).sum(axis=1) - (offset[tx] + offset[rx]) / 2
     leverage = weight * np.einsum("ei,eij,ej->e", d_wall, wall_cov[wall], d_wall)
     left = left / np.maximum(1 - leverage, 0.1)
-    enough = np.bincount(tx, minlength=sensors) + np.bincount(rx, minlength=sensors) * 1 >= settings.min_echoes
+    used = weight > 0
+    enough = np.bincount(tx[used], minlength=sensors) + np.bincount(rx[used], minlength=sensors) >= settings.min_echoes
     offset, error = (np.where(enough, values, np.nan) for values in (offset, error))
     return OffsetEstimate(offset, error, noise if len(row) else np.nan, row, left)
 

@@ -12,6 +12,7 @@ from jaxsonar.diagnostics.findings import Finding, confidence_of
 from jaxsonar.diagnostics.health_report import Health
 from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
 from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.sensors.ring import Ring
 
 _FINDINGS = SETTINGS.findings
 _ROLES = (
@@ -84,7 +85,7 @@ def plain_findings(
 
 def described(health: Health, measured: MeasuredSensors, found: Sequence[Finding]) -> Health:
     """The health with these findings, those about the ring as a whole, and remarks for each sensor."""
-    found = [*found, *_ring_findings(health, measured, found)]
+    found = [*_beam_width(health), *found, *_ring_findings(health, measured, found)]
     return replace(health, remarks=_remarks(health, found), findings=tuple(found))
 
 
@@ -274,10 +275,12 @@ def _weak_sensors(health: Health, evidence: SensorEvidence) -> Iterator[GradedFi
 
 def _turned_sensors(health: Health, evidence: SensorEvidence) -> Iterator[GradedFinding]:
     """Sensors that point in another direction."""
+    turns = np.degrees(health.centre[:, 0])
+    scatter = 1.4826 * float(np.median(np.abs(turns[np.isfinite(turns)]))) if np.isfinite(turns).any() else 0.0
     for k in range(health.ring.count):
         turn, error = np.degrees(health.centre[k])
         nats = float(evidence.turn_nats[k])
-        if abs(turn) > max(_FINDINGS.min_turn_deg, 4 * error) and nats > _FINDINGS.min_turn_nats:
+        if abs(turn) > max(_FINDINGS.min_turn_deg, 4 * error, 4 * scatter) and nats > _FINDINGS.min_turn_nats:
             side = "left" if turn > 0 else "right"
             finding = Finding(
                 "turned",
@@ -288,6 +291,27 @@ def _turned_sensors(health: Health, evidence: SensorEvidence) -> Iterator[Graded
                 "turn the sensor in its mount, or calibrate the ring (jaxsonar calibrate)",
             )
             yield GradedFinding(nats, finding)
+
+
+def differs_from_nominal(beam: Float[np.ndarray, " 2"], ring: Ring) -> bool:
+    """Whether a measured width of the cones and its standard deviation (radians) differ from the ring's."""
+    width, error, nominal = np.degrees([*beam, float(np.mean(ring.beam))])
+    return bool(abs(width - nominal) > max(_FINDINGS.min_beam_deg, _FINDINGS.min_beam * nominal, 3 * error))
+
+
+def _beam_width(health: Health) -> Iterator[Finding]:
+    """Cones that are wider or narrower than the ring states."""
+    if differs_from_nominal(health.beam, health.ring):
+        width, error, nominal = np.degrees([*health.beam, health.nominal])
+        yield Finding(
+            "beam width",
+            (),
+            f"cones are measured {width:.0f} ± {error:.0f} deg wide, the ring has {nominal:.0f} deg",
+            confidence_of(((width - nominal) / error) ** 2 / 2),
+            f"the difference is {abs(width - nominal) / error:.0f} standard deviations; sensors are judged by the "
+            "measured width",
+            f"set beam_deg = {width:.0f} in the ring",
+        )
 
 
 def _ring_findings(health: Health, measured: MeasuredSensors, faults: Sequence[Finding]) -> Iterator[Finding]:
@@ -302,16 +326,6 @@ def _ring_findings(health: Health, measured: MeasuredSensors, faults: Sequence[F
             0.5,
             "",
             "check the ring, the unit of the ranges, and the sensor numbers",
-        )
-    width, error, nominal = np.degrees([*health.beam, health.nominal])
-    if abs(width - nominal) > max(_FINDINGS.min_beam_deg, _FINDINGS.min_beam * nominal, 3 * error):
-        yield Finding(
-            "beam width",
-            (),
-            f"cones are measured {width:.0f} ± {error:.0f} deg wide, the ring has {nominal:.0f} deg",
-            confidence_of(((width - nominal) / error) ** 2 / 2),
-            f"the difference is {abs(width - nominal) / error:.0f} standard deviations",
-            f"set beam_deg = {width:.0f} in the ring",
         )
     usual_constant = _usual_constant_fraction(health)
     if usual_constant > 0.1:

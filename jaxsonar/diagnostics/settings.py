@@ -106,7 +106,9 @@ class SwapSettings:
     min_gain: float = 30.0
     """Log-likelihood ratio that an exchange must reach, also against rival exchanges, nats."""
     min_gain_each: float = 8.0
-    """Log-likelihood ratio that each of the exchanged sensors must reach, nats."""
+    """Log-likelihood ratio of the new to the old position that each exchanged sensor must reach, nats, ..."""
+    min_share_each: float = 0.3
+    """... and this share of its log-likelihood ratio to clutter at the new position."""
     extra_sigma: float = 0.002
     """Errors of walls and sensor positions, added to the noise in quadrature, metres; they must not look like an
     exchange."""
@@ -128,10 +130,14 @@ class ConeSettings:
     """Expected echoes that it needs inside, and outside of the border."""
     max_error: float = float(np.radians(4.0))
     """Largest standard deviation of a width or direction that is reported, radians."""
-    min_expected_each: int = 40
+    min_expected_each: int = 25
     """Expected echoes that the cone of a single sensor needs."""
-    min_detected_each: int = 15
+    min_detected_each: int = 8
     """Detected echoes that it needs."""
+    largest_beam: float = float(np.radians(175))
+    """Largest width of a cone that is assumed after a measurement, radians."""
+    alike: float = 0.2
+    """Scatter of the widths of the cones of a ring, relative to their mean."""
     most_turn_deg: int = 60
     """Largest rotation of a single sensor that is tried, degrees."""
     lower_limits: tuple[float, float, float, float] = (float(np.radians(2)), float(np.radians(0.6)), 0.05, 0.0)
@@ -186,7 +192,8 @@ class FindingSettings:
     min_constant: float = 0.25
     """Fraction of identical ranges above which a sensor saturates; at least four times the usual fraction, too."""
     min_turn_deg: float = 10.0
-    """Rotation of a sensor that is reported, degrees; at least four standard deviations, too."""
+    """Rotation of a sensor that is reported, degrees; at least four standard deviations, and four times the scatter of
+    all sensors, too."""
     min_turn_nats: float = 10.0
     """Least log-likelihood ratio of that rotation to none."""
     min_weak: int = 6

@@ -42,14 +42,16 @@ class _Hypothesis(NamedTuple):
         """Sensors that are not at their own position."""
         return set(np.flatnonzero(self.place != np.arange(len(self.place))).tolist())
 
-    def least_gain(self, before: Int[np.ndarray, " sensors"]) -> float:
-        """Least log-likelihood ratio of the new to the earlier position among the sensors that changed it.
+    def is_mutual(self, before: Int[np.ndarray, " sensors"]) -> bool:
+        """Whether all sensors that changed their position clearly fit better at the new one.
 
-        Both sensors of an exchange fit better at the new position. If one does not, the other is only turned.
+        If one of two exchanged sensors does not, the other is only turned.
         """
         changed = np.flatnonzero(self.place != before)
         own, other = self.place[changed], before[changed]
-        return float((self.log_likelihood[own, own] - self.log_likelihood[own, other]).min())
+        new = self.log_likelihood[own, own]
+        least = np.maximum(SETTINGS.swaps.min_gain_each, SETTINGS.swaps.min_share_each * new)
+        return bool((new - self.log_likelihood[own, other] >= least).all())
 
 
 def find_exchanged_sensors(
@@ -76,13 +78,12 @@ def find_exchanged_sensors(
     current = _Hypothesis(np.arange(ring.count), position_log_likelihood(ring, scene, log))
     for _ in range(SETTINGS.swaps.iterations):
         proposals = _propose_exchanges(current.log_likelihood)
-        hypotheses = [current, *(evaluate(found[current.place]) for found in proposals)]
+        evaluated = (evaluate(found[current.place]) for found in proposals)
+        hypotheses = [current, *(one for one in evaluated if one.is_mutual(current.place))]
         best = max(hypotheses, key=lambda hypothesis: hypothesis.total)
         # The best one must beat the present numbering, and every exchange of other sensors.
         rivals = [other for other in hypotheses if other is current or not other.moved & best.moved]
         if best is current or any(best.total < rival.total + SETTINGS.swaps.min_gain for rival in rivals):
-            break
-        if best.least_gain(current.place) < SETTINGS.swaps.min_gain_each:
             break
         current = best
     return current.place
