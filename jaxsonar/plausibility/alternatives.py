@@ -53,13 +53,13 @@ class AlternativeSettings:
     descriptions."""
     least_echoes: int = 30
     """With fewer compared echoes, nothing is stated."""
-    screen_groups: int = 5
+    screen_groups: int = 4
     """Groups of scans with which all alternatives are compared first."""
     finalists: int = 6
     """Alternatives that are then compared with all groups, ..."""
     of_a_kind: int = 2
     """... and as many of them of one kind."""
-    most_echoes: int = 48
+    most_echoes: int = 32
     """Echoes of a scan that are compared."""
     shifts: int = 16
     """Shifts of the numbering that are tried first in larger rings, before those near the best one."""

@@ -28,6 +28,8 @@ class ImplausiblePoseSettings:
     """... and turned by this angle at most, radians, ..."""
     least_echoes: int = 150
     """... and if as many echoes were compared."""
+    most_echoes: int = 32
+    """Echoes of a scan that are compared."""
     far: float = 4.0
     """Scans at a distance of this many maximum ranges have nothing in common."""
     least_steps: int = 5
@@ -65,7 +67,7 @@ def _distant_scans(ring: Ring, log: Log) -> list[Implausibility]:
 
 def _unexplained_echoes(ring: Ring, log: Log) -> list[Implausibility]:
     """Echoes that do not agree with the poses although scans close together must hear the same walls."""
-    part, groups = part_of_groups(log, select_groups(log))
+    part, groups = part_of_groups(log, select_groups(log), most_echoes=SETTINGS.most_echoes)
     if not groups:
         return []
     steps = np.concatenate([np.diff(part.pose[group], axis=0) for group in groups])
