@@ -103,10 +103,10 @@ class Alternative:
 
     def implausibilities(self) -> Iterator[Implausibility]:
         """The mistakes in words."""
-        what = f"only {self.given.mean_support:.0%} of the scans around an echo agree with it"
+        what = f"an echo is confirmed by only {self.given.mean_support:.0%} of the scans around it"
         for one in self.corrections:
             others = [*one.equivalents, *(tie.mistake for tie in self.ties)]
-            cause = f"probably {self.mistake} ({self.corrected.mean_support:.0%} agree)"
+            cause = f"probably {self.mistake} (then by {self.corrected.mean_support:.0%})"
             yield Implausibility(one.kind, what, ", or ".join([cause, *others]), one.remedy)
 
 
