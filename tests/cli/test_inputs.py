@@ -169,8 +169,9 @@ def test_a_log_without_a_used_echo_is_explained_and_writes_nothing(
     Path("log.csv").write_text(HEADER + rows)
     before = contents(tmp_path)
     assert call(*COMMANDS[command].format(log="log.csv").split()) == 1
-    (line,) = capsys.readouterr().err.splitlines()
+    *warnings, line = capsys.readouterr().err.splitlines()
     assert line.startswith(f"nothing found: log.csv: {reason}")
+    assert [one.split(";")[0] for one in warnings] == ["warning: the log has no scan"] * (reason == "no scan")
     assert contents(tmp_path) == before
 
 

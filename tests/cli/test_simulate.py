@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxsonar import load_log
+from jaxsonar import Ring, Room, load_log, save_ring, save_room
 from jaxsonar.cli import app as cli
 from jaxsonar.estimation.trajectory import load_trajectory
 from jaxsonar.simulation.office import load_office
@@ -88,3 +88,41 @@ def test_an_invalid_call_is_answered_in_one_line(mistake, capsys):
     for word in said:
         assert word in shown.err
     assert not list(Path().iterdir())
+
+
+WRONG = {
+    "room": (["room.geojson", "--path", "path.csv"], "millimetres"),
+    "degrees": ([DATA / "office.geojson", "--path", "degrees.csv"], "the headings are probably in degrees"),
+    "path": ([DATA / "office.geojson", "--path", "mm.csv"], "the positions are probably in millimetres"),
+    "noise": ([DATA / "office.geojson", "--path", "path.csv", "--sigma", "3"], "it is probably in millimetres"),
+    "ring": ([DATA / "office.geojson", "--path", "path.csv", "--ring", "radians.toml"], "given in radians"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_probable_mistake_is_a_warning_and_strictly_an_error(name, capsys):
+    poses = np.column_stack([OFFICE.poses, OFFICE.stamps])
+    for file, scale in (("path.csv", 1), ("mm.csv", [1000, 1000, 1, 1]), ("degrees.csv", [1, 1, 180 / np.pi, 1])):
+        np.savetxt(file, poses * scale, delimiter=",", header="x,y,theta,stamp", comments="")
+    save_room(Room(OFFICE.room.walls * 1000), "room.geojson")
+    save_ring(Ring.circular(beam=0.02, max_range=1.0), "radians.toml")
+    arguments, words = WRONG[name]
+    arguments = ["simulate", *map(str, arguments), "-o", "log.csv", *(["--ring", "faw"] * (name != "ring"))]
+    assert cli.main([*arguments, "--strict"]) == 2
+    warning, error = capsys.readouterr().err.splitlines()
+    assert warning.startswith("warning: ")
+    assert words in warning
+    assert error == "jaxsonar simulate: --strict: 1 warning came; allowed is input without warnings"
+    assert not Path("log.csv").exists()
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_path_in_another_number_format_is_named(separator, capsys):
+    Path("path.csv").write_text(separator.join(["x", "y", "theta"]) + "\n" + separator.join(["1,5"] * 3) + "\n")
+    assert (
+        cli.main(["simulate", str(DATA / "office.geojson"), "--ring", "faw", "--path", "path.csv", "-o", "a.csv"]) == 2
+    )
+    came = {";": "semicolons", "\t": "tabs"}[separator]
+    assert f"{came} between the columns came; allowed are commas between columns and points, not decimal commas" in (
+        capsys.readouterr().err
+    )
