@@ -7,13 +7,11 @@ no finding, else wrong. A finding that names a sensor without a fault accuses it
 
 import argparse
 import json
-import re
 import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -26,22 +24,6 @@ from jaxsonar.hardware.errors import SonarError
 
 FAULTLESS = "healthy", "waiting robot"
 """Cases without a fault."""
-WORDS = (
-    ("dead", r"hears nothing|hears hardly anything"),
-    ("mute", r"is mute"),
-    ("deaf", r"is deaf"),
-    ("swapped", r"look swapped|look permuted"),
-    ("stale", r"repeats the range"),
-    ("held readings", r"repeats the last range"),
-    ("no-echo value", r"is this its code for no echo|mark for no echo|one range again and again"),
-    ("offset", r"too much|too little"),
-    ("weak", r"hears \d+ of \d+ expected direct"),
-    ("turned", r"points .* too far"),
-    ("beam width", r"cones are measured"),
-    ("ring or unit", r"is it the right ring"),
-    ("unheard paths", r"no cross echo|does not listen to"),
-)
-"""Causes by the words of a sentence, for versions whose findings are only sentences."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +49,7 @@ def outcome(one: Case) -> Outcome:
     """Check one case and judge the findings."""
     start = time.perf_counter()
     try:
-        found = [_cause_and_sensors(finding) for finding in check(one.ring, one.log, sigma=one.sigma).findings]
+        found = [(f.cause, f.sensors, f.sentence) for f in check(one.ring, one.log, sigma=one.sigma).findings]
     except SonarError as error:
         found = [(f"error: {error}", (), str(error))]
     seconds = time.perf_counter() - start
@@ -94,15 +76,6 @@ def outcome(one: Case) -> Outcome:
 def _same_sensors(one: Case, sensors: Sequence[int]) -> bool:
     """Whether a finding names the faulty sensors; for a fault of all it may name any."""
     return not one.sensors or set(sensors) == set(one.sensors)
-
-
-def _cause_and_sensors(finding: Any) -> tuple[str, tuple[int, ...], str]:
-    """Cause, sensors and sentence of a finding; a plain sentence is read."""
-    if not isinstance(finding, str):
-        return finding.cause, tuple(finding.sensors), finding.sentence
-    cause = next((cause for cause, words in WORDS if re.search(words, finding)), "other")
-    named = re.match(r"sensors? ([\d, and]+)", finding)
-    return cause, tuple(int(k) for k in re.findall(r"\d+", named[1])) if named else (), finding
 
 
 def table(outcomes: Sequence[Outcome]) -> Table:

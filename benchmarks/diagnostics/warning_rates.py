@@ -4,15 +4,12 @@ Run ``python -m benchmarks.diagnostics.warning_rates [--quick] [--only NAME ...]
 """
 
 import argparse
-import importlib
-import importlib.util
 import json
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -22,6 +19,9 @@ from benchmarks.diagnostics.mistakes import WORDS, Input, sound_inputs, wrong_in
 from benchmarks.metrics import environment
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.plausibility.implausible_noise import implausible_noise
+from jaxsonar.plausibility.implausible_ring import implausible_ring
+from jaxsonar.plausibility.implausible_room import implausible_room, implausible_trajectory
 from jaxsonar.plausibility.prepared_log import prepared_log
 
 
@@ -61,26 +61,17 @@ def warnings_about(one: Input) -> Iterator[str]:
     Raises:
         SonarError: an input is refused.
     """
-    yield from _texts("implausible_ring", lambda of: of(one.ring))
+    yield from map(str, implausible_ring(one.ring))
     if one.room is not None:
-        room, poses = one.room, one.poses
-        yield from _texts("implausible_room", lambda of: of(room))
-        if poses is not None:
-            yield from _texts("implausible_room", lambda of: of(room, poses), function="implausible_trajectory")
+        yield from map(str, implausible_room(one.room))
+        if one.poses is not None:
+            yield from map(str, implausible_trajectory(one.room, one.poses))
     if one.noise is not None:
-        noise = one.noise
-        yield from _texts("implausible_noise", lambda of: of(noise))
+        yield from map(str, implausible_noise(one.noise))
     if one.log is not None:
         notes: list[str] = []
         prepared_log(one.ring, one.log, on_note=notes.append)
         yield from (text.removeprefix("warning: ") for text in notes if text.startswith("warning: "))
-
-
-def _texts(module: str, call: Callable[[Any], Iterable[Any]], *, function: str = "") -> Iterator[str]:
-    """Warnings of a function of the package ``plausibility``; none from a version that lacks it."""
-    if importlib.util.find_spec(f"jaxsonar.plausibility.{module}") is not None:
-        found = importlib.import_module(f"jaxsonar.plausibility.{module}")
-        yield from map(str, call(getattr(found, function or module)))
 
 
 def wrong_of(name: str, seed: int) -> Warned:
