@@ -56,6 +56,8 @@ class OdometryJumpSettings:
     """Scans before and after a step that are searched for the range of a path."""
     compared_steps: int = 8
     """Steps before and after a jump whose ranges tell what is usual."""
+    largest: float = 1e7
+    """Poses with larger numbers are none, metres and radians."""
     most_candidates: int = 64
     """Steps whose ranges are compared; a log with more fast steps has other faults."""
 
@@ -113,9 +115,9 @@ def find_odometry_jumps(ring: Ring, log: Log) -> tuple[OdometryJump, ...]:
         log: the scans; their poses are odometry, and may be missing.
     """
     posed = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
-    if len(posed) < 2 * SETTINGS.neighbors:
-        return ()
     pose, stamp = log.pose[posed], log.stamp[posed]
+    if len(posed) < 2 * SETTINGS.neighbors or np.abs(pose).max() > SETTINGS.largest:
+        return ()
     step = relative(pose[:-1], pose[1:])
     size = np.stack([np.hypot(step[:, 0], step[:, 1]), np.abs(wrap_angle(step[:, 2]))], axis=-1)
     seconds = _durations(stamp, size[:, 0])

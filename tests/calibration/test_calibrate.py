@@ -424,7 +424,7 @@ def test_the_file_contains_the_ring_and_its_standard_deviations(found, tmp_path)
         found.scans, found.echoes, len(found.residuals),
     )  # fmt: skip
     assert table["explained"] == pytest.approx(len(found.residuals) / found.echoes, abs=1e-8)
-    assert table["explained_required"] == 0.15
+    assert table["explained_required"] == pytest.approx(found.explained.required)
     np.testing.assert_allclose(table["range_offset_sd"], found.range_offset_sd, atol=1e-8)
     np.testing.assert_allclose(table["speed_of_sound_sd"], found.speed_of_sound_sd, atol=1e-8)
     noise = [table[name] for name in ("sigma", "residual_rms_before", "residual_rms_after")]

@@ -134,3 +134,9 @@ def test_a_jump_is_found_in_any_frame_of_the_world_and_not_without_poses():
     assert [jump.after for jump in find_odometry_jumps(RING, log_of(heard, moved))] == [60]
     assert find_odometry_jumps(RING, log_of(heard, np.full((120, 3), np.nan))) == ()
     assert find_odometry_jumps(RING, Log.from_scans([])) == ()
+
+
+def test_poses_of_any_size_are_valid():
+    odometry = restarted(trajectory(120), 60)
+    for factor in (1e-300, 1e-9, 1e3, 1e12, 1e300):
+        find_odometry_jumps(RING, log_of(ranges(trajectory(120)), factor * odometry))
