@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 from jaxsonar.geometry.se2 import perpendicular, wrap_angle
 from jaxsonar.geometry.segments import cross
+from jaxsonar.mapping.driven_space import DrivenSpace
 from jaxsonar.mapping.free_space import DirectionalFreeSpace
 from jaxsonar.mapping.observations import neighbor_pairs
 from jaxsonar.mapping.settings import SETTINGS
@@ -67,10 +68,7 @@ def remove_seen_through(
     if not len(segments) or not free_space.tiles:
         return segments
     # Sample every segment once per cell.
-    samples = np.maximum(np.round(segments.length / SETTINGS.free_space.cell).astype(np.int64), 1)
-    segment = np.repeat(np.arange(len(segments)), samples)
-    number = np.arange(len(segment)) - np.repeat(np.cumsum(samples) - samples, samples)
-    along = segments.extent[segment, 0] + (number + 0.5) * (segments.length / samples)[segment]
+    segment, along, samples = _sampled(segments, SETTINGS.free_space.cell)
     position = segments.center[segment] + along[:, None] * segments.tangent[segment]
     # The oldest remembered time is that of the third latest scan that saw through the sample.
     seen_through = free_space.query_neighborhood(position, segments.theta[segment])[:, -1]
@@ -100,6 +98,33 @@ def remove_seen_through(
     whole = end - begin + 1 == samples[segment[begin]]
     kept = whole | (extent[:, 1] - extent[:, 0] > SETTINGS.artifacts.min_remainder)
     return replace(segments.take(segment[begin][kept]), extent=extent[kept])
+
+
+def remove_driven_through(segments: WallSegments, driven: DrivenSpace) -> WallSegments:
+    """The segments without those through which the robot drove.
+
+    Such a segment is no wall as a whole: it comes from echoes of something that moves, or spans a door. Other segments
+    of the same wall stay. A segment that was last observed long after the robot drove there may be a closed door.
+    """
+    if not len(segments) or not len(driven.cells):
+        return segments
+    segment, along, _ = _sampled(segments, SETTINGS.evidence.position_cell / 2)
+    start, end = segments.extent[segment].T
+    inner = np.minimum(along - start, end - along) >= SETTINGS.artifacts.driven_end
+    time = driven.latest(segments.center[segment] + along[:, None] * segments.tangent[segment])
+    crossed = inner & (time > segments.last_seen[segment] - SETTINGS.artifacts.door_time)
+    return segments.take(np.bincount(segment[crossed], minlength=len(segments)) == 0) if crossed.any() else segments
+
+
+def _sampled(
+    segments: WallSegments, spacing: float
+) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, " points"], Int[np.ndarray, " segments"]]:
+    """Points on segments: the segment, the position along it (metres), and the number of points of each segment."""
+    samples = np.maximum(np.round(segments.length / spacing).astype(np.int64), 1)
+    segment = np.repeat(np.arange(len(segments)), samples)
+    number = np.arange(len(segment)) - np.repeat(np.cumsum(samples) - samples, samples)
+    along = segments.extent[segment, 0] + (number + 0.5) * (segments.length / samples)[segment]
+    return segment, along, samples
 
 
 def find_openings(

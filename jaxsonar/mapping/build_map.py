@@ -9,7 +9,13 @@ from jaxsonar import kernels
 from jaxsonar.detection.extract import local_models
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.mapping.artifact_removal import find_openings, is_pole_line, remove_corner_lines, remove_seen_through
+from jaxsonar.mapping.artifact_removal import (
+    find_openings,
+    is_pole_line,
+    remove_corner_lines,
+    remove_driven_through,
+    remove_seen_through,
+)
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.hough_merging import merge_by_hough
 from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
@@ -84,6 +90,7 @@ def assemble_map(
         return _as_global_map(walls, evidence.points.take(np.arange(0)))
     min_scans = min(min_scans, max(1, evidence.models - 1))
     segments, free_space = merge_cells(evidence.segments), evidence.free_space
+    segments = remove_driven_through(segments, evidence.driven)
 
     # 1. Estimate the systematic error of the poses, and cluster corners and edges.
     systematic_error = estimate_systematic_error(segments, gap=evidence.gap)

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from jaxsonar.detection.local_model import LocalModel
+from jaxsonar.mapping.driven_space import DrivenSpace
 from jaxsonar.mapping.free_space import DirectionalFreeSpace, observe_free_space
 from jaxsonar.mapping.observations import concatenate, merge_cells
 from jaxsonar.mapping.point_landmarks import PointLandmarks, aggregate_points
@@ -35,13 +36,15 @@ class MapEvidence:
     """Cells (5 cm) of the robot's positions at which local models were made, without repetition."""
     models: int
     """Number of local models with a pose."""
+    driven: DrivenSpace
+    """Where the robot itself was."""
 
     @classmethod
     def empty(cls) -> "MapEvidence":
         """The evidence of no scans."""
         no_poses = np.zeros((0, 3))
         segments, points = aggregate_segments([], no_poses), aggregate_points([], no_poses)
-        return cls(segments, points, DirectionalFreeSpace(), np.zeros((0, 2), np.int64), 0)
+        return cls(segments, points, DirectionalFreeSpace(), np.zeros((0, 2), np.int64), 0, DrivenSpace.empty())
 
     def union(self, other: "MapEvidence") -> "MapEvidence":
         """The evidence of both."""
@@ -51,6 +54,7 @@ class MapEvidence:
             self.free_space.union(other.free_space),
             np.unique(np.concatenate([self.robot_cells, other.robot_cells]), axis=0),
             self.models + other.models,
+            self.driven.union(other.driven),
         )
 
     def condensed(self) -> "MapEvidence":
@@ -99,7 +103,14 @@ def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> MapEv
     free_space = _free_space(ring, log, rows, walls_of_model)
     # Where the robot was.
     robot_cells = np.round(poses[has_pose, :2] / SETTINGS.evidence.position_cell).astype(np.int64)
-    return MapEvidence(segments, points, free_space, np.unique(robot_cells, axis=0), int(has_pose.sum()))
+    before = np.arange(len(log)) <= rows.max(initial=-1)
+    driven = DrivenSpace.of(ring, log.pose[before], _times(log)[before])
+    return MapEvidence(segments, points, free_space, np.unique(robot_cells, axis=0), int(has_pose.sum()), driven)
+
+
+def _times(log: Log) -> Float[np.ndarray, " scans"]:
+    """Time of each scan as in ``WallSegments.last_seen``."""
+    return np.where(np.isnan(log.stamp), log.scan, log.stamp)
 
 
 def _free_space(
@@ -117,7 +128,7 @@ def _free_space(
     distance = np.asarray(ring.corrected(flat.reported, *ring.paths[flat.path].T))
     posed = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1))
     posed = posed[posed <= rows.max(initial=-1)]
-    time = np.where(np.isnan(log.stamp), log.scan, log.stamp)
+    time = _times(log)
     free_space = DirectionalFreeSpace()
     for first in range(0, len(posed), SETTINGS.evidence.block_scans):
         block = posed[first : first + SETTINGS.evidence.block_scans]

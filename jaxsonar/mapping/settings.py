@@ -63,6 +63,10 @@ class EvidenceSettings:
     unobserved of a wall between them."""
     bridged_gap: float = 1.0
     """Largest part of a wall that may be occluded, metres. A gap that was seen through stays open, however small."""
+    inner_share: float = 0.8
+    """No wall comes closer to the center of the robot than this share of the distance of its innermost sensor, ..."""
+    max_half_width: float = 0.1
+    """... and at most this distance is used, metres."""
     max_coordinate: float = 1e8
     """Largest distance of a pose from the world's origin along x or y, metres; cell numbers overflow beyond it."""
     listed_scans: int = 32
@@ -122,6 +126,11 @@ class ArtifactSettings:
     """Distance behind the wall's line at which a segment proves an opening, metres."""
     min_remainder: float = 0.15
     """Shortest part of a segment that is kept after a part of it was removed, metres."""
+    driven_end: float = 0.1
+    """A segment may reach this far into the way of the robot, metres; footpoints scatter beyond the ends of walls."""
+    door_time: float = 300.0
+    """A wall that was observed at most this long after the robot drove through it is none, seconds; later it may be a
+    door that was closed."""
     unseen_end: float = 0.15
     """Length by which a wall may extend beyond its last footpoint without a corner that ends it, metres."""
     max_extension: float = 1.5

@@ -11,8 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import oracles
 
+from jaxsonar import Ring
 from jaxsonar.geometry.se2 import rotation
-from jaxsonar.mapping.artifact_removal import find_openings, is_pole_line, remove_corner_lines, remove_seen_through
+from jaxsonar.mapping.artifact_removal import (
+    find_openings,
+    is_pole_line,
+    remove_corner_lines,
+    remove_driven_through,
+    remove_seen_through,
+)
+from jaxsonar.mapping.driven_space import DrivenSpace
 from jaxsonar.mapping.free_space import DirectionalFreeSpace
 from jaxsonar.mapping.observations import concatenate
 from jaxsonar.mapping.settings import SETTINGS
@@ -217,6 +225,50 @@ def test_a_part_that_three_later_scans_saw_through_is_removed_exactly(times):
 def test_fewer_or_earlier_scans_remove_nothing(times):
     left = remove_seen_through(WALL, np.zeros(1, np.int64), through(range(5, 10), times))
     np.testing.assert_allclose(left.endpoints, WALL.endpoints, atol=LEFT_EXACT)
+
+
+def driven(way, time, *, ring=None):
+    """Where a robot drove on a straight way, at one time."""
+    start, end = np.array(way, float)
+    poses = np.column_stack([np.linspace(start, end, 41), np.zeros(41)])
+    return DrivenSpace.of(Ring.circular() if ring is None else ring, poses, np.full(41, float(time)))
+
+
+ACROSS = [(1.0, -0.8), (1.0, 0.9)]
+DOOR = SETTINGS.artifacts.door_time
+
+
+@pytest.mark.parametrize(
+    ("way", "time", "stays"),
+    [
+        (ACROSS, 10.0 + DOOR, False),
+        (ACROSS, 12.0, False),
+        (ACROSS, 10.1 - DOOR, False),
+        (ACROSS, 9.9 - DOOR, True),  # a door that was closed since
+        ([(-0.5, -0.3), (2.5, -0.3)], 12.0, True),  # beside the wall
+        ([(2.0, -0.8), (2.0, 0.9)], 12.0, True),  # past its end
+    ],
+)
+def test_a_segment_through_which_the_robot_drove_is_removed(way, time, stays):
+    other = segment((0.0, 1.6), (2.0, 1.6), seen_from=(1.0, 0.0), last_seen=10.0)
+    left = remove_driven_through(concatenate([WALL, other]), driven(way, time))
+    np.testing.assert_allclose(left.center[:, 1], [0.05, 1.6] if stays else [1.6])
+    assert remove_driven_through(other, DrivenSpace.empty()) is other
+
+
+def test_driven_space_does_not_depend_on_the_order_of_scans():
+    one, two = driven(ACROSS, 3.0), driven([(0.2, 0.1), (1.4, 0.1)], 5.0)
+    both, swapped = one.union(two), two.union(one)
+    np.testing.assert_array_equal(both.cells, swapped.cells)
+    np.testing.assert_array_equal(both.time, swapped.time)
+    points = np.array([[1.02, 0.1], [1.02, -0.6], [0.22, 0.1], [5.0, 5.0]])
+    np.testing.assert_array_equal(both.latest(points), [5.0, 3.0, 5.0, -np.inf])
+    np.testing.assert_array_equal(both.union(both).time, both.time)
+
+
+def test_a_small_robot_fills_one_cell():
+    tiny = driven([(1.0, 0.0), (1.0, 0.0)], 1.0, ring=Ring.circular(count=4, radius=0.04, neighbors=0))
+    np.testing.assert_array_equal(tiny.cells, [[20, 0]])
 
 
 def test_free_space_in_other_directions_removes_nothing():
