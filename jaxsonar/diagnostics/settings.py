@@ -107,7 +107,7 @@ class SwapSettings:
     """Log-likelihood ratio that an exchange must reach, also against rival exchanges, nats."""
     min_gain_each: float = 8.0
     """Log-likelihood ratio of the new to the old position that each exchanged sensor must reach, nats, ..."""
-    min_share_each: float = 0.3
+    min_share_each: float = 0.15
     """... and this share of its log-likelihood ratio to clutter at the new position."""
     extra_sigma: float = 0.002
     """Errors of walls and sensor positions, added to the noise in quadrature, metres; they must not look like an

@@ -19,7 +19,7 @@ from jaxsonar.diagnostics.reference_scene import (
 )
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.scans.firing_poses import reading_motion
-from jaxsonar.scans.readings import is_repeated
+from jaxsonar.scans.readings import is_repeated, without_readings
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -36,6 +36,12 @@ class _Hypothesis(NamedTuple):
     def total(self) -> float:
         """Log-likelihood of the hypothesis."""
         return float(np.trace(self.log_likelihood))
+
+    def gain(self, before: Int[np.ndarray, " sensors"]) -> float:
+        """Log-likelihood ratio to the earlier positions, with the same walls."""
+        changed = np.flatnonzero(self.place != before)
+        own, other = self.place[changed], before[changed]
+        return float((self.log_likelihood[own, own] - self.log_likelihood[own, other]).sum())
 
     @property
     def moved(self) -> set[int]:
@@ -69,21 +75,29 @@ def find_exchanged_sensors(
         rows = evenly_spaced(len(log), SETTINGS.swaps.max_scans)
         log, scene = select_scans(log, rows), scene.at(rows)
 
-    def evaluate(place: Int[np.ndarray, " sensors"]) -> _Hypothesis:
-        # Detect the walls again with the exchanged numbers: they improve if the hypothesis is right.
+    def evaluate(place: Int[np.ndarray, " sensors"], before: Int[np.ndarray, " sensors"]) -> _Hypothesis:
         renumbered = renumber(log, place)
-        improved = detect(renumbered)
-        return _Hypothesis(place, position_log_likelihood(ring, improved, renumbered))
+        if scene.by_poses:
+            # Walls by the other sensors: they do not depend on the hypothesis.
+            changed = place[place != before]
+            others = without_readings(renumbered, np.isin(renumbered.tx, changed) | np.isin(renumbered.rx, changed))
+        else:
+            # Too few echoes for that. Detect the walls with the exchanged numbers: they improve if these are right.
+            others = renumbered
+        return _Hypothesis(place, position_log_likelihood(ring, detect(others), renumbered))
 
     current = _Hypothesis(np.arange(ring.count), position_log_likelihood(ring, scene, log))
     for _ in range(SETTINGS.swaps.iterations):
-        proposals = _propose_exchanges(current.log_likelihood)
-        evaluated = (evaluate(found[current.place]) for found in proposals)
-        hypotheses = [current, *(one for one in evaluated if one.is_mutual(current.place))]
-        best = max(hypotheses, key=lambda hypothesis: hypothesis.total)
+        before = current.place
+        evaluated = (evaluate(found[before], before) for found in _propose_exchanges(current.log_likelihood))
+        hypotheses = [one for one in evaluated if one.is_mutual(before)]
+        if not hypotheses:
+            break
+        gains = [one.gain(before) if scene.by_poses else one.total - current.total for one in hypotheses]
+        best = hypotheses[int(np.argmax(gains))]
         # The best one must beat the present numbering, and every exchange of other sensors.
-        rivals = [other for other in hypotheses if other is current or not other.moved & best.moved]
-        if best is current or any(best.total < rival.total + SETTINGS.swaps.min_gain for rival in rivals):
+        rivals = [gain for gain, other in zip(gains, hypotheses, strict=True) if not other.moved & best.moved]
+        if max(gains) < max([0.0, *rivals]) + SETTINGS.swaps.min_gain:
             break
         current = best
     return current.place
