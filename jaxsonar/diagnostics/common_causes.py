@@ -17,7 +17,7 @@ from jaxsonar.diagnostics.wrong_descriptions import Comparison, best_description
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.plausibility.odometry_jumps import implausible_odometry
-from jaxsonar.plausibility.pose_agreement import select_groups
+from jaxsonar.plausibility.pose_agreement import part_of_groups, select_groups
 from jaxsonar.plausibility.range_noise import range_noise
 from jaxsonar.registration.local_reflectors import PosedEchoes, group_echoes
 from jaxsonar.registration.motion_fit import LAG, SCALE, MotionFit, fit_motion
@@ -89,15 +89,16 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
         sigma: the stated standard deviation of the ranges, metres; None if it is unknown.
     """
     findings = [_jump_finding(one) for one in implausible_odometry(ring, log)]
-    groups = select_groups(log)
+    # Only the scans of some groups are compared: the rest of a long log costs nothing.
+    part, groups = part_of_groups(log, select_groups(log))
     for _ in range(SETTINGS.mistakes if groups else 0):
-        if (comparison := best_description(ring, log, groups)) is None:
+        if (comparison := best_description(ring, part, groups)) is None:
             break
         findings.append(_description_finding(comparison))
-        ring, log = comparison.best.ring, comparison.best.log
+        ring, log, part = comparison.best.ring, comparison.best.apply(log), comparison.best.apply(part)
     if groups:
-        echoes, step = group_echoes(ring, log, groups), search_step(log)
-        fit = _search_motion(ring, log, groups, echoes, step)
+        echoes, step = group_echoes(ring, part, groups), search_step(part)
+        fit = _search_motion(ring, part, groups, echoes, step)
         if fit is not None and fit.explained < SETTINGS.min_explained * fit.echoes:
             fit = None
         if fit is not None and (found := _lag_finding(echoes, fit, step)) is not None:
@@ -166,6 +167,7 @@ def _search_motion(ring: Ring, log: Log, groups: _Groups, echoes: PosedEchoes, s
     if not np.isfinite(step):
         return fit_motion(echoes, free=(True, False))
     fits: list[MotionFit] = []
+    best: MotionFit | None = None
     tried, center = [0.0], 0.0
     for _ in range(SETTINGS.searches):
         shifted = with_later_poses(log, center) if center else log

@@ -4,7 +4,7 @@ All sensors keep their numbers, so that findings about single sensors hold for t
 by a ring whose sensors stand elsewhere.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +42,7 @@ SETTINGS = DescriptionSettings()
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A mistake, and the ring and the log without it."""
+    """A mistake, and the ring without it."""
 
     cause: str
     """Cause of the finding."""
@@ -52,8 +52,8 @@ class Description:
     """What to do."""
     ring: Ring
     """The true ring."""
-    log: Log
-    """The true log."""
+    apply: Callable[[Log], Log]
+    """Gives the true log, with the same scans and readings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +99,11 @@ def best_description(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]
     screen = [groups[k] for k in some]
 
     def screened(one: Description) -> float:
-        return mean_support(one.ring, one.log, screen)
+        return mean_support(one.ring, one.apply(log), screen)
 
     finalists = sorted(_descriptions(ring, log), key=screened, reverse=True)[: SETTINGS.finalists]
     results = sorted(
-        ((one, _agreement(one.ring, one.log, groups)) for one in finalists), key=lambda one: -one[1].mean_support
+        ((one, _agreement(one.ring, one.apply(log), groups)) for one in finalists), key=lambda one: -one[1].mean_support
     )
     best, result = results[0]
     more = gain(given, result)
@@ -117,13 +117,13 @@ def best_description(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]
 def _descriptions(ring: Ring, log: Log) -> Iterator[Description]:
     for one in (*heading_corrections(), *axis_corrections(), *pose_unit_corrections(log)):
         cause = "headings" if one.kind.startswith("heading") else one.kind
-        yield Description(cause, one.mistake, one.remedy, ring, one.apply(log))
-    yield from _mounted(ring, log)
+        yield Description(cause, one.mistake, one.remedy, ring, one.apply)
+    yield from _mounted(ring)
     if not _is_regular(ring):
-        yield from _numbered(ring, log)
+        yield from _numbered(ring)
 
 
-def _mounted(ring: Ring, log: Log) -> Iterator[Description]:
+def _mounted(ring: Ring) -> Iterator[Description]:
     """Mirrored and rotated rings."""
     position, heading = np.asarray(ring.position), np.asarray(ring.heading)
     yield Description(
@@ -131,7 +131,7 @@ def _mounted(ring: Ring, log: Log) -> Iterator[Description]:
         "the ring is mirrored: its sensors are numbered the other way round",
         "number the sensors counter-clockwise, as the ring does, or mirror the ring's sensors (negate y and heading)",
         replace(ring, position=position * [1, -1], heading=-heading),
-        log,
+        _unchanged,
     )
     spacing = 2 * np.pi / ring.count
     angles = {round(np.degrees(k * spacing), 6) for k in range(1, ring.count)} | {90.0, 180.0, 270.0}
@@ -147,11 +147,11 @@ def _mounted(ring: Ring, log: Log) -> Iterator[Description]:
             f"the ring is mounted {abs(signed):g} deg too far {side}{steps}",
             f"rotate the ring's sensors by {signed:g} deg (first_heading_deg), or turn the axes of the poses",
             replace(ring, position=rotate(position, np.array(turn)), heading=heading + turn),
-            log,
+            _unchanged,
         )
 
 
-def _numbered(ring: Ring, log: Log) -> Iterator[Description]:
+def _numbered(ring: Ring) -> Iterator[Description]:
     """Other numberings of sensors that are not evenly spaced; those of an even ring are rotations."""
     numbers = np.arange(ring.count)
     for direction, cause in ((1, "rotated ring"), (-1, "mirrored ring")):
@@ -168,7 +168,11 @@ def _numbered(ring: Ring, log: Log) -> Iterator[Description]:
                 range_offset=np.asarray(ring.range_offset)[place],
             )
             mistake = f"the sensors are numbered {way}from another one: number 0 is sensor {place[0]} of the ring"
-            yield Description(cause, mistake, "number the sensors as the ring does", changed, log)
+            yield Description(cause, mistake, "number the sensors as the ring does", changed, _unchanged)
+
+
+def _unchanged(log: Log) -> Log:
+    return log
 
 
 def _is_regular(ring: Ring) -> bool:

@@ -20,6 +20,8 @@ class RangeNoiseSettings:
     """Consecutive readings that differ by more are echoes of different reflectors, metres."""
     largest_turn: float = float(np.radians(1.0))
     """Scans between which the robot turns more are left out, radians: ranges then change at changing rates."""
+    max_scans: int = 5000
+    """Scans that are looked at, from the first one on."""
     min_noise: float = 1e-5
     """Less is no measurement, metres: most readings are equal because their resolution is coarse."""
     min_samples: int = 50
@@ -40,6 +42,7 @@ def range_noise(ring: Ring, log: Log) -> float:
         ring: the sensors.
         log: the scans.
     """
+    log = log[: SETTINGS.max_scans]
     nearest = np.full((len(log), len(ring.paths)), np.inf)
     path = path_rows(ring, log.tx, log.rx)
     row = np.flatnonzero((path >= 0) & np.isfinite(log.range) & ~is_repeated(log))

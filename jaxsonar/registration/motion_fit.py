@@ -106,7 +106,8 @@ def _solve(
     reduced: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(SETTINGS.iterations):
         reduced = [part.reduced_system(value, noise) for part in parts]
-        step = _solution(sum(a for a, _ in reduced), sum(g for _, g in reduced), free)
+        total, pull = (np.sum(one, axis=0) for one in zip(*reduced, strict=True))
+        step = _solution(total, pull, free)
         for part in parts:
             part.move(step)
         value += step

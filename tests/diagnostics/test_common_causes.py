@@ -90,7 +90,7 @@ def test_a_mirrored_ring_keeps_the_numbers_of_its_sensors(sound):
 @pytest.mark.parametrize("sensors", [1, pytest.param(-5, marks=pytest.mark.slow)])
 def test_a_rotated_ring_is_named_with_its_angle(sound, sensors):
     turn = np.radians(30.0 * sensors)
-    stated = with_geometry(rotate(RING.position, np.array(-turn)), RING.heading - turn)
+    stated = with_geometry(rotate(np.asarray(RING.position), np.array(-turn)), RING.heading - turn)
     found = assert_one_cause(stated, sound, "rotated ring", f"{abs(30 * sensors)} deg", f"by {abs(sensors)} sensor")
     np.testing.assert_allclose(found.ring.position, RING.position, atol=1e-9)
 

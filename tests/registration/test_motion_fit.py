@@ -19,6 +19,12 @@ def echoes_of(log):
     return group_echoes(RING, log, select_groups(log))
 
 
+def fitted(log, **options):
+    fit = fit_motion(echoes_of(log), **options)
+    assert fit is not None
+    return fit
+
+
 @pytest.fixture(scope="module")
 def log():
     """Ranges of a wandering robot, 3 mm noise, at true poses."""
@@ -42,7 +48,7 @@ def test_the_walls_of_the_room_are_found(log):
 
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.04])
 def test_the_scale_is_found_within_its_error(log, factor):
-    fit = fit_motion(echoes_of(dataclasses.replace(log, range=log.range * factor)))
+    fit = fitted(dataclasses.replace(log, range=log.range * factor))
     assert abs(fit.estimate[SCALE] - (factor - 1)) < 4 * max(fit.error[SCALE], 0.001)
     assert fit.error[SCALE] < 0.01
     assert abs(fit.estimate[LAG]) < 4 * max(fit.error[LAG], 0.003)
@@ -53,13 +59,13 @@ def test_the_scale_is_found_within_its_error(log, factor):
 def test_the_time_offset_is_found_within_its_error(scans):
     before, after = slice(0, len(POSE) - abs(scans)), slice(abs(scans), None)
     true, given = (POSE[after], POSE[before]) if scans > 0 else (POSE[before], POSE[after])
-    fit = fit_motion(echoes_of(log_of(ranges(true), given)))
+    fit = fitted(log_of(ranges(true), given))
     assert fit.estimate[LAG] == pytest.approx(0.1 * scans, abs=4 * max(fit.error[LAG], 0.003))
 
 
 def test_a_fixed_parameter_keeps_its_value(log):
     wrong = dataclasses.replace(log, range=log.range * 1.05)
-    fixed, free = fit_motion(echoes_of(wrong), free=(False, False)), fit_motion(echoes_of(wrong))
+    fixed, free = fitted(wrong, free=(False, False)), fitted(wrong)
     assert fixed.estimate.tolist() == [0, 0]
     assert fixed.log_likelihood < free.log_likelihood
 
