@@ -33,4 +33,6 @@ Decisions:
 - A common corner of two common walls is no additional evidence.
 - ``cluster_adjustment`` does not use the sparse solver of ``estimation``. Clusters are small, the evidence needs the
   full covariance, and kinds of reflectors change between steps.
+- ``local_reflectors`` and ``motion_fit`` take poses as given within the errors of odometry, and find the scale of the
+  ranges and the time offset between echoes and poses; the health check compares causes with them. NumPy only.
 """
