@@ -1,15 +1,19 @@
-"""Health check of a ring (``jaxsonar check``): dead, exchanged, offset, stuck or turned sensors, and the cones.
+"""Health check of a ring (``jaxsonar check``): a differential diagnosis of the ring, its driver and its poses.
 
-Entry points: ``check_ring.check``, ``health_report.Health``.
+Entry points: ``check_ring.check``, ``health_report.Health``, ``findings.Finding``.
 
 Design decisions:
 
-- **No poses needed.** Every scan is explained alone, and each sensor is judged by walls that the other echoes support.
-  Only if single scans show too few walls, a map is built with the log's poses.
-- **Offsets of all sensors and corrections of all walls are estimated jointly**, with a robust loss, so that a bad
-  sensor does not spoil its neighbors. Combinations of offsets that the walls can absorb are not observable; the
-  solution with the fewest sensors off is reported.
-- **An exchange must be certain.** The walls are detected again under each hypothesis, and an exchange is reported only
-  if it beats the present numbering and all rival exchanges by 30 nats.
-- **The field names of ``Health`` are the keys of the JSON file** and therefore do not change.
+- **Common causes come first** (``common_causes``, and the width of the cones): a cause of all sensors is corrected
+  before single sensors are judged, so that it accuses none of them.
+- **Poses are used where they exist.** Pieces of the trajectory give the walls of rings that see few of them in one
+  scan (``local_scene``). Otherwise every scan is explained alone.
+- **A faulty sensor must not accuse others.** The most certain fault is accepted, and the other sensors are judged again
+  by walls without its echoes. Deaf and mute sensors follow from the reciprocity of paths, without walls.
+- **Offsets of all sensors and corrections of all walls are estimated jointly**, with a robust loss. Combinations of
+  offsets that the walls can absorb are not observable; the solution with the fewest sensors off is reported.
+- **An exchange must be mutual and certain.** Both sensors fit clearly better at the other position, and the exchange
+  beats the present numbering and all rival exchanges by 30 nats.
+- **The field names of ``Health`` are the keys of the JSON file** and therefore do not change; ``diagnoses`` holds the
+  causes of ``findings``.
 """

@@ -10,6 +10,7 @@ from jaxtyping import Int
 from jaxsonar.detection.settings import check_sigma
 from jaxsonar.diagnostics.common_causes import find_common_causes
 from jaxsonar.diagnostics.cross_counts import cross_counts
+from jaxsonar.diagnostics.findings import Finding
 from jaxsonar.diagnostics.health_report import OF_SENSORS
 from jaxsonar.diagnostics.health_report import Health as Health
 from jaxsonar.diagnostics.local_scene import scene_from_groups
@@ -141,11 +142,18 @@ def check(
         found = sensor_findings(health, measured, evidence, sigma, named)
         if not found:
             break
-        findings.append(found[0].finding)
-        accepted += found[0].finding.sensors
+        accepted, kept = [*accepted, *found[0].finding.sensors], list(accepted)
         others, evidence = judge(detect(_without_sensors(renumbered, place[accepted])) if source else scene)
-        health = _joined(health, others, accepted)
-    return described(health, measured, findings)
+        # Measured by these walls, too, the same fault has a better size; otherwise its first measurement stays.
+        again = sensor_findings(others, measured, evidence, sigma, named)
+        same = [one.finding for one in again if (one.finding.cause, one.finding.sensors) == _key(found[0].finding)]
+        findings.append([found[0].finding, *same][-1])
+        health = _joined(health, others, kept if same else accepted)
+    return described(health, measured, findings, len(faults))
+
+
+def _key(finding: Finding) -> tuple[str, tuple[int, ...]]:
+    return finding.cause, finding.sensors
 
 
 def _joined(health: Health, others: Health, accepted: list[int]) -> Health:

@@ -83,9 +83,16 @@ def plain_findings(
     return found
 
 
-def described(health: Health, measured: MeasuredSensors, found: Sequence[Finding]) -> Health:
-    """The health with these findings, those about the ring as a whole, and remarks for each sensor."""
-    found = [*_beam_width(health), *found, *_ring_findings(health, measured, found)]
+def described(health: Health, measured: MeasuredSensors, found: Sequence[Finding], common: int) -> Health:
+    """The health with these findings, those about the ring as a whole, and remarks for each sensor.
+
+    Args:
+        health: the measurements.
+        measured: what was measured at all.
+        found: the findings.
+        common: number of findings at the beginning that come before the width of the cones.
+    """
+    found = [*found[:common], *_beam_width(health), *found[common:], *_ring_findings(health, measured, found)]
     return replace(health, remarks=_remarks(health, found), findings=tuple(found))
 
 
@@ -110,7 +117,10 @@ def _silent_sensors(health: Health, measured: MeasuredSensors) -> Iterator[Grade
     others = float(np.median(echoes))
     for k in range(health.ring.count):
         expected, detected = health.expected[k, 0], health.heard[k, 0]
-        if echoes[k] == 0 and others >= _FINDINGS.min_echoes and (measured.any[k] or not measured.certain):
+        # A sensor that faces no wall hears nothing, either.
+        faces_walls = health.source != "poses" or not measured.any[k] or expected >= _FINDINGS.min_faced
+        heard_never = echoes[k] == 0 and others >= _FINDINGS.min_echoes and faces_walls
+        if heard_never and (measured.any[k] or not measured.certain):
             doubt = "" if measured.any[k] else "; it is dead, or was not measured"
             finding = Finding(
                 "dead",

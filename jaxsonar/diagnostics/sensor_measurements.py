@@ -66,6 +66,8 @@ def measure_sensors(ring: Ring, log: Log, scene: ReferenceScene, sigma: float | 
     expected_by_angle, detected_by_angle = count_by_angle(table, usable, detected, beam)
     asked, answered = expected_by_angle.sum(axis=0), detected_by_angle.sum(axis=0)
     curve, half_width_error = fit_cone(asked, answered)
+    if 2 * curve[0] > SETTINGS.findings.most_beam * beam.mean():  # no cones, but wrong walls
+        curve, half_width_error = np.full(4, np.nan), float("nan")
     cones = fit_each_cone(expected_by_angle, detected_by_angle, curve)
     scale = beam[:, None] / beam.mean()  # angles were counted on the scale of the mean cone
     # Summarize residuals and explained echoes.

@@ -206,8 +206,12 @@ class FindingSettings:
     """A sensor is deaf or mute if it has less than this fraction of cross echoes in one role."""
     min_beam_deg: float = 5.0
     """Deviation of the cone width that is reported, degrees; at least three standard deviations, too, ..."""
-    min_beam: float = 0.15
+    min_beam: float = 0.25
     """... and at least this share of the width."""
+    most_beam: float = 2.5
+    """Largest width that counts as measured, relative to the stated one: wrong walls give wider cones still."""
+    min_faced: int = 3
+    """Expected echoes that a sensor without any echo needs to be dead, if the poses gather the walls."""
 
 
 @dataclass(frozen=True)
