@@ -42,6 +42,18 @@ def finite(least: float | int, most: float | int = 1e9):
     return number(float, least, most)
 
 
+def noise(text: str) -> float:
+    """An argparse type: a standard deviation of ranges, metres."""
+    try:
+        return finite(1e-4, 1)(text)
+    except argparse.ArgumentTypeError as error:
+        try:
+            hint = " metres; is it in mm?" if 1 < float(text) < 1e4 else " metres"
+        except ValueError:
+            hint = " metres"
+        raise argparse.ArgumentTypeError(f"{error}{hint}") from None
+
+
 def filename(text: str) -> str:
     """An argparse type: a filename. The file need not exist."""
     if not text or "\0" in text:
@@ -82,7 +94,7 @@ def add_detection_arguments(command: argparse.ArgumentParser) -> None:
         default="ml",
         help="ml: maximum likelihood (default); hough: the paper's, faster",
     )
-    command.add_argument("--sigma", type=finite(1e-4, 1), metavar="METRES", help=SIGMA_HELP)
+    command.add_argument("--sigma", type=noise, metavar="METRES", help=SIGMA_HELP)
     command.add_argument("--settings", type=filename, metavar="TOML", help=SETTINGS_HELP)
 
 
@@ -90,7 +102,7 @@ def add_slam_arguments(command: argparse.ArgumentParser) -> None:
     """Add ``--ring``, ``--sigma`` and ``--odometry`` as ``slam`` and ``localize`` have them."""
     command.add_argument("--ring", type=filename, required=True, help=RING_HELP)
     command.add_argument(
-        "--sigma", type=finite(1e-4, 1), metavar="METRES", help="standard deviation of the ranges (default: estimated)"
+        "--sigma", type=noise, metavar="METRES", help="standard deviation of the ranges (default: estimated)"
     )
     command.add_argument("--odometry", type=odometry_error, metavar="PERCENT,DEG", help=ODOMETRY_HELP)
 

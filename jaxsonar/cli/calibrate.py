@@ -2,7 +2,7 @@
 
 import argparse
 
-from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, finite
+from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, finite, noise
 from jaxsonar.cli.console import ascii_name, errors_in, print_status, step_status, write_figure
 from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_all_inputs, nothing_used
 
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--temperature", type=finite(-60, 85), metavar="DEG_C", help="measured air temperature")
     parser.add_argument(
-        "--sigma", type=finite(1e-4, 1), metavar="METRES", help="standard deviation of the ranges (default: estimated)"
+        "--sigma", type=noise, metavar="METRES", help="standard deviation of the ranges (default: estimated)"
     )
     parser.add_argument(
         "--window",

@@ -4,7 +4,7 @@ import argparse
 from functools import partial
 from itertools import chain
 
-from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, finite
+from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, noise
 from jaxsonar.cli.console import (
     errors_in,
     print_left_out,
@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_log_arguments(parser, help=f"poses are not needed: {LOG_HELP}")
     parser.add_argument("--ring", type=filename, required=True, help=RING_HELP)
     parser.add_argument(
-        "--sigma", type=finite(1e-4, 1), metavar="METRES", help="standard deviation of the ranges (default: estimated)"
+        "--sigma", type=noise, metavar="METRES", help="standard deviation of the ranges (default: estimated)"
     )
     parser.add_argument(
         "--json", type=filename, metavar="FILE", help="the same as JSON; - = stdout instead of the table"

@@ -165,16 +165,17 @@ def _best_by_poses(ring: Ring, log: Log, most: float, candidates: list[tuple[flo
     reach = max(ring.max_range, *(most * scale * 1.02 for scale, _ in candidates))
     ring = replace(ring, max_range=min(reach, 100.0))
     others = [agreement(ring, replace(log, range=log.range * scale), groups) for scale, _ in candidates]
-    index = int(np.argmax([other.share for other in others]))
+    # In too small a unit, all echoes are beside the robot, where they agree by chance.
+    index = int(np.argmax([other.share - other.chance for other in others]))
     (scale, name), best = candidates[index], others[index]
-    if given is not None and _is_clear(given) and given.share >= best.share:
+    if given is not None and _is_clear(given) and given.share - given.chance >= best.share - best.chance:
         return RangeUnit(1.0, given.share, Implausibility("range unit", "", "", ""))
     if not _is_clear(best):
         return None
     what = f"{best.share:.0%} of the echoes agree with the poses"
     if given is not None:
         more = gain(given, best)
-        if more.share < SETTINGS.gain or more.z < SETTINGS.sigmas:
+        if more.share < SETTINGS.gain or max(more.z, more.support_z) < SETTINGS.sigmas:
             return None
         what = f"only {given.share:.0%} of the echoes agree with the poses if ranges are metres"
         cause = f"the ranges are probably {name}, with which {best.share:.0%} agree"
