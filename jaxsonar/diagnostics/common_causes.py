@@ -51,8 +51,10 @@ class CommonCauseSettings:
     """Smaller errors of the scale are not reported: 10 K of the air's temperature, or odometry."""
     scale_errors: float = 3.0
     """A scale error must be this many standard errors, ..."""
-    max_scale_error: float = 0.02
-    """... of at most this size."""
+    vague_scale: float = 0.02
+    """... or, if a standard error is larger than this, ..."""
+    vague_scale_errors: float = 5.0
+    """... this many."""
     air: tuple[float, float] = (312.0, 360.5)
     """Speeds of sound in air of -31 to 50 deg C, m/s."""
     noise_ratio: float = 2.5
@@ -137,7 +139,8 @@ def _lag_finding(echoes: PosedEchoes, fit: MotionFit, step: float) -> Finding | 
 def _scale_finding(ring: Ring, fit: MotionFit) -> Finding | None:
     """The finding about the scale of the ranges; None if it is right."""
     scale, error = float(fit.estimate[SCALE]), float(np.hypot(fit.error[SCALE], SETTINGS.odometry_scale))
-    if error > SETTINGS.max_scale_error or not abs(scale) > max(SETTINGS.min_scale, SETTINGS.scale_errors * error):
+    least = SETTINGS.scale_errors if error < SETTINGS.vague_scale else SETTINGS.vague_scale_errors
+    if not abs(scale) > max(SETTINGS.min_scale, least * error):  # also if it is NaN
         return None
     speed = float(ring.speed_of_sound) / (1 + scale)
     size = f"{100 * abs(scale):.1f} ± {100 * error:.1f} % too {'long' if scale > 0 else 'short'}"
