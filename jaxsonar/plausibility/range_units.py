@@ -38,6 +38,8 @@ class RangeUnitSettings:
     alternative: float = 0.1
     """Other mistakes that explain at least as much as the unit, less this share, are preferred to a unit whose ranges
     are within the maximum range."""
+    driven: float = 0.25
+    """Scans are compared with poses that the robot drives over this distance at least, metres."""
     most_echoes: int = 40
     """As many echoes of a scan are compared with poses."""
     gain: float = 0.1
@@ -153,7 +155,8 @@ def _best_by_poses(ring: Ring, log: Log, most: float, candidates: list[tuple[flo
         most: range that hardly any echo exceeds, in the unit of the log.
         candidates: units that are compared with metres.
     """
-    groups = select_groups(log)
+    # A robot that only turns does not show the scale of the ranges.
+    groups = [one for one in select_groups(log) if np.ptp(log.pose[one, :2], axis=0).max() >= SETTINGS.driven]
     if not groups or not candidates:
         return None
     log, groups = part_of_groups(log, groups, most_echoes=SETTINGS.most_echoes)

@@ -32,7 +32,7 @@ def trace_circles(scene: TracingScene) -> TracedEchoes:
         low, high = np.where(rises, low, middle), np.where(rises, middle, high)
     normal = unit(begin + (low + high) / 2 * turn)
     point = r[..., None] * normal
-    length = sum(np.linalg.norm(offset[:, k] - point, axis=-1) for k in (i, j))
+    length = np.linalg.norm(offset[:, i] - point, axis=-1) + np.linalg.norm(offset[:, j] - point, axis=-1)
     seen = np.linalg.norm(offset, axis=-1) > r + TOLERANCE
     valid = seen[:, i] & seen[:, j] & (length <= 2 * scene.max_range)
     for k in (i, j):

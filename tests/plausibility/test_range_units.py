@@ -61,3 +61,10 @@ def test_a_ring_that_reaches_less_far_than_the_echoes_is_named():
     assert found is not None
     assert "maximum range of the ring is too small" in found.implausibility.cause
     assert found.corrected(LOG) is LOG
+
+
+def test_a_robot_that_turns_does_not_show_the_unit():
+    turning = np.column_stack([np.full((200, 2), 0.4), np.linspace(0, 12, 200)])
+    log = log_of(ranges(turning), turning)
+    for max_range in (3.5, 9.0):
+        assert find_range_unit(replace(RING, max_range=max_range), log) is None
