@@ -116,7 +116,8 @@ def fit_each_cone(
     """
     sensors = len(expected)
     if not np.isfinite(curve).all():
-        return EachCone(*np.full((2, sensors, 2), np.nan), np.full(sensors, np.nan))
+        unknown = np.full((sensors, 2), np.nan)
+        return EachCone(unknown, unknown.copy(), np.full(sensors, np.nan))
     half_width = np.radians(np.arange(3, 90, 1.0))
     direction = np.radians(np.arange(-_CONES.most_turn_deg, _CONES.most_turn_deg + 1, 1.0))
     outside = np.abs(BIN_CENTERS - direction[:, None])[None] - half_width[:, None, None]

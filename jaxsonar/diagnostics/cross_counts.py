@@ -73,4 +73,5 @@ def one_sided_sensors(count: Int[np.ndarray, "sensors sensors"]) -> Iterator[One
 def _entropy(sent: np.ndarray, received: np.ndarray) -> np.ndarray:
     """Minus the logarithm of the likelihood of the counts, at their own rates."""
     total = np.maximum(sent + received, 1)
-    return -sum(part * np.log(np.maximum(part, 1e-9) / total) for part in (sent, received))
+    both = np.stack([sent, received])
+    return -(both * np.log(np.maximum(both, 1e-9) / total)).sum(axis=0)

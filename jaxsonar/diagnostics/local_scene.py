@@ -55,7 +55,7 @@ def scene_from_groups(ring: Ring, log: Log) -> ReferenceScene:
     np.add.at(of_sensor, (found.reflector, rx), tx != rx)
     count = np.bincount(found.reflector, minlength=len(found.kind))
     # The extent of each wall: where it reflected the sound.
-    is_wall = found.kind == kernels.PLANE
+    is_wall = np.isin(found.kind, kernels.PLANE)
     midpoint, baseline = echoes.geometry(echoes.pose[found.echo], echoes.path[found.echo])
     along = plane_footpoint(found.parameters[found.reflector], midpoint, baseline, min_height=1e-3)
     start, end = np.full(len(found.kind), np.inf), np.full(len(found.kind), -np.inf)

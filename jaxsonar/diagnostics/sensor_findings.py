@@ -267,11 +267,10 @@ def _weak_sensors(health: Health, evidence: SensorEvidence) -> Iterator[GradedFi
     usual = _usual_rates(health)[0]
     for k in range(health.ring.count):
         expected, detected = health.expected[k, 0], health.heard[k, 0]
-        rest = evidence.without_worst[k]
-        if _is_low(expected, detected, usual, _FINDINGS.weak_rate) and _is_low(
-            *rest, usual, _FINDINGS.weak_rate, least=_FINDINGS.min_weak, sigmas=3.0
-        ):
-            nats = _rate_nats(*rest, usual)
+        asked, answered = evidence.without_worst[k]
+        low = _is_low(expected, detected, usual, _FINDINGS.weak_rate)
+        if low and _is_low(asked, answered, usual, _FINDINGS.weak_rate, least=_FINDINGS.min_weak, sigmas=3.0):
+            nats = _rate_nats(asked, answered, usual)
             finding = Finding(
                 "weak",
                 (k,),
