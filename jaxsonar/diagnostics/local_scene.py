@@ -55,7 +55,7 @@ def scene_from_groups(ring: Ring, log: Log) -> ReferenceScene:
     np.add.at(of_sensor, (found.reflector, rx), tx != rx)
     count = np.bincount(found.reflector, minlength=len(found.kind))
     # The extent of each wall: where it reflected the sound.
-    is_wall = np.isin(found.kind, kernels.PLANE)
+    is_wall = found.kind == kernels.PLANE
     midpoint, baseline = echoes.geometry(echoes.pose[found.echo], echoes.path[found.echo])
     along = plane_footpoint(found.parameters[found.reflector], midpoint, baseline, min_height=1e-3)
     start, end = np.full(len(found.kind), np.inf), np.full(len(found.kind), -np.inf)
@@ -73,7 +73,7 @@ def scene_from_groups(ring: Ring, log: Log) -> ReferenceScene:
     reflector[group_of_reflector, rank] = np.arange(len(found.kind))
     reflector = reflector[group_of_scan]  # the last row, of scans without a group, is empty
     exists, pose = reflector >= 0, log.pose - np.pad(origin, ((0, 0), (0, 1)))
-    pose = np.where(exists.any(axis=1)[:, None], pose, 0.0)
+    pose = np.where(np.any(exists, axis=1, keepdims=True), pose, 0.0)
     wall = exists & is_wall[reflector]
     plane = found.parameters[reflector]
     theta = plane[..., 1] - pose[:, None, 2]
