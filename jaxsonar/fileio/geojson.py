@@ -13,7 +13,9 @@ from jaxsonar.hardware.errors import SonarError
 
 T = TypeVar("T")
 
+_COLLECTION_KEYS = ("type", "features", "name", "id", "crs", "bbox", "xy_coordinate_resolution")
 _FEATURE_KEYS = ("type", "id", "bbox", "properties", "geometry")
+_GEOMETRY_KEYS = ("type", "coordinates", "bbox", "crs")
 _GEOMETRIES = "allowed are LineString, MultiLineString, Polygon, MultiPolygon and Point"
 
 
@@ -43,6 +45,10 @@ def read_features(
     features = document.get("features") if isinstance(document, dict) else None
     if not (isinstance(document, dict) and document.get("type") == "FeatureCollection" and isinstance(features, list)):
         raise SonarError(f"{where}: no FeatureCollection came; allowed is a GeoJSON FeatureCollection with features")
+    try:
+        _check_keys(document, _COLLECTION_KEYS, "FeatureCollection")
+    except SonarError as error:
+        raise SonarError(f"{where}: {error}") from None
     found = []
     for index, entry in enumerate(features):
         try:
@@ -113,8 +119,7 @@ def _feature_parts(entry: Any) -> tuple[dict[str, Any], str, Any]:
     """Properties, type of the geometry and coordinates of one feature."""
     if not isinstance(entry, dict) or entry.get("type") != "Feature":
         raise SonarError("no Feature came; allowed are Feature objects")
-    if unknown := [key for key in entry if key not in _FEATURE_KEYS]:
-        raise SonarError(f"unknown key {shown(unknown[0], 60)!r}; allowed in a Feature are {', '.join(_FEATURE_KEYS)}")
+    _check_keys(entry, _FEATURE_KEYS, "Feature")
     properties, geometry = entry.get("properties"), entry.get("geometry")
     properties = {} if properties is None else properties
     if not isinstance(properties, dict):
@@ -123,4 +128,15 @@ def _feature_parts(entry: Any) -> tuple[dict[str, Any], str, Any]:
         raise SonarError(f"geometry {geometry['type']!r}; {_GEOMETRIES}; give each part a Feature of its own")
     if not isinstance(geometry, dict) or "coordinates" not in geometry:
         raise SonarError("no geometry with coordinates came; allowed are LineString, Polygon, their Multi forms, Point")
+    _check_keys(geometry, _GEOMETRY_KEYS, "geometry")
     return properties, str(geometry.get("type")), geometry["coordinates"]
+
+
+def _check_keys(entry: dict[str, Any], allowed: tuple[str, ...], what: str) -> None:
+    """Check that an object has no key that nothing reads.
+
+    Raises:
+        SonarError: it has one.
+    """
+    if unknown := [key for key in entry if key not in allowed]:
+        raise SonarError(f"unknown key {shown(unknown[0], 60)!r}; allowed in a {what} are {', '.join(allowed)}")

@@ -15,15 +15,17 @@ _PROPERTIES = ("kind", "name", "id", "radius")
 """Properties of the features of a room."""
 _KINDS_OF_MAPS = ("segment", "corner", "edge")
 """Kinds of features of maps, which have properties of their own."""
+_KINDS_OF_WALLS = (None, "wall", "segment")
+"""Kinds of lines and polygons; without a kind, they are walls."""
 
 
 def load_room(filename: str | os.PathLike[str]) -> Room:
     """Read a room from a GeoJSON FeatureCollection, world frame, metres.
 
     The pieces of LineString and MultiLineString and the rings of Polygon and MultiPolygon are walls, named by the
-    property ``name`` of their feature. A Point with the property ``kind`` "pole" is a pole; one of kind "circle" with
-    the property ``radius`` (metres) is a round column. Points of kind "corner" and "edge", which maps contain, are
-    skipped, because walls imply them.
+    property ``name`` of their feature; their ``kind`` is "wall", "segment" (in maps) or absent. A Point with the
+    property ``kind`` "pole" is a pole; one of kind "circle" with the property ``radius`` (metres) is a round column.
+    Points of kind "corner" and "edge", which maps contain, are skipped, because walls imply them.
 
     Raises:
         SonarError: the file cannot be read, or a feature is of another type; the message names file, feature and cause.
@@ -76,6 +78,8 @@ def _feature(properties: dict[str, Any], form: str, coordinates: Any) -> tuple[s
         raise SonarError(f"radius of a {form:.60}; allowed is it with a Point of kind circle")
     if kind in ("pole", "circle", "corner", "edge"):
         raise SonarError(f"{form:.60} of kind {kind!r}; allowed with this kind is a Point")
+    if kind not in _KINDS_OF_WALLS:
+        raise SonarError(f'{form:.60} of kind {kind!r:.60}; allowed is "wall" ("segment" in maps), or no kind')
     pieces: list[np.ndarray] = []
     for line, is_ring in lines_of(form, coordinates):
         points = positions(line)

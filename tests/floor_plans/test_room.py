@@ -202,6 +202,9 @@ GOOD = feature("LineString", [[0, 0], [1, 0]])
         (feature("LineString", [[0, 0], [0, 1]], radius=0.1), "radius of a LineString"),
         (feature("LineString", [[0, 0], [0, 1]], kind="circle"), "LineString of kind 'circle'"),
         (feature("LineString", [[0, 0], [0, 1]], kind="wall", colour="red"), "unknown property 'colour'"),
+        (feature("LineString", [[0, 0], [0, 1]], kind="wal"), "LineString of kind 'wal'"),
+        (feature("Polygon", [[*SQUARE, SQUARE[0]]], kind=["wall"]), "Polygon of kind ['wall']"),
+        (GOOD | {"geometry": GOOD["geometry"] | {"unit": "mm"}}, "unknown key 'unit'"),
         (feature("LineString", [[8.5, 52], [8.5001, 52.0001]]), "degrees of longitude and latitude"),
         (GOOD | {"propertys": {}}, "unknown key 'propertys'"),
         ({"type": "Feature", "geometry": {"type": "GeometryCollection", "geometries": []}}, "GeometryCollection"),
@@ -228,6 +231,7 @@ def test_an_invalid_feature_raises_a_one_line_error(bad, words, tmp_path):
     [
         *("", "{", "[]", "null", "[" * 100_000, "\xff\x00", '{"type": "Feature"}', '{"type": "FeatureCollection"}'),
         '{"type": "FeatureCollection", "features": []}',
+        '{"type": "FeatureCollection", "unit": "mm", "features": []}',
     ],
 )
 def test_an_invalid_file_raises_a_one_line_error(text, tmp_path):
