@@ -178,14 +178,17 @@ class InputMessages:
         for found in implausible_noise(sigma, **errors):
             self.warn(str(found))
 
-    def warn_of_room(self, room: "Room", poses: "np.ndarray | None" = None) -> None:
-        """Warn of probable mistakes in a floor plan, and in the poses (x, y, theta) of a robot in it."""
+    def warn_of_room(self, room: "Room", poses: "np.ndarray | None" = None, stamps: "np.ndarray | None" = None) -> None:
+        """Warn of probable mistakes in a floor plan, and in the poses (x, y, theta) and stamps of a robot in it."""
         from jaxsonar.plausibility.implausible_room import implausible_room, implausible_trajectory
+        from jaxsonar.plausibility.implausible_stamps import implausible_times
 
-        found = [*implausible_room(room)]
+        found = [*implausible_room(room, None if poses is None else poses[:, :2])]
         if poses is not None:
             # A room in another unit makes every position implausible; the headings can be judged nevertheless.
             found += implausible_trajectory(None if found else room, poses)
+            if stamps is not None:
+                found += implausible_times(stamps, poses)
         for one in found:
             self.warn(str(one))
 

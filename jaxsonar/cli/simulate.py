@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> None:
     messages = InputMessages(strict=options.strict)
     ring, room = load_checked_ring(options.ring, messages), load_room(options.room)
     poses, stamps = load_poses(options.path)
-    messages.warn_of_room(room, poses)
+    messages.warn_of_room(room, poses, stamps)
     messages.warn_of_noise(options.sigma, drift=options.drift, clutter=options.clutter)
     messages.check()
     with progress_bar("scans", len(poses)) as show:
@@ -90,6 +90,10 @@ def run(options: argparse.Namespace) -> None:
             progress=lambda done, _: show(done),
         )
     log = simulation.as_log(ring, _logged_poses(poses, options))
+    if not log.echo_count:
+        what = f"no echo from any wall, pole or circle within {ring.max_range:g} m of the path"
+        messages.warn(f"{what}; room and path probably do not belong together; give both in one frame, in metres")
+        messages.check()
     if options.output == "-":
         sys.stdout.writelines(csv_lines(log))
     else:

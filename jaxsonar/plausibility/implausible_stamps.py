@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.plausibility.implausibility import Implausibility
@@ -43,22 +44,34 @@ def implausible_stamps(log: Log) -> Iterator[Implausibility]:
     Args:
         log: the scans.
     """
-    fall = np.flatnonzero(np.diff(log.stamp) < 0)  # False for NaN
+    yield from implausible_times(log.stamp, log.pose)
+
+
+def implausible_times(
+    stamp: Float[np.ndarray, " poses"], pose: Float[np.ndarray, "poses 3"]
+) -> Iterator[Implausibility]:
+    """Probable mistakes of the stamps of poses.
+
+    Args:
+        stamp: times, seconds; NaN: unknown.
+        pose: world_from_robot x, y (metres), theta (radians) at these times; NaN: unknown.
+    """
+    fall = np.flatnonzero(np.diff(stamp) < 0)  # False for NaN
     if len(fall):
-        before, after = log.stamp[fall[0] : fall[0] + 2]
+        before, after = stamp[fall[0] : fall[0] + 2]
         times = "once" if len(fall) == 1 else f"{len(fall)} times, first"
         what = f"the stamps run backwards {times} from {before:.3f} s to {after:.3f} s"
         cause = "the clock was set, or logs were joined"
         yield Implausibility("stamps", what, cause, "give the scans the times at which they were taken")
         return
-    step = np.diff(log.stamp)
+    step = np.diff(stamp)
     known = np.isfinite(step) & (step > 0)
     if known.sum() < SETTINGS.steps:
         return
     period = float(np.median(step[known]))
-    last = float(np.nanmax(np.abs(log.stamp)))
-    moved = np.hypot(*np.diff(log.pose[:, :2], axis=0).T)
-    turned = np.abs(wrap_angle(np.diff(log.pose[:, 2])))
+    last = float(np.nanmax(np.abs(stamp)))
+    moved = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    turned = np.abs(wrap_angle(np.diff(pose[:, 2])))
     moves = known & ((moved > SETTINGS.moved) | (turned > SETTINGS.turned))  # False for NaN
     cause = ""
     if last > SETTINGS.latest:

@@ -12,7 +12,7 @@ from jaxsonar.floor_plans.room import Room
 from jaxsonar.plausibility.implausible_noise import implausible_noise
 from jaxsonar.plausibility.implausible_ring import implausible_ring
 from jaxsonar.plausibility.implausible_room import implausible_room, implausible_trajectory
-from jaxsonar.plausibility.implausible_stamps import implausible_stamps
+from jaxsonar.plausibility.implausible_stamps import implausible_stamps, implausible_times
 from jaxsonar.sensors.ring import speed_of_sound
 from jaxsonar.sensors.ring_toml import shipped_rings
 
@@ -89,8 +89,33 @@ def test_headings_in_radians():
 def test_units_of_rooms(seed):
     room = random_room(np.random.default_rng(seed))
     assert [*implausible_room(room)] == []
+    points = some_poses(np.random.default_rng(seed), room, 30)[:, :2]
     for scale, name in ((1000, "millimetres"), (100, "centimetres")):
-        one(implausible_room(Room(room.walls * scale)), "room unit", name, f"divide the coordinates by {scale}")
+        wrong = Room(room.walls * scale)
+        one(implausible_room(wrong, points), "room unit", name, f"divide the coordinates by {scale}")
+
+
+@pytest.mark.parametrize(("width", "depth"), [(160, 120), (200, 80), (300, 60), (450, 400)])
+def test_large_halls_are_sound_unless_the_trajectory_shows_centimetres(width, depth):
+    hall = Room(loop([(0, 0), (width, 0), (width, depth), (0, depth)]))
+    along = np.linspace((0.1 * width, 0.5 * depth), (0.9 * width, 0.5 * depth), 50)
+    for points in (None, along, along[:0]):
+        assert [*implausible_room(hall, points)] == []
+    if depth > 150:
+        one(implausible_room(hall, along / 100), "room unit", "centimetres")
+
+
+def test_round_columns_with_a_radius_in_another_unit():
+    walls = loop(OUTLINE)
+    for scale, words in ((1, None), (100, "radius of 25 m"), (1000, "radius of 250 m")):
+        for room in (
+            Room(walls, circles=np.array([[4, 3, 0.25 * scale]])),
+            Room(walls[:0], circles=np.array([[4, 3, 0.25 * scale]])),
+        ):
+            if words is None:
+                assert [*implausible_room(room)] == []
+            else:
+                one(implausible_room(room), "room unit", words, "millimetres or centimetres")
 
 
 def test_longitude_and_latitude():
@@ -132,6 +157,50 @@ def test_headings_that_do_not_agree_with_the_motion():
     one(implausible_trajectory(None, compass), "heading direction", "clockwise")
 
 
+def tour(turned: float, turns: int) -> np.ndarray:
+    """A drive along three and a half sides of a rectangle; at corners, the robot turns in as many poses."""
+    poses, place, heading = [], np.array([1.5, 1.5]), turned
+    for side in range(4):
+        for _ in range(20):
+            place = place + (0.2 - 0.05 * (side % 2)) * np.array([np.cos(heading), np.sin(heading)])
+            poses.append((*place, heading))
+        for _ in range(turns):
+            heading += np.pi / 2 / turns
+            poses.append((*place, heading))
+    return np.array(poses)
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.2])
+@pytest.mark.parametrize("turns", [1, 9, 30])
+def test_headings_on_a_rectangular_tour(turned, turns):
+    poses = tour(turned, turns)
+    degrees, swapped = np.array([1, 1, 180 / np.pi]), poses[:, [1, 0, 2]]
+    for sound in (poses, poses + np.array([0, 0, np.pi]), poses + np.array([0, 0, 1.2])):
+        assert [*implausible_trajectory(None, sound)] == []
+    one(implausible_trajectory(None, poses * (1, 1, -1)), "heading direction", "clockwise", "y is negated")
+    one(implausible_trajectory(None, swapped), "heading direction", "compass", "x and y are swapped")
+    one(implausible_trajectory(None, poses * degrees), "heading unit", "degrees")
+    if turned or turns != 1:  # else the headings 90 and -90 stand for the same motion, and a warning names either
+        one(implausible_trajectory(None, poses * degrees * (1, 1, -1)), "heading unit", "degrees")
+
+
+@pytest.mark.parametrize("degrees", [30, 90, 135, 270])
+def test_a_straight_drive_with_one_heading(degrees):
+    way = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+    points = np.arange(20)[:, None] * 0.05 * way
+    one(implausible_trajectory(None, np.column_stack([points, np.full(20, degrees)])), "heading unit", "degrees")
+    for heading in (0.0, np.radians(degrees), np.radians(degrees) + np.pi, np.radians(degrees) + 6 * np.pi):
+        assert [*implausible_trajectory(None, np.column_stack([points, np.full(20, heading)]))] == []
+
+
+def test_a_robot_that_turns_in_a_narrow_place_or_goes_back_and_forth():
+    leg = np.linspace(0, 1, 10)
+    turn = [(x, 0.0, 0.0) for x in leg] + [(1.0, -y, np.pi / 2) for y in leg] + [(1 - x, -1.0, np.pi) for x in leg]
+    shuttle = [(x, 0.0, 0.0) for _ in range(3) for x in np.concatenate([leg, leg[::-1]])]
+    for poses in (turn, shuttle):
+        assert [*implausible_trajectory(None, np.array(poses))] == []
+
+
 # Noise and stamps
 
 
@@ -148,6 +217,12 @@ def test_noise_in_millimetres_and_clutter_in_per_cent():
 def test_stamps_in_another_unit(factor, name):
     one(implausible_stamps(replace(LOG, stamp=LOG.stamp * factor)), "stamps", name, "give seconds")
     one(implausible_stamps(replace(LOG, stamp=(LOG.stamp + 1.7e9) * factor)), "stamps", name)
+
+
+def test_stamps_of_poses():
+    (of_log,) = implausible_stamps(replace(LOG, stamp=LOG.stamp * 1e3))
+    one(implausible_times(LOG.stamp * 1e3, LOG.pose), "stamps", str(of_log))
+    assert [*implausible_times(LOG.stamp, LOG.pose)] == []
 
 
 def test_sound_stamps():
