@@ -1,7 +1,7 @@
 """Faults that all sensors have in common: numbering, poses, time, speed of sound, noise.
 
 They come before single sensors are judged, because each of them makes healthy sensors look faulty. Descriptions of the
-log are compared by the echoes that agree (``wrong_descriptions``); the scale of the ranges and the time offset are
+log are compared by the echoes that agree (``alternatives``); the scale of the ranges and the time offset are
 estimated (``motion_fit``). The check then goes on with the corrected ring and log.
 """
 
@@ -13,8 +13,8 @@ from jaxtyping import Int
 
 from jaxsonar.diagnostics.findings import Finding, confidence_of
 from jaxsonar.diagnostics.time_offset import search_step, search_time_offsets, with_later_poses
-from jaxsonar.diagnostics.wrong_descriptions import Comparison, best_description
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
+from jaxsonar.plausibility.alternatives import Alternative, find_mistakes
 from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.plausibility.odometry_jumps import implausible_odometry
 from jaxsonar.plausibility.pose_agreement import part_of_groups, select_groups
@@ -24,6 +24,14 @@ from jaxsonar.registration.motion_fit import LAG, SCALE, MotionFit, fit_motion
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
+_CAUSES = {
+    "sensor order": "mirrored ring",
+    "first sensor": "rotated ring",
+    "heading unit": "headings",
+    "heading direction": "headings",
+}
+"""Causes of findings for kinds of mistakes; others have the same name."""
+
 _Groups = Sequence[Int[np.ndarray, "_"]]
 
 
@@ -31,8 +39,6 @@ _Groups = Sequence[Int[np.ndarray, "_"]]
 class CommonCauseSettings:
     """When a common cause is reported. Chosen by hand on random rooms of the simulator."""
 
-    mistakes: int = 2
-    """Wrong descriptions that are sought one after the other."""
     min_explained: float = 0.4
     """Share of the echoes that walls and points must explain before scale and time offset are judged."""
     min_lag: float = 0.03
@@ -90,14 +96,14 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
         log: full scans, without marks for no echo.
         sigma: the stated standard deviation of the ranges, metres; None if it is unknown.
     """
-    findings = [_jump_finding(one) for one in implausible_odometry(ring, log)]
+    findings: list[Finding] = []
+    for one in find_mistakes(ring, log):
+        findings.append(_mistake_finding(one))
+        ring, log = one.describe(ring, log)
+    # In a wrong unit, ordinary steps look like jumps.
+    findings += [_jump_finding(one) for one in implausible_odometry(ring, log)]
     # Only the scans of some groups are compared: the rest of a long log costs nothing.
     part, groups = part_of_groups(log, select_groups(log))
-    for _ in range(SETTINGS.mistakes if groups else 0):
-        if (comparison := best_description(ring, part, groups)) is None:
-            break
-        findings.append(_description_finding(comparison))
-        ring, log, part = comparison.best.ring, comparison.best.apply(log), comparison.best.apply(part)
     if groups:
         echoes, step = group_echoes(ring, part, groups), search_step(part)
         fit = _search_motion(ring, part, groups, echoes, step)
@@ -188,18 +194,18 @@ def _search_motion(ring: Ring, log: Log, groups: _Groups, echoes: PosedEchoes, s
     return best
 
 
-def _description_finding(comparison: Comparison) -> Finding:
-    """The finding about a wrong description."""
-    best, second = comparison.best, comparison.second
-    rival = f", if {second} {comparison.second_support:.0%}" if second else ""
+def _mistake_finding(found: Alternative) -> Finding:
+    """The finding about a mistake in the description of the log."""
+    rival = f", if {found.second} {found.second_support:.0%}" if found.second else ""
+    others = [*(text for one in found.corrections for text in one.equivalents), *(tie.mistake for tie in found.ties)]
     return Finding(
-        best.cause,
+        _CAUSES.get(found.kind, found.kind),
         (),
-        best.mistake,
-        confidence_of(comparison.z**2 / 2),
-        f"so, {comparison.result.mean_support:.0%} of the scans around an echo agree with it, as given "
-        f"{comparison.given.mean_support:.0%}{rival}",
-        best.remedy,
+        ", or ".join([found.mistake, *others]),
+        confidence_of(found.second_z**2 / 2),
+        f"so, {found.corrected.mean_support:.0%} of the scans around an echo agree with it, as given "
+        f"{found.given.mean_support:.0%}{rival}",
+        "; ".join(one.remedy for one in found.corrections),
     )
 
 

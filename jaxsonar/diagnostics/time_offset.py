@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from jaxsonar.diagnostics.wrong_descriptions import mean_support
 from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.plausibility.pose_agreement import agreement, part_of_groups
 from jaxsonar.scans.firing_poses import poses_at
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -29,6 +29,8 @@ class TimeOffsetSettings:
     """The search ends after this many offsets that explain less than the best one."""
     starts: int = 2
     """Best offsets from which the estimation starts."""
+    most_echoes: int = 48
+    """Echoes of a scan that are compared."""
 
 
 SETTINGS = TimeOffsetSettings()
@@ -60,6 +62,12 @@ def with_later_poses(log: Log, lag: float) -> Log:
     return replace(log, pose=pose, odometry=odometry)
 
 
+def _mean_support(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -> float:
+    """The mean support of some echoes of each scan, the same ones for every time offset."""
+    part = part_of_groups(log, groups, most_echoes=SETTINGS.most_echoes)
+    return agreement(ring, *part, support_only=True).mean_support
+
+
 def search_time_offsets(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -> list[float]:
     """Time offsets (seconds) with which the echoes agree better than without, the best first.
 
@@ -68,12 +76,12 @@ def search_time_offsets(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "
         log: the scans.
         groups: rows of the scans that are compared.
     """
-    step, given, found = search_step(log), mean_support(ring, log, groups), []
+    step, given, found = search_step(log), _mean_support(ring, log, groups), []
     for sign in (1, -1) if np.isfinite(step) else ():
         best, misses = given, 0
         for steps in SETTINGS.steps:
             lag = sign * steps * step
-            agrees = mean_support(ring, with_later_poses(log, lag), groups)
+            agrees = _mean_support(ring, with_later_poses(log, lag), groups)
             misses = 0 if agrees > best else misses + 1
             best = max(best, agrees)
             found.append((agrees, lag))

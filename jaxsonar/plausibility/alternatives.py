@@ -84,6 +84,12 @@ class Alternative:
     """The difference."""
     ties: tuple[Correction, ...]
     """Single mistakes of other kinds that explain the echoes as well."""
+    second: str
+    """The next best mistake of another kind in words; empty if the given description is better."""
+    second_support: float
+    """Mean support of the echoes with it."""
+    second_z: float
+    """Gain over it in standard errors."""
 
     @property
     def kind(self) -> str:
@@ -100,6 +106,12 @@ class Alternative:
         for correction in self.corrections:
             log = correction.apply(log)
         return log
+
+    def describe(self, ring: Ring, log: Log) -> tuple[Ring, Log]:
+        """The corrected ring and log; the sensors keep the numbers of the log."""
+        for correction in self.corrections:
+            ring, log = correction.describe(ring, log)
+        return ring, log
 
     def implausibilities(self) -> Iterator[Implausibility]:
         """The mistakes in words."""
@@ -157,7 +169,12 @@ def best_alternative(ring: Ring, log: Log) -> Alternative | None:
         return None
     kinds = {one.kind for one in best}
     others = {one[0].kind: one[0] for one, _ in reversed(ties) if len(one) == 1 and one[0].kind not in kinds}
-    return Alternative(best, given, agreed, more, tuple(others.values()))
+    rivals = [
+        (" and ".join(c.mistake for c in one), other) for one, other in results if not kinds & {c.kind for c in one}
+    ]
+    second, agrees = max([("", given), *rivals], key=lambda one: one[1].mean_support)
+    lead = gain(agrees, agreed).support_z
+    return Alternative(best, given, agreed, more, tuple(others.values()), second, agrees.mean_support, lead)
 
 
 class _Comparison:

@@ -24,6 +24,9 @@ class CorrectionSettings:
 
 SETTINGS = CorrectionSettings()
 
+_OF_SENSORS = ("position", "heading", "beam", "range_offset")
+"""Fields of a ring that belong to a place of a sensor."""
+
 Poses = Float[np.ndarray, "poses 3"]
 
 
@@ -41,6 +44,15 @@ class Correction:
     """Gives the corrected log; it has the same scans and readings in the same order."""
     equivalents: tuple[str, ...] = ()
     """Other mistakes with the same effect, in words."""
+    order: Int[np.ndarray, " sensors"] | None = None
+    """Of another numbering: sensor k of the log is sensor ``order[k]`` of the ring."""
+
+    def describe(self, ring: Ring, log: Log) -> tuple[Ring, Log]:
+        """The corrected ring and log. The sensors keep their numbers, so that findings about them hold for the log."""
+        if self.order is None:
+            return ring, self.apply(log)
+        columns = {name: np.asarray(getattr(ring, name))[self.order] for name in _OF_SENSORS}
+        return replace(ring, **columns), log
 
 
 def heading_corrections() -> list[Correction]:
@@ -113,13 +125,21 @@ def pose_unit_corrections(log: Log) -> list[Correction]:
 
 
 def turned_rings(ring: Ring) -> list[Correction]:
-    """A ring that is mounted at another angle, which no renumbering of its sensors describes."""
-    angles = [np.pi / ring.count, -np.pi / ring.count] if _is_even(ring) else [np.pi / 2, -np.pi / 2, np.pi]
+    """A ring that is mounted at another angle, or mirrored, which no renumbering of its sensors describes."""
     found = []
+    if _is_even(ring):
+        angles = [np.pi / ring.count, -np.pi / ring.count]
+    else:
+        spacings = 2 * np.pi * np.arange(1, ring.count) / ring.count
+        angles = np.unique(np.round(wrap_angle(np.append(spacings, [np.pi / 2, -np.pi / 2, np.pi])), 9))
+        mirror = _poses(lambda pose: pose * [1.0, -1.0, -1.0])
+        remedy = "negate y and the headings of the sensors of the ring, or of the poses"
+        frame = ("y and the headings are those of a frame with z down",)
+        found.append(Correction("sensor order", "the ring is mirrored", remedy, mirror, frame))
     for angle in angles:
         degrees = f"{np.degrees(angle):+.4g} deg"
         remedy = f"add {degrees} to the headings of the ring, and turn its positions likewise"
-        found.append(Correction("first sensor", f"the ring is turned by {degrees}", remedy, _headings(1.0, angle)))
+        found.append(Correction("first sensor", f"the ring is rotated by {degrees}", remedy, _headings(1.0, angle)))
     return found
 
 
@@ -137,18 +157,18 @@ def renumbering(ring: Ring, shift: int, *, clockwise: bool) -> Correction:
     if clockwise:
         first = f", from sensor {shift} of the ring" if shift else ""
         remedy = f"replace the sensor numbers k by {shift or count} - k (modulo {count}) in tx and rx"
-        frame = ("y and the headings are those of a frame with z down",) if not shift else ()
-        return Correction("sensor order", f"the sensors are numbered clockwise{first}", remedy, apply, frame)
+        frame = "the ring is mirrored" + ("" if shift else ": y and the headings are those of a frame with z down")
+        return Correction("sensor order", f"the sensors are numbered clockwise{first}", remedy, apply, (frame,), order)
     if shift == count - 1:
-        other = f"the ring is turned by one sensor{_angle(ring, -1)}"
+        other = f"the ring is rotated by one sensor{_angle(ring, -1)}"
         remedy = "subtract 1 from tx and rx, or turn the headings of the ring"
-        return Correction("first sensor", "the sensors are numbered from 1", remedy, apply, (other,))
+        return Correction("first sensor", "the sensors are numbered from 1", remedy, apply, (other,), order)
     by = shift if shift <= count // 2 else shift - count
     plural = "s" * (abs(by) != 1)
-    mistake = f"the ring is turned by {abs(by)} sensor{plural}{_angle(ring, by)}"
+    mistake = f"the ring is rotated by {abs(by)} sensor{plural}{_angle(ring, by)}"
     remedy = f"add {shift} to tx and rx (modulo {count}), or turn the headings of the ring"
     half = ("x and y of the poses are both negated",) if _is_even(ring) and 2 * shift == count else ()
-    return Correction("first sensor", mistake, remedy, apply, half)
+    return Correction("first sensor", mistake, remedy, apply, half, order)
 
 
 def _angle(ring: Ring, shift: int) -> str:

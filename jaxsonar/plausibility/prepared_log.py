@@ -69,7 +69,6 @@ class PreparedLog:
         if robot := find_robot_echoes(ring, prepared):
             warnings.append(robot.warning())
             prepared = without_robot_echoes(prepared, robot)
-        warnings += implausible_odometry(ring, prepared)
         # Nothing is concluded from a ring that is wrong itself, nor from ranges whose unit is unknown.
         if not any(implausible_ring(ring)):
             unit = find_range_unit(ring, prepared)
@@ -77,6 +76,9 @@ class PreparedLog:
                 warnings.append(unit.implausibility)
             if unit is None or np.isfinite(unit.scale):
                 warnings += implausible_poses(ring, unit.corrected(prepared) if unit else prepared)
+        # In a wrong unit, ordinary steps look like jumps.
+        if not any(one.kind in ("pose unit", "heading unit") for one in warnings):
+            warnings += implausible_odometry(ring, prepared)
         return cls(prepared, tuple(warnings), tuple(notes))
 
 

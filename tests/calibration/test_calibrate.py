@@ -349,7 +349,7 @@ def wrong_logs():
     yield "headings in degrees", "degrees", lambda log: replace(log, pose=log.pose * [1, 1, np.degrees(1)])
     yield "x and y swapped", "swapped", lambda log: replace(log, pose=log.pose[:, [1, 0, 2]])
     yield "numbered clockwise", "clockwise", lambda log: replace(log, tx=-log.tx % COUNT, rx=-log.rx % COUNT)
-    yield "a turned ring", "turned by", lambda log: replace(log, tx=(log.tx + 3) % COUNT, rx=(log.rx + 3) % COUNT)
+    yield "a rotated ring", "rotated by", lambda log: replace(log, tx=(log.tx + 3) % COUNT, rx=(log.rx + 3) % COUNT)
 
 
 @pytest.mark.parametrize(("words", "mistaken"), [pytest.param(*one, id=name) for name, *one in wrong_logs()])

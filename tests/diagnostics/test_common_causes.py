@@ -82,7 +82,7 @@ def test_wrong_axes(sound):
 
 def test_a_mirrored_ring_keeps_the_numbers_of_its_sensors(sound):
     stated = with_geometry(RING.position * [1, -1], -RING.heading)
-    found = assert_one_cause(stated, sound, "mirrored ring", "the other way round")
+    found = assert_one_cause(stated, sound, "mirrored ring", "the ring is mirrored")
     np.testing.assert_allclose(found.ring.position, RING.position)
     assert (found.log.tx == sound.tx).all()
 

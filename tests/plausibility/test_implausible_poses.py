@@ -43,7 +43,7 @@ MISTAKES = {
     "x negated": (_poses(lambda x, y, t: (-x, y, t)), "axes", "x of the poses is negated"),
     "sensors clockwise": (lambda ring, log: numbered(ring, log, -1, 0), "sensor order", "sensors are numbered clockw"),
     "sensors from one": (lambda ring, log: from_one(log), "first sensor", "sensors are numbered from 1"),
-    "turned ring": (lambda ring, log: numbered(ring, log, 1, -3), "first sensor", "the ring is turned by 3 sensors"),
+    "turned ring": (lambda ring, log: numbered(ring, log, 1, -3), "first sensor", "the ring is rotated by 3 sensors"),
 }
 
 
