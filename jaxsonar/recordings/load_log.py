@@ -11,7 +11,7 @@ from jaxsonar.hardware.recorder_base import recording_marker
 from jaxsonar.recordings.file_content import DESCRIPTIONS, FileContent, check_suffix, file_content, interrupted_content
 from jaxsonar.recordings.input_options import FORMATS, InputOptions
 from jaxsonar.scans.log_file import load_scan_log
-from jaxsonar.scans.no_echo_values import without_no_echo_values
+from jaxsonar.scans.no_echo_values import as_range, without_no_echo_values
 from jaxsonar.scans.recording_journal import TruncatedRecording
 from jaxsonar.scans.scan_log import Log
 
@@ -60,8 +60,8 @@ def load_log(
     _check_numbering(filename, log, ring)
     if options.format == "table":
         return log
-    for value in options.no_echo:
-        if (marked := without_no_echo_values(log, [value])) is log:
+    for value in {as_range(value): value for value in options.no_echo}.values():
+        if (marked := without_no_echo_values(log, [as_range(value)])) is log:
             note(f"--no-echo {value:g}: no range has this value")
         log = marked
     return log
@@ -91,7 +91,7 @@ def _read(
 ) -> Log:
     """Read a file in a format."""
     if format in ("csv", "parquet"):
-        return load_scan_log(filename)
+        return load_scan_log(filename, no_echo=options.no_echo)
     if format == "record":
         from jaxsonar.recordings.mcap_records import recorded_scans
 

@@ -9,7 +9,7 @@ invalid field. Row numbers are lines of the file; the header is row 1.
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, NoReturn
 
 import msgspec
@@ -19,6 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from jaxsonar.fileio.atomic_files import DECIMAL, atomic_write, read_bytes, shown
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.scans.no_echo_values import no_echo_hint, with_valid_ranges
 from jaxsonar.scans.scan_log import ALLOWED, LARGEST_SENSOR, InvalidLogValue, Log
 
 COLUMNS = ("scan", "stamp", "x", "y", "theta", "tx", "rx", "range")
@@ -56,29 +57,31 @@ class _Rows(NamedTuple):
     """tx, rx, range, and the optional columns of the file, in its order."""
 
 
-def read_csv(filename: str | os.PathLike[str]) -> Log:
+def read_csv(filename: str | os.PathLike[str], *, no_echo: Sequence[float] = ()) -> Log:
     """Read a scan log from CSV.
 
     The text is UTF-8 with or without byte order mark. Lines end with LF or CRLF, the last one optionally.
 
     Args:
         filename: the file.
+        no_echo: ranges that mean no echo, metres; those that are no valid ranges become ``as_range``.
 
     Raises:
         SonarError: the file cannot be read or is no scan log; the message names file, row, column, value and allowed
             values.
     """
-    return read_csv_text(filename, read_bytes(filename, what="a scan log (CSV)"))
+    return read_csv_text(filename, read_bytes(filename, what="a scan log (CSV)"), no_echo=no_echo)
 
 
-def read_csv_text(filename: str | os.PathLike[str], text: bytes) -> Log:
+def read_csv_text(filename: str | os.PathLike[str], text: bytes, *, no_echo: Sequence[float] = ()) -> Log:
     """As ``read_csv``, from the content of the file; ``filename`` is used in error messages only."""
     text = text.removeprefix(b"\xef\xbb\xbf")
     if b"\r" in text:
         text = text.replace(b"\r\n", b"\n")
     header, _, body = text.partition(b"\n")
     is_cut = bool(body) and not body.endswith(b"\n")
-    return read_csv_rows(filename, csv_header(filename, header), body + b"\n" * is_cut, is_cut=is_cut)
+    columns = csv_header(filename, header)
+    return read_csv_rows(filename, columns, body + b"\n" * is_cut, is_cut=is_cut, no_echo=no_echo)
 
 
 def read_csv_rows(
@@ -89,6 +92,7 @@ def read_csv_rows(
     first: int = 2,
     asked: Int[np.ndarray, "pairs 2"] | None = None,
     is_cut: bool = False,
+    no_echo: Sequence[float] = (),
 ) -> Log:
     """As ``read_csv``, from complete rows of a file.
 
@@ -99,9 +103,12 @@ def read_csv_rows(
         first: row number of the first of them in the file; the header is row 1.
         asked: ``Log.asked`` of the whole file; derived from these rows if omitted.
         is_cut: the last row had no line end in the file, so that it may be incomplete.
+        no_echo: as in ``read_csv``.
     """
     source = _CsvBody(filename, columns, body, first, is_cut=is_cut)
-    return source.log(source.rows(), asked)
+    rows = source.rows()
+    rows.echo[:, 2] = with_valid_ranges(rows.echo[:, 2], no_echo)
+    return source.log(rows, asked)
 
 
 def csv_header(filename: str | os.PathLike[str], line: bytes) -> tuple[str, ...]:
@@ -203,7 +210,7 @@ class _CsvBody:
             )
         except InvalidLogValue as fault:
             row = first[fault.scan] if fault.echo is None else echo[fault.echo]
-            self.fail(int(row), fault.column, fault.allowed)
+            self.fail(int(row), fault.column, fault.allowed + no_echo_hint(fault))
 
     def check(
         self,

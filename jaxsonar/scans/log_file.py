@@ -1,7 +1,7 @@
 """Reading and writing of scan logs as CSV and Parquet."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -13,12 +13,14 @@ PARQUET_MAGIC = b"PAR1"
 """First bytes of a Parquet file."""
 
 
-def load_scan_log(filename: str | os.PathLike[str]) -> Log:
+def load_scan_log(filename: str | os.PathLike[str], *, no_echo: Sequence[float] = ()) -> Log:
     """Load a scan log in CSV or Parquet. Its content decides which, not its suffix.
 
     Args:
         filename: the file. If a ``.recording`` file beside it shows that the recording process was killed, all complete
             scans are loaded, with a warning if any is incomplete.
+        no_echo: ranges that mean no echo, metres; those that are no valid ranges, such as 0, become
+            ``no_echo_values.as_range`` in the log.
 
     Raises:
         SonarError: the file cannot be read or is invalid; the message names file, row, column and allowed values.
@@ -30,10 +32,10 @@ def load_scan_log(filename: str | os.PathLike[str]) -> Log:
     if _is_parquet(filename):
         from jaxsonar.scans.parquet_log import read_parquet
 
-        return read_parquet(filename)
+        return read_parquet(filename, no_echo=no_echo)
     from jaxsonar.scans.csv_log import read_csv
 
-    return read_csv(filename)
+    return read_csv(filename, no_echo=no_echo)
 
 
 def save_log(log: Log, filename: str | os.PathLike[str], *, on_note: Callable[[str], None] | None = None) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.scans.readings import explicit_log, without_readings
-from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.scan_log import InvalidLogValue, Log
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,26 @@ def without_no_echo_values(log: Log, values: Sequence[NoEchoValue | float]) -> L
     log, marked = without_readings(log, marked & ~stays), stays[~marked | stays]
     silent = {name: np.where(marked, np.nan, getattr(log, name)) for name in ("range", "amplitude")}
     return explicit_log(replace(log, **silent))
+
+
+def as_range(mark: float) -> float:
+    """What a log holds instead of a range that means no echo and is no valid range, such as 0 or -1 m."""
+    return mark if mark > 0 else float(np.finfo(np.float64).tiny)
+
+
+def with_valid_ranges(ranges: Float[np.ndarray, " readings"], marks: Sequence[float]) -> Float[np.ndarray, " readings"]:
+    """Ranges as a file holds them, with ``as_range`` in place of the marks for no echo, metres."""
+    for mark in marks:
+        if not mark > 0:
+            ranges = np.where(ranges == mark, as_range(mark), ranges)
+    return ranges
+
+
+def no_echo_hint(fault: InvalidLogValue) -> str:
+    """What to do about an invalid range that can mean no echo; empty for other values."""
+    if fault.column != "range" or not (isinstance(fault.value, float) and -np.inf < fault.value <= 0):
+        return ""
+    return f"; if {fault.value:g} means no echo, give --no-echo {fault.value:g}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ The list is the column ``echoes``. A null range is a path that fired and heard n
 """
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxtyping import Int
 
 from jaxsonar.fileio.atomic_files import atomic_write, read_bytes, reason, shown
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.scans.no_echo_values import no_echo_hint, with_valid_ranges
 from jaxsonar.scans.scan_log import ALLOWED, InvalidLogValue, Log
 
 SCANS_PER_GROUP = 8192
@@ -27,7 +28,7 @@ OPTIONAL_VALUES = ("stamp", "x", "y", "theta", "range", "amplitude", "age", "t")
 """Values that may be null."""
 
 
-def read_parquet(filename: str | os.PathLike[str]) -> Log:
+def read_parquet(filename: str | os.PathLike[str], *, no_echo: Sequence[float] = ()) -> Log:
     """Read a scan log from Parquet.
 
     Columns may have any order and any integer or floating type. Null and NaN both mean a missing value. The fields
@@ -35,6 +36,7 @@ def read_parquet(filename: str | os.PathLike[str]) -> Log:
 
     Args:
         filename: the file.
+        no_echo: as in ``load_scan_log``.
 
     Raises:
         SonarError: the file cannot be read or is no scan log, or the extra is missing; the message names file, row,
@@ -53,6 +55,8 @@ def read_parquet(filename: str | os.PathLike[str]) -> Log:
         raise SonarError(
             f"{shown(filename)}: {reason(failure)}; needed is a scan log as a whole Parquet file"
         ) from None
+    for part in parts:
+        part["range"] = with_valid_ranges(part["range"], no_echo)
     return _log(filename, parts)
 
 
@@ -117,7 +121,7 @@ def _log(
     except InvalidLogValue as fault:
         name = fault.column if fault.echo is None else f"echoes[{fault.echo - start[fault.scan]}].{fault.column}"
         name = "x, y, theta" if name == "pose" else name
-        _fail(filename, row + fault.scan, name, str(fault.value), fault.allowed)
+        _fail(filename, row + fault.scan, name, str(fault.value), fault.allowed + no_echo_hint(fault))
 
 
 def write_parquet(log: Log, filename: str | os.PathLike[str]) -> None:

@@ -124,6 +124,18 @@ def test_ranges_that_mean_no_echo_become_silent_readings(tmp_path):
     assert load(tmp_path / "a.csv", no_echo=(7.0,))[0] == load(tmp_path / "a.csv")[0]
 
 
+def test_marks_that_are_no_ranges_are_an_error_or_become_silent_readings(tmp_path):
+    silent = (
+        "scan,stamp,x,y,theta,tx,rx,range\n0,0,0,0,0,0,0,1.2\n0,0,0,0,0,1,1,{0}\n1,1,0,0,0,0,0,{1}\n1,1,0,0,0,1,1,2\n"
+    )
+    (tmp_path / "marked.csv").write_text(silent.format(0, -1))
+    (tmp_path / "silent.csv").write_text(silent.format("", ""))
+    assert "if 0 means no echo, give --no-echo 0" in refused(load, tmp_path / "marked.csv")
+    log, notes = load(tmp_path / "marked.csv", no_echo=(0.0, -1.0))
+    assert log == load(tmp_path / "silent.csv")[0]
+    assert notes == []
+
+
 @pytest.mark.parametrize("name", ["cut.csv", "cut.parquet"])
 def test_an_interrupted_recording_gives_its_complete_scans(tmp_path, name):
     if name.endswith("parquet"):
