@@ -10,6 +10,7 @@ from jaxtyping import Int
 from jaxsonar.detection.settings import check_sigma
 from jaxsonar.diagnostics.common_causes import find_common_causes
 from jaxsonar.diagnostics.cross_counts import cross_counts
+from jaxsonar.diagnostics.echo_residuals import predict_and_match
 from jaxsonar.diagnostics.findings import Finding
 from jaxsonar.diagnostics.health_report import OF_SENSORS
 from jaxsonar.diagnostics.health_report import Health as Health
@@ -25,6 +26,7 @@ from jaxsonar.diagnostics.reference_scene import (
     select_scans,
 )
 from jaxsonar.diagnostics.repeated_ranges import RepeatedRanges
+from jaxsonar.diagnostics.sensor_alternatives import sensor_alternatives
 from jaxsonar.diagnostics.sensor_findings import (
     SensorEvidence,
     described,
@@ -32,7 +34,7 @@ from jaxsonar.diagnostics.sensor_findings import (
     plain_findings,
     sensor_findings,
 )
-from jaxsonar.diagnostics.sensor_measurements import measure_sensors
+from jaxsonar.diagnostics.sensor_measurements import faced_walls, measure_sensors
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.diagnostics.swapped_sensors import find_exchanged_sensors
 from jaxsonar.hardware.errors import SonarError
@@ -130,13 +132,28 @@ def check(
             unmeasured=measured.unmeasured,
         )
         without_worst, turn_nats = found.without_worst[place], found.cones.nats[place]
-        return health, SensorEvidence(repeated.pairs, without_worst, turn_nats, cross_counts(ring, log))
+        # The echoes of a faulty sensor may have spoiled the walls: judge suspects by walls without them.
+        alternatives = list(found.alternatives)
+        noise = found.offsets.sigma
+        for k in found.suspects:
+            apart = detect(_without_sensors(renumbered, np.append(place[accepted], k)))
+            table = predict_and_match(ring, apart, renumbered)
+            again = sensor_alternatives(table, np.asarray(ring.beam) / 2, noise, ring.max_range)[k]
+            # A wall that only this sensor hears is missing now: lost echoes must show in both ways.
+            given = alternatives[k]
+            is_lost_in_both = given is not None and again is not None and not (given.is_moved or again.is_moved)
+            alternatives[k] = again if is_lost_in_both or (again is not None and again.is_moved) else None
+        faced = found.expected[place, 0]
+        if source and not measured.any.all() and not measured.certain:  # silent, or not measured?
+            faced = faced_walls(ring, renumbered, scene)[place]
+        better = {sensor: alternatives[k] for sensor, k in enumerate(place.tolist())} if alternatives else None
+        return health, SensorEvidence(repeated.pairs, without_worst, turn_nats, cross_counts(ring, log), faced, better)
 
+    accepted: list[int] = []
     # The most certain fault of a sensor is accepted; the others are judged by walls without the echoes of this sensor,
     # which may have spoiled them.
     health, evidence = judge(scene if (place == np.arange(ring.count)).all() else detect(renumbered))
     findings = plain_findings(health, measured, evidence, faults)
-    accepted: list[int] = []
     for _ in range(int(SETTINGS.findings.most_faulty * ring.count) + 1):
         named = {k for one in findings for k in one.sensors}
         found = sensor_findings(health, measured, evidence, sigma, named)

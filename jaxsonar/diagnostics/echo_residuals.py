@@ -24,6 +24,8 @@ class ResidualTable(NamedTuple):
 
     wall: Int[np.ndarray, " rows"]
     """Number of the wall, counted over all scans."""
+    scan: Int[np.ndarray, " rows"]
+    """Scan."""
     tx: Int[np.ndarray, " rows"]
     """Transmitter."""
     rx: Int[np.ndarray, " rows"]
@@ -43,8 +45,13 @@ class ResidualTable(NamedTuple):
     """Distance of the point of reflection from the wall's ends, metres; 0 between them."""
     unobstructed: Bool[np.ndarray, " rows"]
     """Whether no known wall is in the way, and the reading is a new one as far as the log shows."""
+    along: Float[np.ndarray, " rows"]
+    """Point of reflection along the wall, from a fixed point of it, metres."""
     independent_echoes: Int[np.ndarray, " rows"]
-    """Echoes that support the wall without those of the sensor itself (for a cross path: of the path, both ways)."""
+    """Echoes that support the wall without those of the sensor itself (for a cross path: of the path, both ways). If
+    the poses gather the walls: around the point of reflection, because there may be gaps in a wall."""
+    is_between: Bool[np.ndarray, " rows"]
+    """Whether such echoes are on both sides of the point of reflection; True if single scans show the walls."""
     echo_tx: Int[np.ndarray, " echoes"]
     """Transmitter of each echo."""
     echo_rx: Int[np.ndarray, " echoes"]
@@ -70,7 +77,32 @@ def predict_and_match(ring: Ring, scene: ReferenceScene, log: Log) -> ResidualTa
     tables = [
         _match_block(ring, scene, block, flat, *_dense_ranges(flat, block, fresh, len(ring.paths))) for block in blocks
     ]
-    return ResidualTable(*(np.concatenate(column) for column in zip(*tables, strict=True)))
+    table = ResidualTable(*(np.concatenate(column) for column in zip(*tables, strict=True)))
+    if not scene.by_poses:
+        return table
+    sides = _echoes_around(table)
+    return table._replace(independent_echoes=sides.sum(axis=1), is_between=(sides > 0).all(axis=1))
+
+
+def _echoes_around(table: ResidualTable) -> Int[np.ndarray, "rows 2"]:
+    """Echoes of other sensors that the wall reflected on each side of the point of reflection of each row."""
+    settings = SETTINGS.reference
+    heard = np.abs(table.residual) < settings.support_gate
+    heard &= table.is_nearest & (table.visibility > 0) & (table.beyond_end <= settings.end_margin)
+    place = table.wall * settings.apart + np.clip(table.along, -settings.apart / 3, settings.apart / 3)
+
+    def around(of: Bool[np.ndarray, " rows"], at: Float[np.ndarray, " places"]) -> Int[np.ndarray, "places 2"]:
+        echoes = np.sort(place[of])
+        bounds = [np.searchsorted(echoes, at + side * settings.end_margin) for side in (-1, 0, 1)]
+        return np.diff(bounds, axis=0).T
+
+    support = around(heard, place)
+    low, high = np.minimum(table.tx, table.rx), np.maximum(table.tx, table.rx)
+    for one, other in np.unique(np.stack([low, high], axis=-1), axis=0):
+        of_path = (low == one) & (high == other)
+        own = heard & ((low == one) | (high == one) if one == other else of_path)
+        support[of_path] -= around(own, place[of_path])
+    return support
 
 
 def _match_block(
@@ -118,6 +150,7 @@ def _match_block(
     scan, path, slot = np.nonzero(np.isfinite(reported) & np.any(is_wall, axis=1)[:, None, None])
     return ResidualTable(
         wall=scene.number[block][s, r],
+        scan=s + block.start,
         tx=tx[p],
         rx=rx[p],
         residual=residual[row],
@@ -127,7 +160,9 @@ def _match_block(
         off_axis=predicted.departure_angle[row],
         beyond_end=np.maximum(beyond_end, 0)[row],
         unobstructed=unobstructed[row],
+        along=predicted.footpoint[row] + scene.shift[block][s, r],
         independent_echoes=scene.echoes[block][s, r] - own,
+        is_between=np.ones(len(s), bool),
         echo_tx=tx[path],
         echo_rx=rx[path],
         echo_residual=distance.min(axis=1)[scan, path, slot],

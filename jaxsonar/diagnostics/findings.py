@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,19 @@ class Finding:
 
     def lines(self) -> tuple[str, ...]:
         """The finding as text: the sentence, the evidence, the remedy; parts without text are left out."""
-        evidence = self.evidence and f"  evidence: {self.evidence} (confidence {self.confidence:.0%})"
+        confidence = "over 99%" if self.confidence > 0.99 else f"{self.confidence:.0%}"
+        evidence = self.evidence and f"  evidence: {self.evidence} (confidence {confidence})"
         return tuple(filter(None, (self.sentence, evidence, self.remedy and f"  what to do: {self.remedy}")))
 
 
 def confidence_of(nats: float) -> float:
     """Probability of a cause from its log-likelihood ratio to the next best explanation (nats), at equal priors."""
     return 1 / (1 + math.exp(-min(max(nats, -50.0), 50.0)))
+
+
+class GradedFinding(NamedTuple):
+    """A finding about one sensor."""
+
+    nats: float
+    """Its log-likelihood ratio to a sound sensor."""
+    finding: Finding

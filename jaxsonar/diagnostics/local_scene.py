@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxsonar import kernels
-from jaxsonar.diagnostics.reference_scene import ReferenceScene, empty_scene
+from jaxsonar.diagnostics.reference_scene import ReferenceScene, empty_scene, evenly_spaced
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.geometry.se2 import rotate, tangent_of, unit
 from jaxsonar.plausibility.pose_agreement import select_groups
@@ -15,25 +15,33 @@ from jaxsonar.sensors.range_models import plane_footpoint
 from jaxsonar.sensors.ring import Ring
 
 
-def groups_of_scans(log: Log) -> list[Int[np.ndarray, "_"]]:
+def groups_of_scans(log: Log, groups_of_piece: int = SETTINGS.reference.piece_groups[0]) -> list[Int[np.ndarray, "_"]]:
     """Rows of the scans of each piece of the trajectory.
 
-    Pieces are twice as long as the groups of ``select_groups``, so that different sensors see the same walls, and
-    contain the scans in between.
+    Pieces are several times as long as the groups of ``select_groups``, so that different sensors see the same walls,
+    and contain the scans in between.
+
+    Args:
+        log: the scans.
+        groups_of_piece: largest number of groups of ``select_groups`` that make a piece.
     """
-    moved, most = has_moved(log.pose), SETTINGS.reference.group_scans
+    moved, settings = has_moved(log.pose), SETTINGS.reference
     selected = select_groups(log)
-    groups, k = [], 0
-    while k < len(selected):
-        group = selected[k]
-        following = selected[k + 1] if k + 1 < len(selected) else None
-        end = len(log) if following is None else int(following[0])
-        if following is not None and end - group[-1] <= 2 * np.diff(group).max():  # they are neighbors
-            last, k = int(following[-1]), k + 2
-        else:
-            last, k = min(int(2 * group[-1] - group[0]), end - 1), k + 1
-        rows = group[0] + np.flatnonzero(moved[group[0] : last + 1])
-        groups.append(rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64))])
+    groups, first = [], 0
+    while first < len(selected):
+        after = first + 1  # the piece goes on while the groups are neighbors
+        while after < min(len(selected), first + groups_of_piece):
+            before = selected[after - 1]
+            if selected[after][0] - before[-1] > 2 * np.diff(before).max():
+                break
+            after += 1
+        begin, last = int(selected[first][0]), int(selected[after - 1][-1])
+        if after == first + 1:  # alone: scans behind it, up to the next group
+            end = len(log) if after == len(selected) else int(selected[after][0])
+            last = min(2 * last - begin, end - 1)
+        rows = begin + np.flatnonzero(moved[begin : last + 1])
+        groups.append(rows[evenly_spaced(len(rows), settings.scans_of_group * groups_of_piece)])
+        first = after
     return groups
 
 
@@ -44,9 +52,11 @@ def scene_from_groups(ring: Ring, log: Log) -> ReferenceScene:
         ring: the sensors.
         log: scans with poses; the others have no reflectors.
     """
-    groups = groups_of_scans(log)
+    settings = SETTINGS.reference
+    long = not ring.neighbors
+    groups = groups_of_scans(log, settings.piece_groups[long])
     echoes = group_echoes(ring, log, groups)
-    found = find_reflectors(echoes, echoes.pose)
+    found = find_reflectors(echoes, echoes.pose, settings.walls_of_piece[long])
     if not len(found.kind):
         return empty_scene(ring, len(log))
     tx, rx = ring.paths[echoes.path[found.echo]].T
@@ -69,7 +79,7 @@ def scene_from_groups(ring: Ring, log: Log) -> ReferenceScene:
     group_of_reflector = np.full(len(found.kind), -1)
     group_of_reflector[found.reflector] = group_of_scan[echoes.scan[found.echo]]
     rank = np.arange(len(found.kind)) - np.searchsorted(group_of_reflector, group_of_reflector)
-    reflector = np.full((len(groups) + 1, SETTINGS.reference.reflectors), -1)
+    reflector = np.full((len(groups) + 1, max(settings.walls_of_piece)), -1)
     reflector[group_of_reflector, rank] = np.arange(len(found.kind))
     reflector = reflector[group_of_scan]  # the last row, of scans without a group, is empty
     exists, pose = reflector >= 0, log.pose - np.pad(origin, ((0, 0), (0, 1)))

@@ -24,8 +24,20 @@ class MeasuredSensors(NamedTuple):
     certain: bool
     """Whether the log marks paths that heard nothing. Otherwise a path that is never heard may be silent or unmeasured,
     and it counts as unmeasured."""
-    unmeasured: tuple[str, ...]
-    """Names of the kinds of paths, and of the sensors, that were never measured."""
+    kinds: tuple[str, ...]
+    """Names of the kinds of paths that were never measured."""
+    absent: tuple[int, ...]
+    """Sensors that were never measured, if others were."""
+
+    @property
+    def unmeasured(self) -> tuple[str, ...]:
+        """Names of the kinds of paths, and of the sensors, that were never measured."""
+        return self.unmeasured_without(set())
+
+    def unmeasured_without(self, known: set[int]) -> tuple[str, ...]:
+        """The same without the sensors that are known to be silent."""
+        absent = [k for k in self.absent if k not in known]
+        return (*self.kinds, f"sensor{'s' * (len(absent) > 1)} {_listed(absent)}") if absent else self.kinds
 
     @classmethod
     def of(cls, ring: Ring, log: Log) -> "MeasuredSensors":
@@ -46,11 +58,10 @@ class MeasuredSensors(NamedTuple):
 
         either = has(measured, tx) | has(measured, rx)
         absent = np.flatnonzero(~either & (has(exists, tx) | has(exists, rx)))
-        if len(absent) and len(absent) < ring.count:
-            kinds.append(f"sensor{'s' * (len(absent) > 1)} {_listed(absent.tolist())}")
+        absent = tuple(absent.tolist()) if len(absent) < ring.count else ()
         roles = np.stack([~has(cross, sensor) | has(cross & measured, sensor) for sensor in (tx, rx)], axis=-1)
         any_cross = bool((measured & (tx != rx)).any())
-        return cls(either, roles, any_cross, bool(np.isnan(log.range).any()), tuple(kinds))
+        return cls(either, roles, any_cross, bool(np.isnan(log.range).any()), tuple(kinds), absent)
 
 
 def _listed(numbers: list[int]) -> str:

@@ -1,21 +1,31 @@
-"""Range offsets of all sensors, estimated jointly with small corrections of all walls."""
+"""Range offsets of all sensors, estimated jointly with small corrections of all walls.
+
+If poses gather the walls, errors of the poses look like range offsets: drift moves a wall towards the sensors on one
+side of the robot, and away from those on the other side. Therefore a wall is corrected in each stretch of the
+trajectory anew, and standard errors are estimated from the differences between stretches.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import stats
 
 from jaxsonar.diagnostics.echo_residuals import ResidualTable
 from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.plausibility.pose_agreement import select_groups
+from jaxsonar.scans.scan_log import Log
 
 
 class OffsetEstimate(NamedTuple):
     """Range offsets, and the residuals that remain."""
 
     offset: Float[np.ndarray, " sensors"]
-    """What each sensor reports too much, metres; NaN where it has too few echoes."""
+    """What each sensor reports too much, metres; NaN where it has echoes in too few scans or stretches."""
     error: Float[np.ndarray, " sensors"]
-    """Standard error of the offset, metres."""
+    """Standard error of the offset, metres. If it comes from few stretches of the trajectory, it
+    is larger, so that an offset of ``OffsetSettings.tail_sigmas`` errors is as improbable as one of a normal
+    distribution."""
     sigma: float
     """Robust standard deviation of the residuals, metres; NaN without residuals."""
     row: Int[np.ndarray, " used"]
@@ -24,13 +34,23 @@ class OffsetEstimate(NamedTuple):
     """Residual of each row against a wall that is determined without it (leave-one-out), metres."""
 
 
-def estimate_offsets(table: ResidualTable, sensors: int, min_noise: float) -> OffsetEstimate:
+def stretches_of_scans(log: Log) -> Int[np.ndarray, " scans"]:
+    """Stretch of the trajectory of each scan, numbered: about 1 m, or a right angle, in which poses drift little."""
+    begin = np.array([group[0] for group in select_groups(log)], np.int64)
+    return np.searchsorted(begin, np.arange(len(log)), side="right")
+
+
+def estimate_offsets(
+    table: ResidualTable, sensors: int, min_noise: float, stretch: Int[np.ndarray, " scans"] | None = None
+) -> OffsetEstimate:
     """Robust least squares over all offsets and all walls jointly, so that a bad sensor does not spoil its neighbors.
 
     Args:
         table: residuals of the echoes.
         sensors: number of sensors.
         min_noise: lower limit of the noise, metres, for walls with so few echoes that their residuals are too small.
+        stretch: number of the stretch of the trajectory of each scan (``stretches_of_scans``), if poses gather the
+            walls; None if single scans show them.
     """
     settings = SETTINGS.offsets
     row = np.flatnonzero(
@@ -42,7 +62,12 @@ def estimate_offsets(table: ResidualTable, sensors: int, min_noise: float) -> Of
         & (table.independent_echoes >= settings.min_independent_echoes)
     )
     tx, rx, residual = table.tx[row], table.rx[row], table.residual[row]
-    _, wall = np.unique(table.wall[row], return_inverse=True)
+    part = None
+    if stretch is None:
+        _, wall = np.unique(table.wall[row], return_inverse=True)
+    else:
+        each, wall = np.unique(np.stack([stretch[table.scan[row]], table.wall[row]]), axis=1, return_inverse=True)
+        part = np.unique(each[0], return_inverse=True)[1]
     walls, d_wall = int(wall.max(initial=-1)) + 1, table.d_range_d_wall[row]
     # The offset of a path is the mean of the offsets of its two sensors.
     d_offset = np.zeros((len(row), sensors))
@@ -64,18 +89,56 @@ def estimate_offsets(table: ResidualTable, sensors: int, min_noise: float) -> Of
         coupling = _sum_groups(wall, weight[:, None, None] * d_wall[:, :, None] * d_offset[:, None, :], walls)
         gradient_wall = _sum_groups(wall, (weight * residual)[:, None] * d_wall, walls)
         wall_cov = np.linalg.inv(info_wall)
-        information = d_offset.T @ (weight[:, None] * d_offset) + prior * np.eye(sensors)
-        information = information - np.einsum("wik,wij,wjl->kl", coupling, wall_cov, coupling)
-        gradient = d_offset.T @ (weight * residual) - np.einsum("wik,wij,wj->k", coupling, wall_cov, gradient_wall)
-        offset, error = remove_gauge_freedom(np.linalg.solve(information, gradient), information, has_echoes)
+        information = _sum_groups(wall, weight[:, None, None] * d_offset[:, :, None] * d_offset[:, None, :], walls)
+        information -= np.einsum("wik,wij,wjl->wkl", coupling, wall_cov, coupling)
+        gradient = _sum_groups(wall, (weight * residual)[:, None] * d_offset, walls)
+        gradient -= np.einsum("wik,wij,wj->wk", coupling, wall_cov, gradient_wall)
+        offset, error = _solve(information, gradient, has_echoes, part)
         correction = np.einsum("wij,wj->wi", wall_cov, gradient_wall - np.einsum("wik,k->wi", coupling, offset))
     left = residual - (d_wall * correction[wall]).sum(axis=1) - (offset[tx] + offset[rx]) / 2
     leverage = weight * np.einsum("ei,eij,ej->e", d_wall, wall_cov[wall], d_wall)
     left = left / np.maximum(1 - leverage, 0.1)
     used = weight > 0
     enough = np.bincount(tx[used], minlength=sensors) + np.bincount(rx[used], minlength=sensors) >= settings.min_echoes
+    enough &= np.isfinite(error)
     offset, error = (np.where(enough, values, np.nan) for values in (offset, error))
     return OffsetEstimate(offset, error, noise if len(row) else np.nan, row, left)
+
+
+def _solve(
+    information: Float[np.ndarray, "walls sensors sensors"],
+    gradient: Float[np.ndarray, "walls sensors"],
+    has_echoes: Bool[np.ndarray, " sensors"],
+    stretch: Int[np.ndarray, " walls"] | None,
+) -> tuple[Float[np.ndarray, " sensors"], Float[np.ndarray, " sensors"]]:
+    """Offsets from the normal equations of each wall, and their standard errors.
+
+    Args:
+        information: matrix of each wall.
+        gradient: right side of each wall.
+        has_echoes: sensors with echoes.
+        stretch: stretch of the trajectory of each wall, numbered without gaps; the offsets are determined without each
+            of them, one after the other (jackknife). None if the errors of the walls are independent.
+    """
+    prior = SETTINGS.offsets.prior_information * np.eye(len(has_echoes))
+    total, right = information.sum(axis=0) + prior, gradient.sum(axis=0)
+    solution = np.linalg.solve(total, right)
+    project, observable = _sparse_gauge(solution, total, has_echoes)
+    offset, error = project @ solution, np.linalg.norm(project @ observable, axis=1)
+    if stretch is None:
+        return offset, error
+    count = int(stretch.max(initial=0)) + 1
+    part, part_right = (_sum_groups(stretch, values, count) for values in (information, gradient))
+    without = np.linalg.solve(total - part, (right - part_right)[..., None])[..., 0]
+    change = (without - solution) @ project.T
+    jackknife = np.sqrt((count - 1) / count * (change**2).sum(axis=0))
+    # Stretches that count: as many as there were if all of them told the same about the sensor.
+    share = np.einsum("pkk->kp", part)
+    stretches = share.sum(axis=1) ** 2 / np.maximum((share**2).sum(axis=1), 1e-12)
+    sigmas = SETTINGS.offsets.tail_sigmas
+    enough = stretches >= SETTINGS.offsets.min_stretches
+    tail = stats.t.isf(stats.norm.sf(sigmas), np.maximum(stretches - 1, 1)) / sigmas
+    return offset, np.where(enough, np.maximum(error, jackknife * tail), np.inf)
 
 
 def remove_gauge_freedom(
@@ -93,6 +156,16 @@ def remove_gauge_freedom(
         information: their information matrix.
         has_echoes: sensors with echoes.
     """
+    project, observable = _sparse_gauge(offset, information, has_echoes)
+    return project @ offset, np.linalg.norm(project @ observable, axis=1)
+
+
+def _sparse_gauge(
+    offset: Float[np.ndarray, " sensors"],
+    information: Float[np.ndarray, "sensors sensors"],
+    has_echoes: Bool[np.ndarray, " sensors"],
+) -> tuple[Float[np.ndarray, "sensors sensors"], Float[np.ndarray, "sensors observable"]]:
+    """The projection of ``remove_gauge_freedom``, and a square root of the covariance of what is observable."""
     settings = SETTINGS.offsets
     eigenvalue, mode = np.linalg.eigh(information)
     unobservable = eigenvalue < settings.weak_information * np.median(eigenvalue)
@@ -105,8 +178,7 @@ def remove_gauge_freedom(
         project = np.eye(len(offset)) - free @ np.linalg.solve(normal, (free * weight[:, None]).T)
         scale = settings.sparsity_scale
         weight = has_echoes / np.sqrt((project @ offset) ** 2 + scale**2) * scale
-    observable = mode[:, ~unobservable] / np.sqrt(eigenvalue[~unobservable])
-    return project @ offset, np.linalg.norm(project @ observable, axis=1)
+    return project, mode[:, ~unobservable] / np.sqrt(eigenvalue[~unobservable])
 
 
 def _sum_groups(group: np.ndarray, values: np.ndarray, groups: int) -> np.ndarray:

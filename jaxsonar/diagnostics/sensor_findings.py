@@ -7,10 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxsonar.diagnostics.alternative_findings import explained_otherwise
 from jaxsonar.diagnostics.cross_counts import one_sided_sensors
-from jaxsonar.diagnostics.findings import Finding, confidence_of
+from jaxsonar.diagnostics.findings import Finding, GradedFinding, confidence_of
 from jaxsonar.diagnostics.health_report import Health
 from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
+from jaxsonar.diagnostics.sensor_alternatives import SensorAlternative
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.sensors.ring import Ring
 
@@ -34,14 +36,10 @@ class SensorEvidence(NamedTuple):
     """Log-likelihood ratio of the measured direction of each cone to its heading."""
     cross: Int[np.ndarray, "sensors sensors"]
     """``cross_counts``."""
-
-
-class GradedFinding(NamedTuple):
-    """A finding about one sensor."""
-
-    nats: float
-    """Its log-likelihood ratio to a sound sensor."""
-    finding: Finding
+    faced: Int[np.ndarray, " sensors"]
+    """Expected direct echoes of walls well inside the cone, also of sensors that the log never measured."""
+    alternatives: dict[int, SensorAlternative | None] | None = None
+    """``SensorMeasurements.alternatives`` by sensor; None if they were not compared."""
 
 
 def sensor_findings(
@@ -58,12 +56,19 @@ def sensor_findings(
     """
     found: list[GradedFinding] = []
     # What explains the others comes first: an offset or a rotation explains missing echoes, not the other way round.
-    for one in (
-        *_range_offsets(health, sigma),
-        *_turned_sensors(health, evidence),
-        *_silent_sensors(health, measured),
-        *_weak_sensors(health, evidence),
-    ):
+    if evidence.alternatives is None:
+        candidates = (
+            *_range_offsets(health, sigma),
+            *_turned_sensors(health, evidence),
+            *_silent_sensors(health, measured, evidence),
+            *_weak_sensors(health, evidence),
+        )
+    else:
+        silent = [
+            one for one in _silent_sensors(health, measured, evidence) if health.direct[one.finding.sensors[0]] == 0
+        ]
+        candidates = (*silent, *explained_otherwise(evidence.alternatives), *_range_offsets(health, sigma))
+    for one in candidates:
         if not known & set(one.finding.sensors):
             known = known | set(one.finding.sensors)
             found.append(one)
@@ -93,7 +98,10 @@ def described(health: Health, measured: MeasuredSensors, found: Sequence[Finding
         common: number of findings at the beginning that come before the width of the cones.
     """
     found = [*found[:common], *_beam_width(health), *found[common:], *_ring_findings(health, measured, found)]
-    return replace(health, remarks=_remarks(health, found), findings=tuple(found))
+    dead = {k for one in found if one.cause == "dead" for k in one.sensors}
+    return replace(
+        health, remarks=_remarks(health, found), findings=tuple(found), unmeasured=measured.unmeasured_without(dead)
+    )
 
 
 def _remarks(health: Health, found: Sequence[Finding]) -> tuple[str, ...]:
@@ -107,7 +115,7 @@ def _remarks(health: Health, found: Sequence[Finding]) -> tuple[str, ...]:
     return tuple("; ".join(remark(one, k) for one in found if k in one.sensors) for k in range(health.ring.count))
 
 
-def _silent_sensors(health: Health, measured: MeasuredSensors) -> Iterator[GradedFinding]:
+def _silent_sensors(health: Health, measured: MeasuredSensors, evidence: SensorEvidence) -> Iterator[GradedFinding]:
     """Sensors that hear nothing, or nothing of the walls.
 
     If the log does not mark paths that heard nothing, sensors that are never heard are named with both explanations.
@@ -118,7 +126,7 @@ def _silent_sensors(health: Health, measured: MeasuredSensors) -> Iterator[Grade
     for k in range(health.ring.count):
         expected, detected = health.expected[k, 0], health.heard[k, 0]
         # A sensor that faces no wall hears nothing, either.
-        faces_walls = health.source != "poses" or not measured.any[k] or expected >= _FINDINGS.min_faced
+        faces_walls = not health.source or evidence.faced[k] >= _FINDINGS.min_faced
         heard_never = echoes[k] == 0 and others >= _FINDINGS.min_echoes and faces_walls
         if heard_never and (measured.any[k] or not measured.certain):
             doubt = "" if measured.any[k] else "; it is dead, or was not measured"
@@ -256,7 +264,7 @@ def _range_offsets(health: Health, sigma: float | None) -> Iterator[GradedFindin
             f"sensor {k} reports {1e3 * size[k]:.1f} ± {1e3 * health.offset_error[k]:.1f} mm too {direction}, relative "
             f"to the others",
             confidence_of(z**2 / 2 - np.log(health.ring.count)),
-            f"the offset is {z:.0f} standard errors, estimated jointly with all other offsets and all walls",
+            f"the offset is {z:.1f} standard errors, estimated jointly with all other offsets and all walls",
             "calibrate the ring (jaxsonar calibrate), or give the sensor this range_offset",
         )
         yield GradedFinding(z**2 / 2, finding)
@@ -325,20 +333,22 @@ def _beam_width(health: Health) -> Iterator[Finding]:
 
 def _ring_findings(health: Health, measured: MeasuredSensors, faults: Sequence[Finding]) -> Iterator[Finding]:
     """Findings about the ring as a whole."""
-    explained = health.fits[:, 1][np.isfinite(health.fits[:, 1])]
-    if health.source == "scans" and not faults and len(explained) and np.median(explained) < _FINDINGS.min_explained:
+    # Sensors that face no wall hear little, and nothing that walls explain: all echoes count alike.
+    echoes = np.where(np.isfinite(health.fits[:, 1]), health.direct + health.cross, 0)
+    explained = float(np.nan_to_num(health.fits[:, 1]) @ echoes / max(echoes.sum(), 1))
+    if health.source == "scans" and not faults and echoes.any() and explained < _FINDINGS.min_explained:
         yield Finding(
             "unexplained echoes",
             (),
-            f"walls explain {100 * np.median(explained):.0f} % of the echoes: is it the right ring, are ranges half "
+            f"walls explain {100 * explained:.0f} % of the echoes: is it the right ring, are ranges half "
             "path lengths in metres?",
             0.5,
             "",
             "check the ring, the unit of the ranges, and the sensor numbers",
         )
+    value, sensors = _common_constant(health)
     usual_constant = _usual_constant_fraction(health)
-    if usual_constant > 0.1:
-        value = float(np.nanmedian(health.constant[:, 0]))
+    if usual_constant > 0.1 and sensors > health.ring.count / 2:
         yield Finding(
             "no-echo value",
             (),
@@ -368,6 +378,13 @@ def _ring_findings(health: Health, measured: MeasuredSensors, faults: Sequence[F
             "",
             "set neighbors in the ring to what the device listens to",
         )
+
+
+def _common_constant(health: Health) -> tuple[float, int]:
+    """The range that is the most frequent one of the most sensors, metres, and the number of these sensors."""
+    value = health.constant[np.isfinite(health.constant[:, 0]), 0]
+    each, sensors = np.unique(value, return_counts=True)
+    return (float(each[sensors.argmax()]), int(sensors.max())) if len(each) else (float("nan"), 0)
 
 
 def _usual_constant_fraction(health: Health) -> float:

@@ -1,5 +1,6 @@
 """What the walls around the robot tell about every sensor: offsets, detection rates, cones, and unexplained echoes."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -7,8 +8,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.diagnostics.beam_width import EachCone, count_by_angle, fit_cone, fit_each_cone
 from jaxsonar.diagnostics.echo_residuals import ResidualTable, explained_fraction, predict_and_match
-from jaxsonar.diagnostics.range_offsets import OffsetEstimate, estimate_offsets
+from jaxsonar.diagnostics.range_offsets import OffsetEstimate, estimate_offsets, stretches_of_scans
 from jaxsonar.diagnostics.reference_scene import ReferenceScene
+from jaxsonar.diagnostics.sensor_alternatives import SensorAlternative, sensor_alternatives, suspects
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -42,6 +44,11 @@ class SensorMeasurements(NamedTuple):
     """Scatter of the residuals of its direct echoes, and of all its echoes, metres."""
     explained: Float[np.ndarray, " sensors"]
     """Fraction of its echoes that reflectors explain."""
+    alternatives: tuple[SensorAlternative | None, ...]
+    """What explains the echoes of each sensor better than a sound sensor; None where nothing does. Only for sensors
+    that do not overlap and walls that the poses gather; else empty."""
+    suspects: tuple[int, ...]
+    """Sensors whose echoes may have spoiled these walls."""
 
 
 def measure_sensors(ring: Ring, log: Log, scene: ReferenceScene, sigma: float | None) -> SensorMeasurements:
@@ -56,7 +63,7 @@ def measure_sensors(ring: Ring, log: Log, scene: ReferenceScene, sigma: float | 
     table = predict_and_match(ring, scene, log)
     # Estimate range offsets and the noise of the ranges.
     min_noise = sigma or scene.noise(default=SETTINGS.reference.min_sigma)
-    offsets = estimate_offsets(table, ring.count, min_noise)
+    offsets = estimate_offsets(table, ring.count, min_noise, stretches_of_scans(log) if scene.by_poses else None)
     noise = offsets.sigma if np.isfinite(offsets.sigma) else SETTINGS.detection.default_sigma
     # Count which expected echoes were detected.
     usable, detected = _detections(table, np.nan_to_num(offsets.offset), noise)
@@ -71,6 +78,7 @@ def measure_sensors(ring: Ring, log: Log, scene: ReferenceScene, sigma: float | 
     cones = fit_each_cone(expected_by_angle, detected_by_angle, curve)
     scale = beam[:, None] / beam.mean()  # angles were counted on the scale of the mean cone
     # Summarize residuals and explained echoes.
+    compared = scene.by_poses and not ring.neighbors
     gate = SETTINGS.detection.explained_gate * noise + SETTINGS.detection.explained_margin
     return SensorMeasurements(
         offsets,
@@ -84,7 +92,23 @@ def measure_sensors(ring: Ring, log: Log, scene: ReferenceScene, sigma: float | 
         EachCone(cones.half_width * scale, cones.direction * scale, cones.nats),
         *_residual_statistics(table, offsets, ring.count),
         explained_fraction(table, gate, ring.count),
+        tuple(sensor_alternatives(table, beam / 2, noise, ring.max_range)) if compared else (),
+        tuple(suspects(table, beam / 2, noise)) if compared else (),
     )
+
+
+def faced_walls(ring: Ring, log: Log, scene: ReferenceScene) -> Int[np.ndarray, " sensors"]:
+    """Expected direct echoes of walls well inside the cone of each sensor, whether or not the log measured it.
+
+    Args:
+        ring: the sensors.
+        log: the scans, with sensors numbered as in the ring.
+        scene: the reflectors of these scans.
+    """
+    direct = np.repeat(np.arange(ring.count)[:, None], 2, axis=1)
+    table = predict_and_match(ring, scene, replace(log, asked=np.concatenate([log.asked, direct])))
+    usable, detected = _detections(table, np.zeros(ring.count), SETTINGS.detection.default_sigma)
+    return _count_well_inside(table, usable, detected, ring.count)[0][:, 0]
 
 
 def _detections(
@@ -108,7 +132,7 @@ def _count_well_inside(
 ) -> tuple[Int[np.ndarray, "sensors 3"], Int[np.ndarray, "sensors 3"], Int[np.ndarray, "sensors 2"]]:
     """Counts of walls well inside the cones: ``SensorMeasurements.expected``, ``heard``, ``without_worst``."""
     inside = usable & (table.visibility > SETTINGS.detection.min_visibility)
-    inside &= table.beyond_end <= SETTINGS.detection.max_beyond_end
+    inside &= (table.beyond_end <= SETTINGS.detection.max_beyond_end) & table.is_between
     direct = table.tx == table.rx
     columns = ((table.tx, inside & direct), (table.tx, inside & ~direct), (table.rx, inside & ~direct))
     expected = [np.bincount(sensor[rows], minlength=sensors) for sensor, rows in columns]

@@ -15,22 +15,29 @@ class ReferenceSettings:
     """Number of scans that are analysed; longer logs are sampled evenly."""
     block_scans: int = 32
     """Scans per compiled step."""
-    group_scans: int = 40
-    """Largest number of scans of one piece of the trajectory, spread over it."""
+    piece_groups: tuple[int, int] = (2, 6)
+    """Groups of ``pose_agreement`` that make one piece of the trajectory: up to 1.6 m; up to 5 m for sensors that do
+    not hear their neighbors, because they see the same walls on such a way only."""
+    scans_of_group: int = 20
+    """Largest number of scans of a piece for each of its groups."""
     min_share: float = 0.6
     """Walls of single scans as a share of those that the poses gather, from which on the poses are not used."""
     min_echoes: int = 3
     """Echoes that support a reference wall, and sensors that took part in them."""
     min_walls: int = 5
     """Number of reference walls below which single scans are not used. One wall per ten scans is needed, too."""
-    reflectors: int = 8
-    """Largest number of reflectors of one piece of the trajectory."""
+    walls_of_piece: tuple[int, int] = (8, 14)
+    """Largest number of reflectors of a piece of the trajectory, for the same two lengths."""
     default_sigma: float = 0.01
     """Standard deviation of the ranges where it is unknown, metres."""
     min_sigma: float = MIN_SIGMA
     """Lower limit of the noise where it is unknown, metres."""
     end_margin: float = 0.25
     """Length that a wall is assumed to extend beyond its outermost footpoints, unless another wall ends it, metres."""
+    support_gate: float = 0.04
+    """Residual up to which an echo supports a wall that the poses gather, metres."""
+    apart: float = 1e4
+    """Distance between the scales of two walls where their lengths share one axis, metres."""
     range_margin: float = 0.02
     """Predicted echoes this close to the maximum range are left out, metres. Also the depth behind another wall from
     which on a point of reflection is occluded."""
@@ -84,6 +91,10 @@ class OffsetSettings:
     """Inverse variance of the prior of offsets and walls: 50 mm, 0.05 rad."""
     min_echoes: int = 16
     """Echoes (direct ones count twice) that the offset of a sensor needs."""
+    min_stretches: float = 2.5
+    """Stretches of the trajectory that a standard error needs, if poses gather the walls."""
+    tail_sigmas: float = 3.5
+    """Standard errors from few stretches are larger, so that this many of them mean the same as of many."""
     weak_information: float = 0.03
     """Directions with less than this fraction of the median information are not observable."""
     sparsity_scale: float = 0.0005
@@ -153,6 +164,38 @@ class ConeSettings:
 
 
 @dataclass(frozen=True)
+class AlternativeSettings:
+    """Comparison of explanations of the direct echoes of a sensor."""
+
+    largest_gate: float = 0.04
+    """An echo farther than this from the range of a wall is not explained by it, metres."""
+    cone_margin: float = float(np.radians(3.0))
+    """A wall this far inside the cone must be heard, one this far outside may be, radians."""
+    block_scans: int = 10
+    """Scans that count as one part of the trajectory: their errors are alike."""
+    min_parts: int = 3
+    """Parts of the trajectory that must support a fault, each by more than 1 nat."""
+    most_offset: float = 0.1
+    """Largest offset that is tried, metres."""
+    min_sensors: int = 3
+    """Sensors from which the usual rates are taken."""
+    least_rate: float = 0.5
+    """Usual rate of detection, and usual share of explained echoes, that the comparison needs."""
+    most_rate: float = 0.95
+    """Both count as at most this."""
+    dependent: float = 4.0
+    """Echoes that share the errors of their walls: the likelihood is flatter by this factor for standard errors."""
+    min_gain: float = 0.15
+    """Share of the echoes of a sensor that an offset or a rotation must explain in addition."""
+    most_suspects: int = 4
+    """Sensors that are judged by walls without their own echoes, ..."""
+    suspicious: float = 1.0
+    """... if they fit worse than the others by this many standard deviations."""
+    min_nats: float = 12.0
+    """Log-likelihood ratio to a sound sensor that is reported, without the best part of the trajectory."""
+
+
+@dataclass(frozen=True)
 class FindingSettings:
     """Thresholds of the findings."""
 
@@ -168,11 +211,11 @@ class FindingSettings:
     """... if its ranges scatter by more than this, metres."""
     min_offset: float = 0.002
     """Smaller range offsets are never reported, metres."""
-    min_offset_by_poses: float = 0.015
+    min_offset_by_poses: float = 0.02
     """The same if the poses gather the walls, metres: their errors add to the residuals."""
-    offset_sigmas: tuple[float, float] = (4.0, 6.0)
+    offset_sigmas: tuple[float, float] = (4.0, 3.5)
     """Range offsets that are reported are at least this many standard errors; the second one counts if the poses gather
-    the walls, whose errors are common to many echoes."""
+    the walls: ``OffsetSettings.tail_sigmas``."""
     min_explained: float = 0.3
     """Fraction of echoes that reflectors must explain; below, the ring or the units are probably wrong."""
     min_expected: int = 8
@@ -228,6 +271,8 @@ class DiagnosticsSettings:
     """Exchanged sensors."""
     cones: ConeSettings = field(default_factory=ConeSettings)
     """Detection cones."""
+    alternatives: AlternativeSettings = field(default_factory=AlternativeSettings)
+    """Explanations of the echoes of a sensor."""
     findings: FindingSettings = field(default_factory=FindingSettings)
     """Findings."""
 

@@ -29,12 +29,15 @@ class LocalReflectorSettings:
     """Scans of a group that must see a wall or point."""
     min_range: float = 0.05
     """Shorter echoes are left out, metres."""
+    extent: float = 30.0
+    """Scans farther than this from the middle of their group, and walls farther than this plus the maximum range, are
+    left out, metres: the pose of a glitch is of no use."""
     angle_cell: float = float(np.radians(2.0))
     """Cell of the accumulator, radians, ..."""
     range_cell: float = 0.025
     """... and metres."""
     walls: int = 8
-    """Largest number of walls of a group."""
+    """Usual largest number of walls and points of a group."""
     gate: float = 0.08
     """An echo farther than this from the range of a peak does not belong to it, metres."""
     cone_margin: float = float(np.radians(4.0))
@@ -128,11 +131,12 @@ def group_echoes(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -
     of_scan, origin = np.full(len(log), -1), np.zeros((len(log), 2))
     for number, rows in enumerate(groups):
         of_scan[rows] = number
-        origin[rows] = log.pose[rows, :2].mean(axis=0)
+        origin[rows] = np.median(log.pose[rows, :2], axis=0)
     path = path_rows(ring, log.tx, log.rx)
     corrected = np.asarray(ring.corrected(log.range, log.tx, log.rx))
     used = (of_scan[log.echo_scan] >= 0) & (path >= 0) & ~is_repeated(log)
     used &= (corrected > SETTINGS.min_range) & (corrected < ring.max_range)  # False for silent readings
+    used[used] = np.hypot(*(reading_poses(log)[used, :2] - origin[log.echo_scan[used]]).T) < SETTINGS.extent
     row = np.flatnonzero(used)
     scan = log.echo_scan[row]
     row = row[np.argsort(of_scan[scan], kind="stable")]
@@ -148,17 +152,20 @@ def group_echoes(ring: Ring, log: Log, groups: Sequence[Int[np.ndarray, "_"]]) -
     )
 
 
-def find_reflectors(groups: PosedEchoes, pose: Float[np.ndarray, "echoes 3"]) -> LocalReflectors:
+def find_reflectors(
+    groups: PosedEchoes, pose: Float[np.ndarray, "echoes 3"], most: int = SETTINGS.walls
+) -> LocalReflectors:
     """Find walls and points in each group.
 
     Args:
         groups: the echoes.
         pose: group_from_robot of each echo: x, y (m), theta (rad).
+        most: largest number of walls and points of a group.
     """
     found = [
         (number, *one)
         for number in range(groups.count)
-        for one in _reflectors_of_group(groups, np.flatnonzero(groups.group == number), pose)
+        for one in _reflectors_of_group(groups, np.flatnonzero(groups.group == number), pose, most)
     ]
     kind, parameters = np.array([one[1] for one in found], int), np.array([one[2] for one in found]).reshape(-1, 2)
     echoes = [one[3] for one in found]
@@ -168,7 +175,7 @@ def find_reflectors(groups: PosedEchoes, pose: Float[np.ndarray, "echoes 3"]) ->
 
 
 def _reflectors_of_group(
-    groups: PosedEchoes, echo: Int[np.ndarray, " echoes"], pose: Float[np.ndarray, "all 3"]
+    groups: PosedEchoes, echo: Int[np.ndarray, " echoes"], pose: Float[np.ndarray, "all 3"], most: int
 ) -> Iterator[tuple[int, Float[np.ndarray, " 2"], Int[np.ndarray, " explained"]]]:
     """Kind, parameters and echoes of the reflectors of a group, the one with the most scans first."""
     votes, start = _votes(groups, echo, pose[echo])
@@ -177,7 +184,7 @@ def _reflectors_of_group(
     midpoint, baseline = groups.geometry(pose[echo], groups.path[echo])
     free, scan = np.ones(len(echo), bool), groups.scan[echo]
     around = np.ceil(np.array(SETTINGS.suppressed) / [SETTINGS.angle_cell, SETTINGS.range_cell]).astype(int)
-    for _ in range(SETTINGS.walls):
+    for _ in range(most):
         angle, distance = np.unravel_index(votes.argmax(), votes.shape)
         if votes[angle, distance] < SETTINGS.min_scans:
             return
@@ -206,14 +213,14 @@ def _votes(
     width = np.asarray(paths.width)[path]
     angles = round(2 * np.pi / SETTINGS.angle_cell)
     steps = np.arange(int(np.ceil(width.max(initial=0) / SETTINGS.angle_cell)) + 1)
-    inside = steps * SETTINGS.angle_cell <= width[:, None]
     theta = np.asarray(paths.start)[path][:, None] + pose[:, None, 2] + steps * SETTINGS.angle_cell
     normal, (midpoint, baseline) = unit(theta), groups.geometry(pose, path)
     across = baseline[:, None, 1] * normal[..., 0] - baseline[:, None, 0] * normal[..., 1]
     height = np.sqrt(np.maximum(groups.range[echo][:, None] ** 2 - across**2, 0))
     rho = (midpoint[:, None] * normal).sum(axis=-1) + height
-    start = float(rho.min(initial=0)) - SETTINGS.range_cell
-    column = ((rho - start) / SETTINGS.range_cell).astype(int)
+    inside = (steps * SETTINGS.angle_cell <= width[:, None]) & (np.abs(rho) < SETTINGS.extent + groups.ring.max_range)
+    start = float(rho.min(initial=0, where=inside)) - SETTINGS.range_cell
+    column = (np.where(inside, rho - start, 0) / SETTINGS.range_cell).astype(int)
     row = np.round(theta / SETTINGS.angle_cell).astype(int) % angles
     _, scan = np.unique(groups.scan[echo], return_inverse=True)
     voted = np.zeros((int(scan.max(initial=0)) + 1, angles, int(column.max(initial=0)) + 2), bool)
