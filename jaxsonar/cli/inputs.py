@@ -20,8 +20,8 @@ from jaxsonar.cli.console import errors_in, print_status
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.reports.text import plural
 
-_REPORTED_BY_CHECK = ("no-echo value", "held readings", "robot echo")
-"""Kinds of mistakes that ``check`` reports itself, as findings."""
+_NO_FINDINGS = ("empty log", "unheard paths", "explained share")
+"""Kinds of probable mistakes of a log that ``check`` does not report itself, as findings."""
 
 LOG_HELP = "scan log (CSV, Parquet), raw record (MCAP, extra live), ROS bag (extra ros), or what --from names"
 
@@ -240,7 +240,7 @@ def load_all_inputs(
         with errors_in(name):
             if as_recorded and not options.strict:
                 for found in implausible_input(ring, log):
-                    if found.kind not in _REPORTED_BY_CHECK:
+                    if found.kind in _NO_FINDINGS:
                         messages.warn(str(found))
             else:
                 prepared = prepared_log(ring, log, on_note=messages.note)

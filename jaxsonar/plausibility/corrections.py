@@ -27,6 +27,14 @@ SETTINGS = CorrectionSettings()
 _OF_SENSORS = ("position", "heading", "beam", "range_offset")
 """Fields of a ring that belong to a place of a sensor."""
 
+_LENGTH_UNITS = (
+    (1e-3, "millimetres", "mm"),
+    (1e-2, "centimetres", "cm"),
+    (0.0254, "inches", "in"),
+    (0.3048, "feet", "ft"),
+)
+"""Metres per unit, its name, and its abbreviation."""
+
 Poses = Float[np.ndarray, "poses 3"]
 
 
@@ -111,14 +119,15 @@ def axis_corrections() -> list[Correction]:
 
 
 def pose_unit_corrections(log: Log) -> list[Correction]:
-    """Positions in millimetres or centimetres, if the robot moves at all in this unit."""
+    """Positions in another unit, if the robot moves at all in this unit."""
     position = bounded(log.pose[np.isfinite(log.pose).all(axis=1)])[:, :2]
     extent = float(np.ptp(position, axis=0).max()) if len(position) else 0.0
     found = []
-    for unit, name, short in ((1e-3, "millimetres", "mm"), (1e-2, "centimetres", "cm")):
+    for unit, name, short in _LENGTH_UNITS:
         if extent * unit >= SETTINGS.least_extent:
             scale = np.array([unit, unit, 1.0])
-            remedy = f"give metres: divide x and y by {1 / unit:g} (of a table: --pose-unit {short})"
+            action = f"divide x and y by {1 / unit:g}" if unit <= 0.01 else f"multiply x and y by {unit:g}"
+            remedy = f"give metres: {action} (of a table: --pose-unit {short})"
             apply = _poses(lambda pose, scale=scale: pose * scale)
             found.append(Correction("pose unit", f"x and y of the poses are in {name}", remedy, apply))
     return found

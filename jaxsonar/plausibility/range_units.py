@@ -58,6 +58,7 @@ _TIME_OF_FLIGHT = REFERENCE_SPEED_OF_SOUND / 2
 _UNITS = (
     (1000.0, "kilometres"),
     (_TIME_OF_FLIGHT, "times of flight in seconds"),
+    (2.0, "half path lengths that were halved again"),
     (0.5, "lengths of the round trip, out and back"),
     (0.3048, "feet"),
     (1e-3 * _TIME_OF_FLIGHT, "times of flight in milliseconds"),
@@ -69,6 +70,7 @@ _UNITS = (
 )
 """Metres per unit, and its name, from the largest one."""
 _ROUND_TRIP = 0.5
+_HALVED = 2.0
 
 
 @dataclass(frozen=True)
@@ -105,13 +107,14 @@ def find_range_unit(ring: Ring, log: Log) -> RangeUnit | None:
     candidates = [unit for unit in _UNITS if SETTINGS.nearest <= most * unit[0] <= SETTINGS.farther * ring.max_range]
     if most < SETTINGS.too_near:
         what = f"{SETTINGS.fits:.0%} of the echoes are nearer than {most * 1000:.2g} mm"
-        candidates = [unit for unit in candidates if unit[0] > 1]
+        candidates = [unit for unit in candidates if unit[0] > _HALVED]
     elif beyond > SETTINGS.beyond:
         what = f"{beyond:.0%} of the echoes are beyond the maximum range of the ring, {ring.max_range:g} m"
         candidates = [unit for unit in candidates if unit[0] < 1]
     else:
         # Units whose values can be within the maximum range.
-        candidates = [unit for unit in candidates if _ROUND_TRIP >= unit[0] >= min(_ROUND_TRIP, 0.3 / most)]
+        least = min(_ROUND_TRIP, 0.3 / most)
+        candidates = [unit for unit in candidates if least <= unit[0] <= _ROUND_TRIP or unit[0] == _HALVED]
         best = _best_by_poses(ring, log, most, candidates)
         if best is None or best.scale == 1.0:
             return None
@@ -194,6 +197,10 @@ def _is_clear(one: Agreement) -> bool:
 
 def _remedy(scale: float) -> str:
     """What to do about ranges in a unit of this many metres."""
+    if scale == _HALVED:
+        return (
+            "give half path lengths in metres: multiply the ranges by 2; check clock and speed of sound of the driver"
+        )
     if scale == _ROUND_TRIP:
         return "give half path lengths in metres: divide the ranges by 2"
     action = f"multiply by {scale:.6g}" if scale not in (0.01, 0.001) else f"divide by {1 / scale:g}"

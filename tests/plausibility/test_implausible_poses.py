@@ -25,6 +25,8 @@ def _poses(change):
 MISTAKES = {
     "millimetres": (_poses(lambda x, y, t: (1e3 * x, 1e3 * y, t)), "pose unit", "x and y of the poses are in millim"),
     "centimetres": (_poses(lambda x, y, t: (100 * x, 100 * y, t)), "pose unit", "x and y of the poses are in centim"),
+    "inches": (_poses(lambda x, y, t: (x / 0.0254, y / 0.0254, t)), "pose unit", "x and y of the poses are in inches"),
+    "feet": (_poses(lambda x, y, t: (x / 0.3048, y / 0.3048, t)), "pose unit", "x and y of the poses are in feet"),
     "degrees": (_poses(lambda x, y, t: (x, y, np.degrees(t) % 360)), "heading unit", "headings are in degrees"),
     "clockwise": (_poses(lambda x, y, t: (x, y, -t)), "heading direction", "headings are clockwise"),
     "compass": (_poses(lambda x, y, t: (x, y, np.pi / 2 - t)), "heading direction", "compass headings"),

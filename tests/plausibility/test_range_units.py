@@ -47,6 +47,15 @@ def test_without_poses_the_maximum_range_decides(name):
     assert str(found.implausibility).startswith("100% of the echoes are beyond the maximum range of the ring, ")
 
 
+@pytest.mark.parametrize("max_range", [2.0, 5.0])
+def test_halved_ranges(max_range):
+    found = find_range_unit(replace(RING, max_range=max_range), scaled(0.5))
+    assert found is not None
+    assert "halved again" in found.implausibility.cause
+    assert "multiply the ranges by 2" in found.implausibility.remedy
+    np.testing.assert_allclose(found.corrected(scaled(0.5)).range, LOG.range)
+
+
 def test_sound_ranges_have_no_unit():
     assert find_range_unit(RING, LOG) is None
     assert find_range_unit(RING, scaled(1.05)) is None
