@@ -75,7 +75,7 @@ def scene_from_groups(ring: Ring, log: Log) -> ReferenceScene:
     # The reflectors of each scan are those of its group, in its own frame.
     group_of_scan, origin = np.full(len(log), -1), np.zeros((len(log), 2))
     for number, rows in enumerate(groups):
-        group_of_scan[rows], origin[rows] = number, log.pose[rows, :2].mean(axis=0)
+        group_of_scan[rows], origin[rows] = number, np.median(log.pose[rows, :2], axis=0)  # as in group_echoes
     group_of_reflector = np.full(len(found.kind), -1)
     group_of_reflector[found.reflector] = group_of_scan[echoes.scan[found.echo]]
     rank = np.arange(len(found.kind)) - np.searchsorted(group_of_reflector, group_of_reflector)
