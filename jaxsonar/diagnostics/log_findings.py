@@ -1,4 +1,7 @@
-"""The log as the health check needs it, and findings about what was removed: marks, held and constant readings."""
+"""The log as the health check needs it, and findings about what was removed: marks, held and constant readings.
+
+Ranges in another unit become metres.
+"""
 
 from typing import NamedTuple
 
@@ -6,6 +9,10 @@ from jaxsonar.diagnostics.findings import Finding
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.plausibility.constant_ranges import range_resolution
 from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
+from jaxsonar.plausibility.implausibility import Implausibility
+from jaxsonar.plausibility.implausible_ring import implausible_ring
+from jaxsonar.plausibility.implausible_stamps import implausible_stamps
+from jaxsonar.plausibility.range_units import find_range_unit
 from jaxsonar.plausibility.robot_echoes import RobotEcho, RobotEchoes, find_robot_echoes, without_robot_echoes
 from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
 from jaxsonar.scans.scan_log import Log
@@ -19,7 +26,7 @@ class CheckedLog(NamedTuple):
     """A log without readings that are no echoes of the surroundings."""
 
     log: Log
-    """Without marks for no echo and without echoes of the robot; old readings have an age."""
+    """In metres, without marks for no echo and without echoes of the robot; old readings have an age."""
     reported: Log
     """The same with the echoes of the robot."""
     findings: tuple[Finding, ...]
@@ -33,7 +40,7 @@ def checked_log(ring: Ring, log: Log) -> CheckedLog:
         ring: the sensors.
         log: the scans, as they were recorded.
     """
-    findings = []
+    findings = [_of_input(one) for one in implausible_stamps(log)]
     if values := find_no_echo_values(log):
         listed = ", ".join(map(str, values))
         exact = " ".join(f"--no-echo {one.value:.6g}" for one in values if not one.sigma)
@@ -63,7 +70,18 @@ def checked_log(ring: Ring, log: Log) -> CheckedLog:
     log = with_ages(log, held)
     robot = find_robot_echoes(ring, log)
     findings += _robot_findings(log, robot)
-    return CheckedLog(without_robot_echoes(log, robot), log, tuple(findings))
+    checked = without_robot_echoes(log, robot)
+    # Nothing is concluded from a ring that is wrong itself.
+    unit = None if any(implausible_ring(ring)) else find_range_unit(ring, checked)
+    if unit is not None:
+        findings.insert(0, _of_input(unit.implausibility))
+        checked, log = unit.corrected(checked), unit.corrected(log)
+    return CheckedLog(checked, log, tuple(findings))
+
+
+def _of_input(found: Implausibility) -> Finding:
+    """The finding about a mistake in the log, with its kind as cause."""
+    return Finding(found.kind, (), f"{found.what}; {found.cause}", _FINDINGS.certain, "", found.remedy)
 
 
 def _robot_findings(log: Log, found: RobotEchoes) -> list[Finding]:
