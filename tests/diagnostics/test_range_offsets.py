@@ -4,10 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from support.driven_logs import driven_log
 from support.health_logs import RING, log_of
 
 from jaxsonar.diagnostics.check_ring import check
-from jaxsonar.diagnostics.range_offsets import remove_gauge_freedom
+from jaxsonar.diagnostics.echo_residuals import predict_and_match
+from jaxsonar.diagnostics.local_scene import scene_from_groups
+from jaxsonar.diagnostics.range_offsets import estimate_offsets, remove_gauge_freedom, stretches_of_scans
 
 
 @pytest.mark.slow
@@ -32,3 +35,21 @@ def test_the_gauge_of_offsets_is_sparse():
     offset, error = remove_gauge_freedom(sparse + modes @ np.array([0.02, -0.01, 0.005]), held, np.ones(24, bool))
     np.testing.assert_allclose(offset, sparse, atol=3e-4)
     assert (error < 2e-3).all()
+
+
+def measured_offsets(ring, log):
+    scene = scene_from_groups(ring, log)
+    return estimate_offsets(predict_and_match(ring, scene, log), ring.count, 0.002, stretches_of_scans(log))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_drift_of_the_poses_is_no_offset(seed):
+    """Drift moves a wall towards the sensors of one side: the errors tell. An offset of 40 mm shows nevertheless."""
+    ring, log = driven_log(seed, 12, 0, scans=200)
+    sound = measured_offsets(ring, log)
+    assert not (np.abs(sound.offset) > 3.5 * sound.error).any()
+    k = int(np.argmax(np.bincount(log.tx, minlength=12)))
+    found = measured_offsets(ring, dataclasses.replace(log, range=log.range + 0.04 * (log.tx == k)))
+    assert found.offset[k] > 3.5 * found.error[k]
+    others = np.arange(12) != k
+    assert not (np.abs(found.offset) > 3.5 * found.error)[others].any()
