@@ -148,6 +148,7 @@ def open_manifest(folder: str | os.PathLike[str], run: Record) -> Iterator[Manif
         SonarError: a folder that cannot be written to, holds something else, or is in use by another process.
     """
     folder = Path(folder)
+    is_new = not folder.exists()
     make_folder(folder)
     if (folder / STAGING_NAME).is_symlink():
         raise SonarError(f"{shown(folder / STAGING_NAME)}: a symbolic link came; allowed is a folder of the batch")
@@ -170,6 +171,13 @@ def open_manifest(folder: str | os.PathLike[str], run: Record) -> Iterator[Manif
         manifest = Manifest(folder, run, records)
         try:
             yield manifest
+        except SonarError:
+            manifest.close()
+            if is_new and not manifest.shards:  # refused before the first result
+                (folder / MANIFEST_NAME).unlink(missing_ok=True)
+                for left in (folder / STAGING_NAME, *(folder / name for name in TABLES), folder):
+                    _remove(left)
+            raise
         finally:
             manifest.close()
             _remove(folder / STAGING_NAME)

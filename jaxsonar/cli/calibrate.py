@@ -4,7 +4,8 @@ import argparse
 
 from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, finite, noise
 from jaxsonar.cli.console import ascii_name, errors_in, print_status, step_status, write_figure
-from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_all_inputs, nothing_used
+from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_all_inputs, nothing_used
+from jaxsonar.hardware.errors import SonarError
 
 SUMMARY = "Calibrate a ring from ordinary scans of an unknown room."
 
@@ -56,13 +57,17 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.fileio.atomic_files import check_outputs
 
     check_outputs({"-o": options.output, "--figure": options.figure}, [*options.logs, options.ring])
-    ring, logs = load_all_inputs(options, options.logs)
+    messages = InputMessages(strict=options.strict)
+    ring, logs = load_all_inputs(options, options.logs, messages=messages)
     unused = [nothing_used(ring, log, name) for log, name in zip(logs, options.logs, strict=True)]
     if all(unused):
         return 1
     choices = {key: getattr(options, key) for key in ("free", "poses", "odometry", "temperature", "sigma", "window")}
     with errors_in(", ".join(ascii_name(log) for log in options.logs)), step_status() as step:
-        calibration = calibrate_ring(ring, logs, **choices, on_step=step)
+        try:
+            calibration = calibrate_ring(ring, logs, **choices, on_step=step)
+        except SonarError as error:
+            raise SonarError(_shortened(str(error), messages.warnings)) from None
     figure = None
     if options.figure:
         from jaxsonar.reports.plot_calibration import calibration_figure
@@ -73,3 +78,9 @@ def run(options: argparse.Namespace) -> int:
     for line in calibration.summary():
         print_status(line)
     return 0
+
+
+def _shortened(error: str, warnings: list[str]) -> str:
+    """An error that refers to a warning that was printed instead of repeating it."""
+    repeated = next((one for one in warnings if one in error), "")
+    return error.replace(repeated, f"{repeated.split('; ')[1]}: see the warning") if repeated else error

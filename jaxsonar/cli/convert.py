@@ -45,6 +45,7 @@ def run(options: argparse.Namespace) -> int:
     log = read_log(options.source, options, messages, ring=ring)
     if count := unmarked_paths(log):
         messages.warn(_without_ring(count) if ring is None and _is_raw(options) else unmarked_warning(count))
+    messages.warn_of_stamps(log)
     messages.check()
     if not len(log):
         print_status(f"nothing converted: {shown(options.source)}: no scan: the log is empty")

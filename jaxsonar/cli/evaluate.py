@@ -4,6 +4,7 @@ import argparse
 
 from jaxsonar.cli.arguments import filename, finite
 from jaxsonar.cli.console import print_tables, write_json
+from jaxsonar.cli.inputs import InputMessages, add_strict
 
 SUMMARY = "Compare a map with a reference: deviations, precision, recall."
 
@@ -31,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--json", type=filename, metavar="FILE", help="the same figures as JSON; - = stdout instead of the table"
     )
+    add_strict(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -43,9 +45,14 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.reports.terminal_tables import evaluation_table
 
     check_outputs({"--json": options.json}, [options.map, options.reference])
+    messages = InputMessages(strict=options.strict)
+    walls, reference = load_walls(options.map), load_walls(options.reference)
+    messages.warn_of_walls(options.map, walls)
+    messages.warn_of_walls(options.reference, reference)
+    messages.check()
     evaluation = evaluate_map(
-        load_walls(options.map),
-        load_walls(options.reference),
+        walls,
+        reference,
         gate_distance=options.gate,
         gate_angle=float(np.radians(options.gate_deg)),
     )

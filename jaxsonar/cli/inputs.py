@@ -156,8 +156,8 @@ class InputMessages:
     def __init__(self, *, strict: bool):
         self.strict = strict
         """Whether a warning ends the command."""
-        self.warnings = 0
-        """Number of warnings so far."""
+        self.warnings: list[str] = []
+        """The warnings so far."""
 
     def note(self, text: str) -> None:
         """Print a note; one that begins with ``warning:`` is a warning."""
@@ -168,7 +168,7 @@ class InputMessages:
 
     def warn(self, text: str) -> None:
         """Print a warning: what, likely cause, what to do."""
-        self.warnings += 1
+        self.warnings.append(text)
         print_status(f"warning: {text}")
 
     def warn_of_noise(self, sigma: float | None = None, **errors: float | None) -> None:
@@ -192,6 +192,21 @@ class InputMessages:
         for one in found:
             self.warn(str(one))
 
+    def warn_of_walls(self, name: str, walls: "np.ndarray") -> None:
+        """Warn of probable mistakes in the walls of a map or a reference."""
+        from jaxsonar.fileio.atomic_files import shown
+        from jaxsonar.plausibility.implausible_room import implausible_walls
+
+        for found in implausible_walls(walls):
+            self.warn(f"{shown(name)}: {found}")
+
+    def warn_of_stamps(self, log: "Log") -> None:
+        """Warn of probable mistakes in the stamps of a log."""
+        from jaxsonar.plausibility.implausible_stamps import implausible_stamps
+
+        for found in implausible_stamps(log):
+            self.warn(str(found))
+
     def check(self) -> None:
         """Check that there was no warning, if there must be none.
 
@@ -199,7 +214,9 @@ class InputMessages:
             SonarError: there was one, and the command is strict.
         """
         if self.strict and self.warnings:
-            raise SonarError(f"--strict: {plural(self.warnings, 'warning')} came; allowed is input without warnings")
+            raise SonarError(
+                f"--strict: {plural(len(self.warnings), 'warning')} came; allowed is input without warnings"
+            )
 
 
 def load_inputs(

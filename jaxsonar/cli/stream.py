@@ -186,7 +186,7 @@ class StatusLine:
         """Print a link event; called in the reading thread."""
         self._write(event.text)
         if event.text.startswith("warning: "):
-            self._messages.warnings += 1
+            self._messages.warnings.append(event.text.removeprefix("warning: "))
             if self._messages.strict and self.stop is not None:
                 self.stop.set()
 

@@ -99,14 +99,21 @@ def implausible_room(room: Room, points: Float[np.ndarray, "poses 2"] | None = N
         points: world positions of a robot that drives there, metres; without NaN. None: unknown.
     """
     yield from _implausible_columns(room)
-    if not len(room.walls):
+    yield from implausible_walls(room.walls, points)
+
+
+def implausible_walls(
+    walls: Float[np.ndarray, "walls 2 2"], points: Float[np.ndarray, "poses 2"] | None = None
+) -> Iterator[Implausibility]:
+    """Probable mistakes of walls, as ``implausible_room``; ``walls`` are both ends of each, metres."""
+    if not len(walls):
         return
-    ends = room.walls.reshape(-1, 2)
+    ends = walls.reshape(-1, 2)
     low, high = ends.min(axis=0), ends.max(axis=0)
     width, depth = high - low
     size = max(width, depth)
     what = f"the room is {width:.4g} m x {depth:.4g} m"
-    wall = float(np.median(lengths(room.walls)))
+    wall = float(np.median(lengths(walls)))
     if size > ROOM_SETTINGS.large and wall > ROOM_SETTINGS.long_wall:
         millimetres = wall > ROOM_SETTINGS.millimetres
         if millimetres or size > ROOM_SETTINGS.hall or _shows_centimetres(points, low, high):

@@ -199,7 +199,7 @@ def _remedy(scale: float) -> str:
     """What to do about ranges in a unit of this many metres."""
     if scale == _HALVED:
         return (
-            "give half path lengths in metres: multiply the ranges by 2; check clock and speed of sound of the driver"
+            "give half path lengths in metres: multiply the ranges by 2"
         )
     if scale == _ROUND_TRIP:
         return "give half path lengths in metres: divide the ranges by 2"

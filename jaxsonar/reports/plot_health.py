@@ -57,7 +57,7 @@ def _draw_residuals(axes: Axes, health: Health) -> None:
     axes.errorbar(
         has_offset + 0.3,
         1e3 * health.offset[has_offset],
-        2e3 * health.offset_error[has_offset],
+        1e3 * health.offset_error[has_offset],
         fmt="o",
         color=ROBOT_COLOR,
         ms=3,
@@ -71,13 +71,15 @@ def _draw_residuals(axes: Axes, health: Health) -> None:
     axes.tick_params(labelbottom=False)
     handles = [
         Line2D([], [], color=DIRECT_COLOR, marker="_", ls="", ms=9, mew=2, label="median, quartiles, 5–95 %"),
-        Line2D([], [], color=ROBOT_COLOR, marker="o", ms=3, lw=1, label="offset ± 2 standard errors"),
+        Line2D([], [], color=ROBOT_COLOR, marker="o", ms=3, lw=1, label="offset ± standard error"),
     ]
     if len(faulty):
         handles.append(Line2D([], [], color=LINE_COLOR, marker="o", ls="", label="finding"))
     if len(has_median):
-        limit = max(1.0, float(np.abs([low, high]).max()), float(np.nanmax(1e3 * np.abs(health.offset), initial=0)))
-        axes.set_ylim(-1.1 * limit, 1.5 * limit)
+        reach = 1e3 * (np.abs(health.offset) + np.nan_to_num(health.offset_error))[has_offset]
+        limit = max(1.0, float(np.abs([low, high]).max()), float(np.max(reach, initial=0.0)))
+        axes.set_ylim(-1.1 * limit, 1.6 * limit)  # the legend is above all bars
+        _mark_blanks(axes, np.setdiff1d(np.arange(health.ring.count), [*has_median, *has_offset]), 0.0)
         axes.legend(handles=handles, loc="upper right", ncols=3, fontsize=8)
     else:
         _write_no_data(axes)
@@ -105,6 +107,8 @@ def _draw_detection_rate(axes: Axes, health: Health) -> None:
         if remark:
             axes.axvspan(k - 0.5, k + 0.5, color=LINE_COLOR, alpha=0.12, lw=0)
     if drawn:
+        expected = np.sum([column[3] for column in drawn], axis=0)
+        _mark_blanks(axes, np.flatnonzero(expected == 0), 3.0)
         axes.legend(loc="upper right", ncols=3, fontsize=8)
     else:
         _write_no_data(axes)
@@ -189,6 +193,13 @@ def _write_findings(axes: Axes, health: Health) -> None:
         lines = [*lines[: _MAX_LINES - 1], f"… and more: {len(health.findings)} findings in all"]
     color = LINE_COLOR if health.findings else ROBOT_COLOR
     axes.text(0, 1, "\n".join(lines), va="top", fontsize=9, color=color, parse_math=False, transform=axes.transAxes)
+
+
+def _mark_blanks(axes: Axes, sensors: np.ndarray, height: float) -> None:
+    """Write for each sensor without data that it has none."""
+    for k in sensors:
+        vertical = "bottom" if height else "center"
+        axes.text(k, height, "no data", rotation=90, ha="center", va=vertical, fontsize=6.5, color=ROBOT_COLOR)
 
 
 def _write_no_data(axes: Axes) -> None:

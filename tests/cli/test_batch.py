@@ -180,3 +180,11 @@ def test_an_unfinished_recording_is_read_up_to_its_last_complete_scan(tmp_path):
     (tmp_path / "log.csv.recording").write_text(f"{len(GOOD):20d}\n")
     assert len(parts_of(tmp_path / "log.csv", tmp_path)) == 20
     assert [one.source for one in find_inputs([tmp_path])] == ["log.csv"]
+
+
+def test_a_batch_that_a_warning_stops_leaves_nothing(here, capsys):
+    backwards = GOOD + "20,3.0,0,0,0,3,3,1.0\n"
+    (here / "backwards.csv").write_text(backwards)
+    assert call("batch", "backwards.csv", "--ring", "faw", "-o", "out", "--strict") == 2
+    assert "the stamps run backwards" in capsys.readouterr().err
+    assert not (here / "out").exists()

@@ -41,3 +41,12 @@ def test_a_raw_recording_without_its_ring_is_a_warning(tmp_path, capsys):
     log.unlink()
     assert call("convert", raw, log, "--strict") == 2
     assert not log.exists()
+
+
+def test_stamps_in_milliseconds_are_a_warning_and_strictly_an_error(tmp_path, capsys):
+    rows = "".join(f"{k},{100 * k},{0.02 * k},0,0,0,0,1.5\n" for k in range(20))
+    (tmp_path / "log.csv").write_text("scan,stamp,x,y,theta,tx,rx,range\n" + rows)
+    assert call("convert", tmp_path / "log.csv", tmp_path / "out.csv") == 0
+    assert "the stamps are probably milliseconds" in capsys.readouterr().err
+    assert call("convert", tmp_path / "log.csv", tmp_path / "strict.csv", "--strict") == 2
+    assert not (tmp_path / "strict.csv").exists()

@@ -19,7 +19,7 @@ from support.recordings import recorded, write_corridor8_laser
 from jaxsonar import load_log
 from jaxsonar.detection import extract as local
 from jaxsonar.evaluation import laser_reference_map as reference
-from jaxsonar.fileio.geojson import feature
+from jaxsonar.fileio.geojson import feature, write_features
 
 NUMBERS = ("rho", "theta", "sigma_rho", "sigma_theta")
 
@@ -435,3 +435,14 @@ def test_results_to_files_need_no_standard_output(here, monkeypatch):
     monkeypatch.setattr(sys, "stdout", None)  # as Python starts under `>&-`
     assert call(*REFERENCE.split(), "--scan", "0") == 0
     assert features("out.geojson")
+
+
+def test_a_reference_in_millimetres_is_a_warning_and_strictly_an_error(tmp_path, capsys):
+    for name, scale in (("room", 1), ("mm", 1000)):
+        wall = [[0, 0], [6 * scale, 0], [6 * scale, 4 * scale]]
+        write_features([feature("LineString", wall, kind="wall")], tmp_path / f"{name}.geojson")
+    arguments = ("evaluate", tmp_path / "room.geojson", tmp_path / "mm.geojson")
+    assert call(*arguments) == 0
+    assert "mm.geojson: the room is 6000 m x 4000 m" in capsys.readouterr().err
+    assert call(*arguments, "--strict") == 2
+    assert call("evaluate", tmp_path / "room.geojson", tmp_path / "room.geojson", "--strict") == 0
