@@ -139,10 +139,9 @@ def check(
             apart = detect(_without_sensors(renumbered, np.append(place[accepted], k)))
             table = predict_and_match(ring, apart, renumbered)
             again = sensor_alternatives(table, np.asarray(ring.beam) / 2, noise, ring.max_range)[k]
-            # A wall that only this sensor hears is missing now: lost echoes must show in both ways.
+            # A wall that only this sensor hears is missing now: a fault must show with and without its own echoes.
             given = alternatives[k]
-            is_lost_in_both = given is not None and again is not None and not (given.is_moved or again.is_moved)
-            alternatives[k] = again if is_lost_in_both or (again is not None and again.is_moved) else None
+            alternatives[k] = again if given is not None and again is not None and given.cause == again.cause else None
         faced = found.expected[place, 0]
         if source and not measured.any.all() and not measured.certain:  # silent, or not measured?
             faced = faced_walls(ring, renumbered, scene)[place]
