@@ -198,9 +198,7 @@ def _is_clear(one: Agreement) -> bool:
 def _remedy(scale: float) -> str:
     """What to do about ranges in a unit of this many metres."""
     if scale == _HALVED:
-        return (
-            "give half path lengths in metres: multiply the ranges by 2"
-        )
+        return "give half path lengths in metres: multiply the ranges by 2"
     if scale == _ROUND_TRIP:
         return "give half path lengths in metres: divide the ranges by 2"
     action = f"multiply by {scale:.6g}" if scale not in (0.01, 0.001) else f"divide by {1 / scale:g}"
