@@ -1,9 +1,11 @@
 """The log as the health check needs it, and findings about what was removed: marks, held and constant readings.
 
-Ranges in another unit become metres.
+Ranges in another unit become metres if the poses tell the unit.
 """
 
 from typing import NamedTuple
+
+import numpy as np
 
 from jaxsonar.diagnostics.findings import Finding
 from jaxsonar.diagnostics.settings import SETTINGS
@@ -26,7 +28,7 @@ class CheckedLog(NamedTuple):
     """A log without readings that are no echoes of the surroundings."""
 
     log: Log
-    """In metres, without marks for no echo and without echoes of the robot; old readings have an age."""
+    """Without marks for no echo and without echoes of the robot; old readings have an age."""
     reported: Log
     """The same with the echoes of the robot."""
     findings: tuple[Finding, ...]
@@ -74,14 +76,16 @@ def checked_log(ring: Ring, log: Log) -> CheckedLog:
     # Nothing is concluded from a ring that is wrong itself.
     unit = None if any(implausible_ring(ring)) else find_range_unit(ring, checked)
     if unit is not None:
-        findings.insert(0, _of_input(unit.implausibility))
-        checked, log = unit.corrected(checked), unit.corrected(log)
+        by_poses = bool(np.isfinite(unit.share))
+        findings.insert(0, _of_input(unit.implausibility, _FINDINGS.certain if by_poses else 0.5))
+        if by_poses:
+            checked, log = unit.corrected(checked), unit.corrected(log)
     return CheckedLog(checked, log, tuple(findings))
 
 
-def _of_input(found: Implausibility) -> Finding:
+def _of_input(found: Implausibility, confidence: float = _FINDINGS.certain) -> Finding:
     """The finding about a mistake in the log, with its kind as cause."""
-    return Finding(found.kind, (), f"{found.what}; {found.cause}", _FINDINGS.certain, "", found.remedy)
+    return Finding(found.kind, (), f"{found.what}; {found.cause}", confidence, "", found.remedy)
 
 
 def _robot_findings(log: Log, found: RobotEchoes) -> list[Finding]:
