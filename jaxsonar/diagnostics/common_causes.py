@@ -48,19 +48,27 @@ class CommonCauseSettings:
     lag_errors: float = 5.0
     """A time offset must be this many standard errors, ..."""
     min_nats: float = 20.0
-    """... and raise the log-likelihood by this, nats."""
+    """... and raise the log-likelihood by this, nats, ..."""
+    nats_per_echo: float = 0.2
+    """... and by this for each echo."""
+    min_groups: tuple[float, float] = (3.0, 2.0)
+    """Groups of scans that scale and time offset must rest on."""
+    scale_nats: float = 3.5
+    """Evidence from which on a scale error is reported, nats."""
+    scale_starts: tuple[float, ...] = (-0.5, 1.0)
+    """Scale errors that are tried (one way instead of both, or the reverse) ..."""
+    badly_explained: float = 0.75
+    """... if less than this share of the echoes is explained, ..."""
+    large_scale: float = 0.2
+    """From this scale error on it must explain more echoes than none, ..."""
+    clearly_more: float = 1.1
+    """... by this factor."""
     searches: int = 3
     """Searches for a time offset, each around the last estimate."""
     odometry_scale: float = 0.003
     """Standard deviation of the scale of odometry, which has the same effect as the scale of the ranges."""
     min_scale: float = 0.018
     """Smaller errors of the scale are not reported: 10 K of the air's temperature, or odometry."""
-    scale_errors: float = 3.0
-    """A scale error must be this many standard errors, ..."""
-    vague_scale: float = 0.02
-    """... or, if a standard error is larger than this, ..."""
-    vague_scale_errors: float = 5.0
-    """... this many."""
     air: tuple[float, float] = (312.0, 360.5)
     """Speeds of sound in air of -31 to 50 deg C, m/s."""
     noise_ratio: float = 2.5
@@ -106,13 +114,13 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
     part, groups = part_of_groups(log, select_groups(log))
     if groups:
         echoes, step = group_echoes(ring, part, groups), search_step(part)
-        fit = _search_motion(ring, part, groups, echoes, step)
+        fit = _with_other_scale(echoes, _search_motion(ring, part, groups, echoes, step))
         if fit is not None and fit.explained < SETTINGS.min_explained * fit.echoes:
             fit = None
         if fit is not None and (found := _lag_finding(echoes, fit, step)) is not None:
             findings.append(found)
             log = with_later_poses(log, float(fit.estimate[LAG]))
-        if fit is not None and (found := _scale_finding(ring, fit)) is not None:
+        if fit is not None and (found := _scale_finding(ring, echoes, fit)) is not None:
             findings.append(found)
             log = replace(log, range=log.range / (1 + fit.estimate[SCALE]))
     measured = range_noise(ring, log)
@@ -125,10 +133,14 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
 def _lag_finding(echoes: PosedEchoes, fit: MotionFit, step: float) -> Finding | None:
     """The finding about a time offset; None if there is none."""
     lag, error = float(fit.estimate[LAG]), float(fit.error[LAG])
+    if fit.groups[LAG] < SETTINGS.min_groups[LAG]:
+        return None
     if not abs(lag) > max(SETTINGS.min_lag, SETTINGS.lag_steps * step, SETTINGS.lag_errors * error):
         return None
     without = fit_motion(echoes, free=(True, False))
-    if without is None or (nats := fit.log_likelihood - without.log_likelihood) < SETTINGS.min_nats:
+    if without is None or (nats := fit.log_likelihood - without.log_likelihood) < max(
+        SETTINGS.min_nats, SETTINGS.nats_per_echo * fit.echoes
+    ):
         return None
     return Finding(
         "time offset",
@@ -142,15 +154,29 @@ def _lag_finding(echoes: PosedEchoes, fit: MotionFit, step: float) -> Finding | 
     )
 
 
-def _scale_finding(ring: Ring, fit: MotionFit) -> Finding | None:
+def _scale_finding(ring: Ring, echoes: PosedEchoes, fit: MotionFit) -> Finding | None:
     """The finding about the scale of the ranges; None if it is right."""
-    scale, error = float(fit.estimate[SCALE]), float(np.hypot(fit.error[SCALE], SETTINGS.odometry_scale))
-    least = SETTINGS.scale_errors if error < SETTINGS.vague_scale else SETTINGS.vague_scale_errors
-    if not abs(scale) > max(SETTINGS.min_scale, least * error):  # also if it is NaN
+    scale, groups = float(fit.estimate[SCALE]), float(fit.groups[SCALE])
+    if not abs(scale) > SETTINGS.min_scale or groups < SETTINGS.min_groups[SCALE]:  # also if it is NaN
+        return None
+    lag = float(fit.estimate[LAG]) if np.isfinite(fit.estimate[LAG]) else 0.0
+    without = fit_motion(echoes, lag=lag, free=(False, True))
+    if without is None:
+        return None
+    # Odometry that swings while the robot drives straight on looks like motion that the ranges do not show.
+    bias = without.strain / fit.information
+    if abs(scale) > SETTINGS.large_scale:
+        if fit.explained < SETTINGS.clearly_more * without.explained:
+            return None
+        bias = max(bias - scale**2, 0.0)
+    error = float(np.linalg.norm([fit.error[SCALE], SETTINGS.odometry_scale, bias]))
+    # Student's distribution: the standard error comes from the scatter of a few groups.
+    nats = groups / 2 * float(np.log1p((scale / error) ** 2 / (groups - 1)))
+    if nats < SETTINGS.scale_nats:
         return None
     speed = float(ring.speed_of_sound) / (1 + scale)
     size = f"{100 * abs(scale):.1f} ± {100 * error:.1f} % too {'long' if scale > 0 else 'short'}"
-    confidence = confidence_of((scale / error) ** 2 / 2)
+    confidence = confidence_of(nats)
     other, more = f"{100 * abs(scale):.1f} % too {'short' if scale > 0 else 'long'}", "more" if scale > 0 else "less"
     evidence = (
         f"while the robot moves, the ranges of {fit.explained} echoes change by that much {more} than its motion, "
@@ -207,6 +233,16 @@ def _mistake_finding(found: Alternative) -> Finding:
         f"{found.given.mean_support:.0%}{rival}",
         "; ".join(one.remedy for one in found.corrections),
     )
+
+
+def _with_other_scale(echoes: PosedEchoes, fit: MotionFit | None) -> MotionFit | None:
+    """The fit, or one of a very different scale that explains clearly more."""
+    if fit is None or fit.explained > SETTINGS.badly_explained * fit.echoes:
+        return fit
+    lag = float(fit.estimate[LAG]) if np.isfinite(fit.estimate[LAG]) else 0.0
+    others = [fit_motion(echoes, scale=scale, lag=lag) for scale in SETTINGS.scale_starts]
+    best = max((one for one in others if one is not None), key=lambda one: one.log_likelihood, default=fit)
+    return best if best.log_likelihood > SETTINGS.clearly_more * fit.log_likelihood else fit
 
 
 def _jump_finding(found: Implausibility) -> Finding:

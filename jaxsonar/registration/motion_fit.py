@@ -31,6 +31,10 @@ class MotionFitSettings:
     """Half the time over which the motion of the robot is differentiated, seconds."""
     prior_information: float = 1e-2
     """Added to the information of walls, points and poses."""
+    most_fitted: float = 0.5
+    """Largest share of the degrees of freedom that walls, points and poses take from the residuals."""
+    min_noise: float = 0.002
+    """Least standard deviation of the ranges, metres."""
     first_noise: float = 0.02
     """Standard deviation of the residuals at the beginning, metres."""
     odometry: tuple[float, float] = (0.01, float(np.radians(0.5)))
@@ -59,6 +63,12 @@ class MotionFit:
     seconds. NaN where it cannot be estimated."""
     error: Float[np.ndarray, " 2"]
     """Standard errors, from the noise, the odometry, and the scatter between groups of scans."""
+    groups: Float[np.ndarray, " 2"]
+    """Number of groups of scans that the estimates rest on, each counted by its share of the information."""
+    information: float
+    """Information about the scale if the errors of the poses were as assumed: the inverse of its variance."""
+    strain: float
+    """Weighted sum of squares of the corrections of the poses."""
     noise: float
     """Robust standard deviation of the residuals, metres."""
     explained: int
@@ -74,18 +84,21 @@ class MotionFit:
         return self.explained * float(np.log(self.max_range / (self.noise * np.sqrt(2 * np.pi * np.e))))
 
 
-def fit_motion(groups: PosedEchoes, *, lag: float = 0.0, free: tuple[bool, bool] = (True, True)) -> MotionFit | None:
+def fit_motion(
+    groups: PosedEchoes, *, scale: float = 0.0, lag: float = 0.0, free: tuple[bool, bool] = (True, True)
+) -> MotionFit | None:
     """Estimate the scale of the ranges and the time offset between echoes and poses.
 
     Args:
         groups: echoes of groups of scans.
-        lag: time offset at which the search begins, seconds.
-        free: whether each of the two is estimated; the others stay 0 and ``lag``.
+        scale: scale error at which the search begins.
+        lag: time offset at which it begins, seconds.
+        free: whether each of the two is estimated; the others stay ``scale`` and ``lag``.
 
     Returns:
         The estimates; None if there are too few groups with walls.
     """
-    value, fit, everything = np.array([0.0, lag]), None, np.arange(len(groups.path))
+    value, fit, everything = np.array([scale, lag]), None, np.arange(len(groups.path))
     for _ in range(SETTINGS.rounds):
         found = find_reflectors(
             replace(groups, range=groups.range / (1 + value[SCALE])), groups.poses_after(value[LAG], everything)
@@ -112,11 +125,17 @@ def _solve(
             part.move(step)
         value += step
         residual = np.concatenate([part.residual(value) for part in parts])
-        noise = residual_noise(residual)
-    explained = int((biweight(residual, noise) > 0).sum())
+        # Reflectors and poses adapt to the noise: the residuals are smaller than it.
+        left = 1 - min(sum(part.fitted for part in parts) / len(residual), SETTINGS.most_fitted)
+        noise = max(residual_noise(residual) / np.sqrt(left), SETTINGS.min_noise)
+    scatter = residual_noise(residual)
+    explained = int((biweight(residual, scatter) > 0).sum())
     information, gradient = (np.array(one) for one in zip(*reduced, strict=True))
-    estimate, error = _errors(information, gradient, value, free)
-    return MotionFit(estimate, error, noise, explained, len(groups.path), groups.ring.max_range)
+    strain = sum(part.strain for part in parts)
+    estimate, error, count = _errors(information, gradient, value, free)
+    known = _scale_information(information, free)
+    max_range = groups.ring.max_range
+    return MotionFit(estimate, error, count, known, strain, scatter, explained, len(groups.path), max_range)
 
 
 class _Part:
@@ -133,11 +152,17 @@ class _Part:
         rows, first, self.scan = np.unique(groups.scan[self.echo], return_index=True, return_inverse=True)
         self.correction = np.zeros((len(rows), 3))
         self.prior = _odometry_information(groups.pose[self.echo[first]])
+        self.fitted = 0.0
         self.system: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def residual(self, value: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " echoes"]:
         """Measured minus predicted ranges, metres."""
         return self.measured - (1 + value[SCALE]) * self._predict(value[LAG])[0].range
+
+    @property
+    def strain(self) -> float:
+        """Weighted sum of squares of the corrections of the poses."""
+        return float(self.correction.ravel() @ self.prior @ self.correction.ravel())
 
     def _predict(self, lag: float) -> tuple[PredictedRange, Float[np.ndarray, "echoes 3"]]:
         pose = self.groups.poses_after(lag, self.echo) + self.correction[self.scan]
@@ -170,11 +195,13 @@ class _Part:
             jacobian[:, poses + landmarks + LAG] = factor * change / (2 * step)
         information = jacobian.T @ (weight[:, None] * jacobian)
         gradient = jacobian.T @ (weight * residual)
+        own, rest = slice(0, poses + landmarks), slice(poses + landmarks, None)
+        data = information[own, own].copy()
         information[:poses, :poses] += self.prior
         gradient[:poses] -= self.prior @ self.correction.ravel()
-        own, rest = slice(0, poses + landmarks), slice(poses + landmarks, None)
         information[own, own] += SETTINGS.prior_information * np.eye(poses + landmarks)
         cov = np.linalg.inv(information[own, own])
+        self.fitted = float((cov * data).sum())
         coupling = information[own, rest]
         self.system = cov, coupling, gradient[own]
         return information[rest, rest] - coupling.T @ cov @ coupling, gradient[rest] - coupling.T @ cov @ gradient[own]
@@ -219,21 +246,35 @@ def _solution(
     return np.clip(step, -np.array(SETTINGS.largest_step), SETTINGS.largest_step)
 
 
+def _scale_information(information: Float[np.ndarray, "groups 2 2"], free: Bool[np.ndarray, " 2"]) -> float:
+    """Information about the scale, whether it is free or not."""
+    total = information.sum(axis=0)
+    shared = total[SCALE, LAG] ** 2 / total[LAG, LAG] if free[LAG] and total[LAG, LAG] > 0 else 0.0
+    return float(total[SCALE, SCALE] - shared)
+
+
 def _errors(
     information: Float[np.ndarray, "groups 2 2"],
     gradient: Float[np.ndarray, "groups 2"],
     value: Float[np.ndarray, " 2"],
     free: Bool[np.ndarray, " 2"],
-) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
-    """Estimates and standard errors; NaN where not observable.
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
+    """Estimates, standard errors, and the number of groups that they rest on; NaN where not observable.
 
-    The errors of the least squares grow if the groups contradict each other more than these errors allow (Birge ratio).
+    Errors of the poses are common to a group. The groups are therefore the independent observations: the standard
+    errors are the larger ones of the least squares and of the jackknife, which leaves out one group after the other.
     """
-    total, of_group = information.sum(axis=0), np.diagonal(information, axis1=1, axis2=2)
+    total = information.sum(axis=0)
     known = np.diag(total) > SETTINGS.min_information
-    which, error = np.flatnonzero(free & known), np.zeros(2)
-    error[which] = np.sqrt(np.diag(np.linalg.inv(total[np.ix_(which, which)])))
-    pull = np.divide(gradient**2, of_group, out=np.zeros_like(gradient), where=of_group > SETTINGS.min_information)
-    dispersion = pull.sum(axis=0) / max(len(information) - 1, 1)
-    error *= np.sqrt(np.maximum(dispersion, 1))
-    return np.where(known | ~free, value, np.nan), np.where(known | ~free, error, np.nan)
+    which, error, groups = np.flatnonzero(free & known), np.zeros(2), np.full(2, np.inf)
+    if len(which):
+        own, pull = information[:, which[:, None], which], gradient[:, which]
+        cov = np.linalg.inv(total[np.ix_(which, which)])
+        rest = total[np.ix_(which, which)] - own + 1e-9 * np.eye(len(which))
+        without = np.linalg.solve(rest, (pull.sum(axis=0) - pull)[..., None])[..., 0]
+        spread = ((without - without.mean(axis=0)) ** 2).sum(axis=0) * (1 - 1 / len(own))
+        error[which] = np.sqrt(np.maximum(np.diag(cov), spread))
+        share = np.einsum("ij,gji->gi", cov, own)
+        groups[which] = 1 / np.maximum((share**2).sum(axis=0), 1e-12)
+    absent = free & ~known
+    return np.where(absent, np.nan, value), np.where(absent, np.nan, error), np.where(absent, 0, groups)
