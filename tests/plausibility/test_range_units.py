@@ -47,7 +47,7 @@ def test_without_poses_the_maximum_range_decides(name):
     assert str(found.implausibility).startswith("100% of the echoes are beyond the maximum range of the ring, ")
 
 
-@pytest.mark.parametrize("max_range", [2.0, 5.0])
+@pytest.mark.parametrize("max_range", [3.5, 5.0])
 def test_halved_ranges(max_range):
     found = find_range_unit(replace(RING, max_range=max_range), scaled(0.5))
     assert found is not None
