@@ -8,6 +8,7 @@ from support.wandering_robot import RING, log_of, ranges, trajectory
 
 from jaxsonar.diagnostics.common_causes import find_common_causes
 from jaxsonar.geometry.se2 import rotate, subtract_poses
+from jaxsonar.simulation.wheel_odometry import simulate_odometry
 
 POSE = trajectory(180)
 
@@ -140,3 +141,14 @@ def test_a_restart_of_the_odometry_is_named(sound):
     found = find_common_causes(RING, with_poses(sound, pose))
     assert causes(found) == ["odometry jump"]
     assert "scan 90" in found.findings[0].sentence
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_in_a_corridor_drifting_odometry_does_not_tell_the_scale(seed):
+    """Only the odometry swings: the walls beside the robot stay where they are."""
+    true = np.column_stack([0.1 * np.arange(120), np.full(120, 0.1), np.zeros(120)])
+    reported = np.full((len(true), RING.count), np.nan)
+    reported[:, 3], reported[:, 9] = 0.7, 0.9  # the sensors to the left and to the right
+    reported += 0.003 * np.random.default_rng(seed).standard_normal(reported.shape)
+    odometry = simulate_odometry(true, distance=0.02, turn=0.02, seed=seed)
+    assert not find_common_causes(RING, log_of(reported, odometry)).findings

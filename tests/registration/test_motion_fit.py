@@ -73,3 +73,13 @@ def test_a_fixed_parameter_keeps_its_value(log):
 def test_too_few_groups_give_no_estimate(log):
     assert fit_motion(echoes_of(log[:20])) is None
     assert fit_motion(echoes_of(dataclasses.replace(log, pose=np.full_like(log.pose, np.nan)))) is None
+
+
+@pytest.mark.parametrize("size", [2e4, 1e15])
+def test_a_glitch_of_a_pose_costs_its_own_echoes_alone(log, size):
+    pose = log.pose.copy()
+    pose[90, 0] += size
+    echoes = group_echoes(RING, dataclasses.replace(log, pose=pose), select_groups(log))
+    assert 0 < len(echoes.path) <= len(echoes_of(log).path)
+    assert np.abs(echoes.pose[:, :2]).max() < 10
+    assert len(find_reflectors(echoes, echoes.pose).kind) > 10
