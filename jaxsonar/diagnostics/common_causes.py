@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxsonar.diagnostics.findings import Finding, confidence_of
+from jaxsonar.diagnostics.repeated_ranges import repeated_scans
 from jaxsonar.diagnostics.time_offset import search_step, search_time_offsets, with_later_poses
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.plausibility.alternatives import Alternative, find_mistakes
@@ -112,7 +113,9 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
     findings += [_jump_finding(one) for one in implausible_odometry(ring, log)]
     # Only the scans of some groups are compared: the rest of a long log costs nothing.
     part, groups = part_of_groups(log, select_groups(log))
-    if groups:
+    if (repeated := repeated_scans(log)) is not None:
+        findings.append(repeated)
+    elif groups:
         echoes, step = group_echoes(ring, part, groups), search_step(part)
         fit = _with_other_scale(echoes, _search_motion(ring, part, groups, echoes, step))
         if fit is not None and fit.explained < SETTINGS.min_explained * fit.echoes:

@@ -1,11 +1,14 @@
-"""Ranges that a sensor reports again and again: fractions of repeated and of identical ranges."""
+"""Ranges that a sensor, or the whole driver, reports again and again."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxsonar.diagnostics.findings import Finding
 from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.scans.readings import is_repeated
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import has_moved
@@ -45,3 +48,55 @@ class RepeatedRanges(NamedTuple):
             if times.sum() >= SETTINGS.findings.min_samples:
                 constant[k] = values[times.argmax()], times.max() / times.sum()
         return cls(np.where(pairs > 0, same / np.maximum(pairs, 1), np.nan), pairs, constant)
+
+
+@dataclass(frozen=True)
+class RepeatedScanSettings:
+    """When repeated scans are reported. Chosen by hand."""
+
+    motion: float = 0.02
+    """Motion between two scans from which on they are compared, metres; a turn of 1 rad counts like 1 m."""
+    least_readings: int = 3
+    """Readings of a scan that is compared."""
+    least_scans: int = 20
+    """Repeated scans from which on it is reported, ..."""
+    share: float = 0.2
+    """... and their share of the compared ones."""
+    most_pairs: int = 2000
+    """Pairs of scans that are compared; more of them are thinned out evenly."""
+    equal: float = 0.1
+    """Largest share of equal ranges between the other scans: more of them come from coarse or resting readings."""
+
+
+_WHOLE = RepeatedScanSettings()
+
+
+def repeated_scans(log: Log) -> Finding | None:
+    """The finding about scans that repeat all ranges of the one before although the robot moved; None if there is none.
+
+    Independent echoes of a moving robot agree in a few ranges at most. Scans that agree in all of them, while the
+    others agree in hardly any, were read once and reported several times.
+    """
+    motion = np.hypot(*np.diff(log.pose[:, :2], axis=0).T) + np.abs(wrap_angle(np.diff(log.pose[:, 2])))
+    count = np.diff(log.start)
+    pair = np.flatnonzero((motion > _WHOLE.motion) & (count[1:] >= _WHOLE.least_readings))
+    pair = pair[:: len(pair) // _WHOLE.most_pairs + 1]
+    agreed = np.zeros((len(pair), 2))
+    for k, scan in enumerate(pair.tolist()):
+        before, after = (slice(log.start[row], log.start[row + 1]) for row in (scan, scan + 1))
+        same = np.isin(log.range[after], log.range[before]) | ~np.isfinite(log.range[after])
+        agreed[k] = same.mean(), count[scan] == count[scan + 1]
+    whole = (agreed[:, 0] == 1) & (agreed[:, 1] == 1)
+    if not whole.sum() >= max(_WHOLE.least_scans, _WHOLE.share * len(pair)):
+        return None
+    if whole.all() or agreed[~whole, 0].mean() > _WHOLE.equal:
+        return None
+    return Finding(
+        "held readings",
+        (),
+        f"all sensors repeat their readings: {whole.sum()} of {len(pair)} scans of the moving robot are copies of the "
+        "scan before",
+        0.99,
+        f"of the ranges of the other scans, {agreed[~whole, 0].mean():.0%} equal those of the scan before",
+        "let the driver report each reading once, with the time at which it was measured",
+    )

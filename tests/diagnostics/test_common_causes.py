@@ -152,3 +152,8 @@ def test_in_a_corridor_drifting_odometry_does_not_tell_the_scale(seed):
     reported += 0.003 * np.random.default_rng(seed).standard_normal(reported.shape)
     odometry = simulate_odometry(true, distance=0.02, turn=0.02, seed=seed)
     assert not find_common_causes(RING, log_of(reported, odometry)).findings
+
+
+def test_scans_that_are_reported_again_are_named():
+    reported = ranges(POSE)
+    assert_one_cause(RING, log_of(reported[np.arange(len(POSE)) // 3 * 3], POSE), "held readings", "copies")
