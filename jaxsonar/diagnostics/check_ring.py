@@ -17,6 +17,7 @@ from jaxsonar.diagnostics.health_report import Health as Health
 from jaxsonar.diagnostics.local_scene import scene_from_groups
 from jaxsonar.diagnostics.log_findings import checked_log
 from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
+from jaxsonar.diagnostics.range_offsets import estimate_offsets, stretches_of_scans
 from jaxsonar.diagnostics.reference_scene import (
     ReferenceScene,
     empty_scene,
@@ -134,14 +135,18 @@ def check(
         without_worst, turn_nats = found.without_worst[place], found.cones.nats[place]
         # The echoes of a faulty sensor may have spoiled the walls: judge suspects by walls without them.
         alternatives = list(found.alternatives)
-        noise = found.offsets.sigma
+        noise, offset, error = found.offsets.sigma, found.offsets.offset.copy(), found.offsets.error.copy()
         for k in found.suspects:
             apart = detect(_without_sensors(renumbered, np.append(place[accepted], k)))
             table = predict_and_match(ring, apart, renumbered)
             again = sensor_alternatives(table, np.asarray(ring.beam) / 2, noise, ring.max_range)[k]
+            by_others = estimate_offsets(table, ring.count, noise, stretches_of_scans(renumbered))
+            if np.isfinite(by_others.offset[k]):
+                offset[k], error[k] = by_others.offset[k], by_others.error[k]
             # A wall that only this sensor hears is missing now: a fault must show with and without its own echoes.
             given = alternatives[k]
             alternatives[k] = again if given is not None and again is not None and given.cause == again.cause else None
+        health = replace(health, offset=offset[place], offset_error=error[place])
         faced = found.expected[place, 0]
         if source and not measured.any.all() and not measured.certain:  # silent, or not measured?
             faced = faced_walls(ring, renumbered, scene)[place]

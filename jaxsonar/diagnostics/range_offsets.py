@@ -135,10 +135,16 @@ def _solve(
     # Stretches that count: as many as there were if all of them told the same about the sensor.
     share = np.einsum("pkk->kp", part)
     stretches = share.sum(axis=1) ** 2 / np.maximum((share**2).sum(axis=1), 1e-12)
-    sigmas = SETTINGS.offsets.tail_sigmas
+    sigmas, prior_freedom = SETTINGS.offsets.tail_sigmas, SETTINGS.offsets.pooled_stretches
     enough = stretches >= SETTINGS.offsets.min_stretches
-    tail = stats.t.isf(stats.norm.sf(sigmas), np.maximum(stretches - 1, 1)) / sigmas
-    return offset, np.where(enough, np.maximum(error, jackknife * tail), np.inf)
+    # The scatter between stretches is much the same for all sensors: their mean counts as several stretches.
+    freedom = np.maximum(stretches - 1, 0.0)
+    scatter = jackknife**2 * stretches
+    pooled = float((freedom * scatter).sum() / max(freedom.sum(), 1e-12))
+    scatter = (freedom * scatter + prior_freedom * pooled) / (freedom + prior_freedom)
+    tail = stats.t.isf(stats.norm.sf(sigmas), freedom + prior_freedom) / sigmas
+    spread = np.sqrt(scatter / np.maximum(stretches, 1)) * tail
+    return offset, np.where(enough, np.maximum(error, spread), np.inf)
 
 
 def remove_gauge_freedom(

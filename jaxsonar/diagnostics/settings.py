@@ -93,6 +93,8 @@ class OffsetSettings:
     """Echoes (direct ones count twice) that the offset of a sensor needs."""
     min_stretches: float = 2.5
     """Stretches of the trajectory that a standard error needs, if poses gather the walls."""
+    pooled_stretches: float = 3.0
+    """The mean scatter between stretches of all sensors counts as much as this many stretches of a sensor."""
     tail_sigmas: float = 3.5
     """Standard errors from few stretches are larger, so that this many of them mean the same as of many."""
     weak_information: float = 0.03
