@@ -116,8 +116,12 @@ def of_diagnosis(options: Options) -> list[Metric]:
         "named": named,
         "alarms": alarms,
     }
-    direction = {"correct": "higher", "named": "higher"}
     return [
-        Metric(f"diagnosis.{name}", 100 * float(np.mean(values)), "%", direction.get(name, "lower"))
+        Metric(
+            f"diagnosis.{name}",
+            100 * float(np.mean(values)),
+            "%",
+            "higher" if name in ("correct", "named") else "lower",
+        )
         for name, values in shares.items()
     ]

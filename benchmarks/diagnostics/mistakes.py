@@ -1,6 +1,6 @@
 """Wrong and sound inputs for the benchmark of the warnings about inputs."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,10 +38,10 @@ def _scaled_ranges(log: Log, factor: float) -> Log:
     return replace(log, range=log.range * factor)
 
 
-def _poses(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Scene], Log]:
+def _poses(change: Callable[[np.ndarray], Sequence[np.ndarray]]) -> Callable[[Scene], Log]:
     def wrong(scene: Scene) -> Log:
         log = scene.log()
-        return replace(log, pose=np.stack(change(log.pose.T), axis=-1))
+        return replace(log, pose=np.stack(list(change(log.pose.T)), axis=-1))
 
     return wrong
 

@@ -5,7 +5,7 @@ log are compared by the echoes that agree (``alternatives``); the scale of the r
 estimated (``motion_fit``). The check then goes on with the corrected ring and log.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,7 +107,7 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
     """
     findings: list[Finding] = []
     for one in find_mistakes(ring, log):
-        findings.append(_mistake_finding(one))
+        findings += _mistake_findings(one)
         ring, log = one.describe(ring, log)
     # In a wrong unit, ordinary steps look like jumps.
     findings += [_jump_finding(one) for one in implausible_odometry(ring, log)]
@@ -223,19 +223,20 @@ def _search_motion(ring: Ring, log: Log, groups: _Groups, echoes: PosedEchoes, s
     return best
 
 
-def _mistake_finding(found: Alternative) -> Finding:
-    """The finding about a mistake in the description of the log."""
+def _mistake_findings(found: Alternative) -> Iterator[Finding]:
+    """The findings about mistakes in the description of the log, which explain its echoes together."""
     rival = f", if {found.second} {found.second_support:.0%}" if found.second else ""
-    others = [*(text for one in found.corrections for text in one.equivalents), *(tie.mistake for tie in found.ties)]
-    return Finding(
-        _CAUSES.get(found.kind, found.kind),
-        (),
-        ", or ".join([found.mistake, *others]),
-        confidence_of(found.second_z**2 / 2),
-        f"so, {found.corrected.mean_support:.0%} of the scans around an echo agree with it, as given "
-        f"{found.given.mean_support:.0%}{rival}",
-        "; ".join(one.remedy for one in found.corrections),
-    )
+    ties = [tie.mistake for tie in found.ties]
+    for one in found.corrections:
+        yield Finding(
+            _CAUSES.get(one.kind, one.kind),
+            (),
+            ", or ".join([one.mistake, *one.equivalents, *ties]),
+            confidence_of(found.second_z**2 / 2),
+            f"if {found.mistake}, {found.corrected.mean_support:.0%} of the scans around an echo agree with it, "
+            f"as given {found.given.mean_support:.0%}{rival}",
+            one.remedy,
+        )
 
 
 def _with_other_scale(echoes: PosedEchoes, fit: MotionFit | None) -> MotionFit | None:

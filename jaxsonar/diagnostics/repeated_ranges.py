@@ -75,8 +75,11 @@ def repeated_scans(log: Log) -> Finding | None:
     """The finding about scans that repeat all ranges of the one before although the robot moved; None if there is none.
 
     Independent echoes of a moving robot agree in a few ranges at most. Scans that agree in all of them, while the
-    others agree in hardly any, were read once and reported several times.
+    others agree in hardly any, were read once and reported several times. A log that marks old readings by their age is
+    not judged.
     """
+    if is_repeated(log).any():
+        return None
     motion = np.hypot(*np.diff(log.pose[:, :2], axis=0).T) + np.abs(wrap_angle(np.diff(log.pose[:, 2])))
     count = np.diff(log.start)
     pair = np.flatnonzero((motion > _WHOLE.motion) & (count[1:] >= _WHOLE.least_readings))

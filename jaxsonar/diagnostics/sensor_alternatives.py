@@ -24,6 +24,8 @@ class Rates(NamedTuple):
     """Probability that an expected echo is detected."""
     foreign: float
     """Share of the echoes that do not come from a known wall."""
+    scatter: float
+    """Standard deviation of the first among the sensors."""
 
 
 class SensorAlternative(NamedTuple):
@@ -54,7 +56,7 @@ class SensorAlternative(NamedTuple):
         return self.cause in ("turned", "offset")
 
 
-class _Rows(NamedTuple):
+class _DirectEchoes(NamedTuple):
     """Direct echoes of one sensor: an entry for every scan and wall."""
 
     scan: Int[np.ndarray, " rows"]
@@ -107,7 +109,7 @@ def sensor_alternatives(
 
 def _stated(
     table: ResidualTable, half_width: Float[np.ndarray, " sensors"], noise: float
-) -> tuple[list[_Rows], list[_Counts], float]:
+) -> tuple[list[_DirectEchoes], list[_Counts], float]:
     """The direct echoes of each sensor, how a sound sensor explains them, and the gate of their ranges, metres."""
     gate = min(SETTINGS.detection.gate * noise + SETTINGS.detection.gate_margin, _SETTINGS.largest_gate)
     fair = table.independent_echoes >= SETTINGS.detection.min_independent_echoes
@@ -119,7 +121,7 @@ def _stated(
 
 def _rows_of(
     table: ResidualTable, fair: Bool[np.ndarray, " all"], sensor: int, half_width: float, gate: float
-) -> _Rows:
+) -> _DirectEchoes:
     direct = (table.tx == sensor) & (table.rx == sensor)
     # Scans in which the sensor hears a wall of its own, that no other sensor hears, tell nothing.
     beside = np.abs(table.off_axis) - half_width
@@ -130,7 +132,7 @@ def _rows_of(
     each, scan = np.unique(table.scan[row], return_inverse=True)
     heard = np.zeros(len(each), bool)
     heard[scan[np.isfinite(table.residual[row])]] = True
-    return _Rows(
+    return _DirectEchoes(
         scan,
         table.residual[row],
         table.off_axis[row],
@@ -141,7 +143,7 @@ def _rows_of(
     )
 
 
-def _count(rows: _Rows, half_width: float, gate: float, turn: float, offset: float) -> _Counts:
+def _count(rows: _DirectEchoes, half_width: float, gate: float, turn: float, offset: float) -> _Counts:
     """How an explanation by a rotation (radians) and an offset (metres) fits."""
     scans = len(rows.heard)
     beside = np.abs(rows.off_axis - turn) - half_width
@@ -160,7 +162,7 @@ def _count(rows: _Rows, half_width: float, gate: float, turn: float, offset: flo
     return _Counts(expected, expected & explained, explained, np.bincount(rows.scan[in_cone], minlength=scans))
 
 
-def _usual_rates(rows: list[_Rows], counts: list[_Counts]) -> Rates | None:
+def _usual_rates(rows: list[_DirectEchoes], counts: list[_Counts]) -> Rates | None:
     """Medians over the sensors; None if walls explain too little to judge any sensor."""
     expected, detected, explained = (np.array([one[k].sum() for one in counts]) for k in range(3))
     heard = np.array([one.heard.sum() for one in rows])
@@ -171,7 +173,8 @@ def _usual_rates(rows: list[_Rows], counts: list[_Counts]) -> Rates | None:
     foreign = 1 - float(np.median(explained[enough] / heard[enough]))
     if rate < _SETTINGS.least_rate or foreign > 1 - _SETTINGS.least_rate:
         return None
-    return Rates(min(rate, _SETTINGS.most_rate), max(foreign, 1 - _SETTINGS.most_rate))
+    scatter = 1.4826 * float(np.median(np.abs(detected[enough] / expected[enough] - rate)))
+    return Rates(min(rate, _SETTINGS.most_rate), max(foreign, 1 - _SETTINGS.most_rate), scatter)
 
 
 def _log_likelihood(
@@ -193,7 +196,7 @@ def _log_likelihood(
 
 
 def _best(
-    rows: _Rows, stated: _Counts, half_width: float, gate: float, max_range: float, rates: Rates
+    rows: _DirectEchoes, stated: _Counts, half_width: float, gate: float, max_range: float, rates: Rates
 ) -> SensorAlternative | None:
     if not len(rows.heard):
         return None
@@ -221,7 +224,8 @@ def _best(
     # Lost echoes.
     expected, detected = int(stated.expected.sum()), int(stated.detected.sum())
     rate = float(np.clip(detected / max(expected, 1), 0.01, 0.99))
-    if expected >= SETTINGS.findings.min_weak and rate < SETTINGS.findings.weak_rate * rates.detected:
+    usual = min(SETTINGS.findings.weak_rate * rates.detected, rates.detected - _SETTINGS.scatters * rates.scatter)
+    if expected >= SETTINGS.findings.min_weak and rate < usual:
         lost = _log_likelihood(stated, rows.heard, rate, rates.foreign, odds)
         explained = int(stated.explained.sum())
         few = heard < SETTINGS.findings.min_expected
@@ -246,6 +250,7 @@ def _best(
         best = int(np.argmin(np.abs(values - mean)))
         explained, before = int(tried[best].explained.sum()), int(stated.explained.sum())
         enough = explained >= max(_SETTINGS.least_rate * (1 - rates.foreign) * heard, SETTINGS.findings.min_expected)
+        enough &= before < _SETTINGS.least_rate * (1 - rates.foreign) * heard
         enough &= explained - before >= max(SETTINGS.findings.min_expected, _SETTINGS.min_gain * heard)
         # Another direction or an offset that explains some echoes is in doubt: then the sensor is not called astray.
         most = max(int(one.explained.sum()) for one in tried)

@@ -166,7 +166,7 @@ class ConeSettings:
 
 
 @dataclass(frozen=True)
-class AlternativeSettings:
+class ExplanationSettings:
     """Comparison of explanations of the direct echoes of a sensor."""
 
     largest_gate: float = 0.04
@@ -185,6 +185,8 @@ class AlternativeSettings:
     """Usual rate of detection, and usual share of explained echoes, that the comparison needs."""
     most_rate: float = 0.95
     """Both count as at most this."""
+    scatters: float = 3.0
+    """A weak sensor is below the usual rate by this many standard deviations of the rates of the sensors."""
     dependent: float = 4.0
     """Echoes that share the errors of their walls: the likelihood is flatter by this factor for standard errors."""
     min_gain: float = 0.15
@@ -273,7 +275,7 @@ class DiagnosticsSettings:
     """Exchanged sensors."""
     cones: ConeSettings = field(default_factory=ConeSettings)
     """Detection cones."""
-    alternatives: AlternativeSettings = field(default_factory=AlternativeSettings)
+    alternatives: ExplanationSettings = field(default_factory=ExplanationSettings)
     """Explanations of the echoes of a sensor."""
     findings: FindingSettings = field(default_factory=FindingSettings)
     """Findings."""

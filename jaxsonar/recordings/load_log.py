@@ -12,6 +12,7 @@ from jaxsonar.recordings.file_content import DESCRIPTIONS, FileContent, check_su
 from jaxsonar.recordings.input_options import FORMATS, InputOptions
 from jaxsonar.scans.log_file import load_scan_log
 from jaxsonar.scans.no_echo_values import as_range, without_no_echo_values
+from jaxsonar.scans.readings import counts_from_one
 from jaxsonar.scans.recording_journal import TruncatedRecording
 from jaxsonar.scans.scan_log import Log
 
@@ -149,7 +150,7 @@ def _check_numbering(filename: str | os.PathLike[str], log: Log, ring: "Ring | N
         return
     first = min(int(log.tx.min()), int(log.rx.min()))
     last = max(int(log.tx.max()), int(log.rx.max()))
-    if first >= 1 and last == ring.count:
+    if counts_from_one(log.tx, log.rx, ring.count):
         came = f"the sensors {first} to {last} came, so the log seems to count from 1"
         raise SonarError(f"{shown(filename)}: {came}; allowed are 0 to {ring.count - 1}, the sensors of '{ring.name}'")
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.firing_poses import path_poses
 from jaxsonar.scans.measured_paths import measured_paths
-from jaxsonar.scans.readings import is_repeated
+from jaxsonar.scans.readings import counts_from_one, is_repeated
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -123,10 +123,10 @@ class FlatEchoes:
         sensor = np.maximum(log.tx, log.rx)
         if (sensor >= ring.count).any():
             k = int(np.argmax(sensor >= ring.count))
-            from_one = bool(min(log.tx.min(), log.rx.min()) >= 1 and sensor.max() == ring.count)
+            hint = "; the log seems to count from 1" * counts_from_one(log.tx, log.rx, ring.count)
             raise SonarError(
                 f"scan {log.scan[log.echo_scan[k]]}: echo of sensors tx {log.tx[k]}, rx {log.rx[k]}; allowed are 0 to "
-                f"{ring.count - 1}, the sensors of {ring.name!r}" + "; the log seems to count from 1" * from_one
+                f"{ring.count - 1}, the sensors of {ring.name!r}{hint}"
             )
         path = ring.path_index[log.tx, log.rx]
         heard = np.isfinite(log.range)

@@ -213,3 +213,17 @@ def _pair_codes(
 ) -> Int[np.ndarray, " rows"]:
     """One number for each scan and pair of sensors."""
     return (scan * sensors + tx) * sensors + rx
+
+
+def counts_from_one(tx: Int[np.ndarray, " readings"], rx: Int[np.ndarray, " readings"], sensors: int) -> bool:
+    """Whether the sensors seem to be counted from 1: half of the numbers from 1 to ``sensors`` or more occur.
+
+    Args:
+        tx: transmitters of one reading or more.
+        rx: receivers.
+        sensors: number of sensors of the ring.
+    """
+    if min(tx.min(), rx.min()) < 1 or max(tx.max(), rx.max()) != sensors:
+        return False
+    occurs = np.bincount(tx, minlength=sensors + 1) + np.bincount(rx, minlength=sensors + 1) > 0
+    return bool(2 * occurs.sum() >= sensors)

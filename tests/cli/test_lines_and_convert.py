@@ -325,7 +325,8 @@ def test_a_closed_pipe_is_not_an_error(here, command):
     assert code in (0, 1)  # 0 if everything was written before the pipe was closed
     assert "Traceback" not in err
     assert "Exception" not in err
-    assert len(err.splitlines()) <= 1
+    # The longer log is a joined one, which gives warnings.
+    assert len([line for line in err.splitlines() if not line.startswith("warning: ")]) <= 1
 
 
 def test_the_version_is_that_of_the_project(capsys):

@@ -10,6 +10,7 @@ from support.wandering_robot import RING, held, log_of, ranges, trajectory
 
 from jaxsonar import Room, save_log, save_ring
 from jaxsonar.cli import emulate
+from jaxsonar.cli.inputs import InputMessages
 from jaxsonar.hardware.messages import Group
 from jaxsonar.hardware.protocol import encode
 from jaxsonar.hardware.transport_base import open_source, register_transport
@@ -41,7 +42,7 @@ def emulated(path, ring_path, *options):
     parser = ArgumentParser()
     emulate.add_arguments(parser)
     given = parser.parse_args([str(path), "--ring", str(ring_path), "--listen", "pty:", *options])
-    return list(emulate._messages(given, load_ring(ring_path)))
+    return list(emulate._messages(given, load_ring(ring_path), InputMessages(strict=False)))
 
 
 @pytest.mark.parametrize("case", CASES)

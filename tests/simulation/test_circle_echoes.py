@@ -29,7 +29,7 @@ def test_the_path_is_the_shortest_one_over_the_circle(seed):
     direction = rng.uniform(-np.pi, np.pi) + np.array([0.0, rng.uniform(-0.6, 0.6)])
     distance = radius + rng.uniform(0.5, 3.0, 2)
     sensors = center + distance[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
-    found = traced(circle_room(*center, radius), *sensors)
+    found = traced(circle_room(center[0], center[1], radius), *sensors)
     around = np.linspace(-np.pi, np.pi, 400_001)
     points = center + radius * np.stack([np.cos(around), np.sin(around)], axis=-1)
     legs = [np.linalg.norm(points - sensor, axis=-1) for sensor in sensors]

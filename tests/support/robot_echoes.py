@@ -55,8 +55,8 @@ def drive(corners, *, step=0.1, turn=0.35):
 
 def same_measurements(one, other):
     """Whether two logs hold the same echoes and the same silence, in whatever form."""
-    rows = [
+    first, second = (
         np.unique(np.column_stack([log.echo_scan, log.tx, log.rx, np.nan_to_num(log.range, nan=-1.0)]), axis=0)
         for log in (explicit_log(one), explicit_log(other))
-    ]
-    return np.array_equal(*rows)
+    )
+    return np.array_equal(first, second)
