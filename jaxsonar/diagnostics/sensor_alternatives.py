@@ -229,10 +229,15 @@ def _best(
         lost = _log_likelihood(stated, rows.heard, rate, rates.foreign, odds)
         explained = int(stated.explained.sum())
         few = heard < SETTINGS.findings.min_expected
-        cause = "weak" if few or explained >= _SETTINGS.least_rate * (1 - rates.foreign) * heard else "astray"
+        # The echoes that a weak sensor has come from the known walls; those of a sensor astray do not. In between, it
+        # hears other walls than the known ones.
         silent = rate < SETTINGS.findings.dead_rate and few
         error = float(np.sqrt(rate * (1 - rate) / expected))
-        propose("dead" if silent else cause, rate, error, stated, robust(lost))
+        usual_share = (1 - rates.foreign) * heard
+        if few or explained >= _SETTINGS.fitting * usual_share:
+            propose("dead" if silent else "weak", rate, error, stated, robust(lost))
+        elif explained < _SETTINGS.unfitting * usual_share:
+            propose("astray", rate, error, stated, robust(lost))
     # Rotations and offsets.
     turns = np.radians(np.arange(-SETTINGS.cones.most_turn_deg, SETTINGS.cones.most_turn_deg + 1, 2.0))
     offsets = np.arange(-_SETTINGS.most_offset, _SETTINGS.most_offset + gate / 4, gate / 2)
@@ -249,7 +254,7 @@ def _best(
         error = float(np.sqrt(posterior @ (values - mean) ** 2 / posterior.sum() + (values[1] - values[0]) ** 2 / 12))
         best = int(np.argmin(np.abs(values - mean)))
         explained, before = int(tried[best].explained.sum()), int(stated.explained.sum())
-        enough = explained >= max(_SETTINGS.least_rate * (1 - rates.foreign) * heard, SETTINGS.findings.min_expected)
+        enough = explained >= max(_SETTINGS.fitting * (1 - rates.foreign) * heard, SETTINGS.findings.min_expected)
         enough &= before < _SETTINGS.least_rate * (1 - rates.foreign) * heard
         enough &= explained - before >= max(SETTINGS.findings.min_expected, _SETTINGS.min_gain * heard)
         # Another direction or an offset that explains some echoes is in doubt: then the sensor is not called astray.

@@ -185,6 +185,10 @@ class ExplanationSettings:
     """Usual rate of detection, and usual share of explained echoes, that the comparison needs."""
     most_rate: float = 0.95
     """Both count as at most this."""
+    fitting: float = 0.7
+    """Share of its echoes, relative to the other sensors, that the right explanation explains at least, ..."""
+    unfitting: float = 0.25
+    """... and that a wrong one explains at most."""
     scatters: float = 3.0
     """A weak sensor is below the usual rate by this many standard deviations of the rates of the sensors."""
     dependent: float = 4.0
