@@ -58,7 +58,8 @@ def check(
 
     Args:
         ring: the ring as it should be.
-        log: scans. Poses are used only if single scans show too few walls.
+        log: scans, as they were recorded. Poses, where they exist, show causes that concern all sensors, and gather
+            walls where single scans show too few.
         sigma: standard deviation of the ranges, metres; None estimates it.
         progress: called with (scans done, scans) from time to time.
         on_left_out: called once with the number of echoes of pairs (tx, rx) that this ring does not listen to.

@@ -14,6 +14,7 @@ from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
 from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.plausibility.implausible_ring import implausible_ring
 from jaxsonar.plausibility.implausible_stamps import implausible_stamps
+from jaxsonar.plausibility.prepared_log import no_echo_warning
 from jaxsonar.plausibility.range_units import find_range_unit
 from jaxsonar.plausibility.robot_echoes import RobotEcho, RobotEchoes, find_robot_echoes, without_robot_echoes
 from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
@@ -45,7 +46,6 @@ def checked_log(ring: Ring, log: Log) -> CheckedLog:
     findings = [_of_input(one) for one in implausible_stamps(log)]
     if values := find_no_echo_values(log):
         listed = ", ".join(map(str, values))
-        exact = " ".join(f"--no-echo {one.value:.6g}" for one in values if not one.sigma)
         findings.append(
             Finding(
                 "no-echo value",
@@ -53,7 +53,7 @@ def checked_log(ring: Ring, log: Log) -> CheckedLog:
                 f"most sensors read {listed}, wherever the robot is: a mark for no echo, which counts as silence",
                 _FINDINGS.certain,
                 "most sensors share the value, and it does not change while the robot moves",
-                f"confirm with {exact}" if exact else "let the driver report nothing instead",
+                no_echo_warning(values).remedy,
             )
         )
         log = without_no_echo_values(log, values)

@@ -212,6 +212,7 @@ def _best(
 
     found: list[SensorAlternative] = []
     heard = int(rows.heard.sum())
+    usual_share = (1 - rates.foreign) * heard  # of its echoes, explained by known walls
 
     def propose(cause: str, value: float, error: float, counts: _Counts, nats: float) -> None:
         expected, detected, explained = (int(one.sum()) for one in counts[:3])
@@ -233,7 +234,6 @@ def _best(
         # hears other walls than the known ones.
         silent = rate < SETTINGS.findings.dead_rate and few
         error = float(np.sqrt(rate * (1 - rate) / expected))
-        usual_share = (1 - rates.foreign) * heard
         if few or explained >= _SETTINGS.fitting * usual_share:
             propose("dead" if silent else "weak", rate, error, stated, robust(lost))
         elif explained < _SETTINGS.unfitting * usual_share:
@@ -254,8 +254,8 @@ def _best(
         error = float(np.sqrt(posterior @ (values - mean) ** 2 / posterior.sum() + (values[1] - values[0]) ** 2 / 12))
         best = int(np.argmin(np.abs(values - mean)))
         explained, before = int(tried[best].explained.sum()), int(stated.explained.sum())
-        enough = explained >= max(_SETTINGS.fitting * (1 - rates.foreign) * heard, SETTINGS.findings.min_expected)
-        enough &= before < _SETTINGS.least_rate * (1 - rates.foreign) * heard
+        enough = explained >= max(_SETTINGS.fitting * usual_share, SETTINGS.findings.min_expected)
+        enough &= before < _SETTINGS.least_rate * usual_share
         enough &= explained - before >= max(SETTINGS.findings.min_expected, _SETTINGS.min_gain * heard)
         # Another direction or an offset that explains some echoes is in doubt: then the sensor is not called astray.
         most = max(int(one.explained.sum()) for one in tried)

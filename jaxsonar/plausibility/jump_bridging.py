@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsonar.geometry.se2 import compose, interpolate, inverse, relative, wrap_angle
-from jaxsonar.plausibility.pose_agreement import agreement, part_of_groups
+from jaxsonar.geometry.se2 import compose, interpolate, inverse
+from jaxsonar.plausibility.pose_agreement import agreement, part_of_groups, spaced_scans
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -99,11 +99,4 @@ def jump_support(ring: Ring, log: Log, before: int, after: int) -> JumpSupport |
 
 def _spaced(pose: Float[np.ndarray, "scans 3"], rows: Int[np.ndarray, " some"]) -> Int[np.ndarray, " spaced"]:
     """The first of some rows, and those that follow at a distance from the last one that was selected."""
-    chosen = [int(row) for row in rows[:1]]
-    for row in rows[1:].tolist():
-        step = relative(pose[chosen[-1]], pose[row])
-        if np.hypot(step[0], step[1]) > SETTINGS.spacing or abs(float(wrap_angle(step[2]))) > SETTINGS.turn:
-            chosen.append(row)
-        if len(chosen) == SETTINGS.side:
-            break
-    return np.array(chosen, dtype=np.int64)
+    return rows[spaced_scans(pose[rows], SETTINGS.side, spacing=SETTINGS.spacing, turn=SETTINGS.turn)]

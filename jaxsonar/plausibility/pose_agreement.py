@@ -137,12 +137,13 @@ def select_groups(log: Log) -> list[Int[np.ndarray, "_"]]:
     posed = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
     pose = bounded(log.pose[posed])
     if len(posed) <= SETTINGS.long_log:
-        row = _spaced(pose, len(pose))
+        row = spaced_scans(pose, len(pose), spacing=SETTINGS.spacing, turn=SETTINGS.turn)
         groups = [row[k : k + SETTINGS.group] for k in range(0, len(row), SETTINGS.group)]
     else:
         bounds = np.linspace(0, len(pose), SETTINGS.groups + 1).astype(int)
         pairs = pairwise(bounds)
-        groups = [begin + _spaced(pose[begin:end], SETTINGS.group) for begin, end in pairs]
+        limits = {"spacing": SETTINGS.spacing, "turn": SETTINGS.turn}
+        groups = [begin + spaced_scans(pose[begin:end], SETTINGS.group, **limits) for begin, end in pairs]
     groups = [posed[one] for one in groups if len(one) >= SETTINGS.least_group]
     if len(groups) > SETTINGS.groups:
         groups = [groups[k] for k in np.linspace(0, len(groups) - 1, SETTINGS.groups).round().astype(int)]
@@ -261,8 +262,17 @@ def _difference(
     return float(other_mean - mean), float(np.hypot(np.linalg.norm(part), least))
 
 
-def _spaced(pose: Float[np.ndarray, "scans 3"], limit: int) -> Int[np.ndarray, " spaced"]:
-    """Rows of scans each of which is some distance or angle away from the one before; the first ``limit`` of them."""
+def spaced_scans(
+    pose: Float[np.ndarray, "scans 3"], limit: int, *, spacing: float, turn: float
+) -> Int[np.ndarray, " spaced"]:
+    """Rows of scans each of which is some distance or angle away from the one before; the first ``limit`` of them.
+
+    Args:
+        pose: world_from_robot, metres and radians, without NaN.
+        limit: largest number of rows.
+        spacing: distance that must be exceeded, metres, ...
+        turn: ... or angle, radians.
+    """
     rows, at, block = [], 0, 32
     while at < len(pose) and len(rows) < limit:
         rows.append(at)
@@ -270,8 +280,8 @@ def _spaced(pose: Float[np.ndarray, "scans 3"], limit: int) -> Int[np.ndarray, "
         width = block
         while at < len(pose):
             ahead = pose[at : at + width]
-            moved = np.hypot(*(ahead[:, :2] - last[:2]).T) > SETTINGS.spacing
-            moved |= np.abs(wrap_angle(ahead[:, 2] - last[2])) > SETTINGS.turn
+            moved = np.hypot(*(ahead[:, :2] - last[:2]).T) > spacing
+            moved |= np.abs(wrap_angle(ahead[:, 2] - last[2])) > turn
             if moved.any():
                 at += int(np.argmax(moved))
                 break

@@ -54,7 +54,7 @@ class PreparedLog:
             return cls(log, (_EMPTY,), ())
         warnings, notes = [*implausible_stamps(log)], []
         if values := find_no_echo_values(log):
-            warnings.append(_no_echo_warning(values))
+            warnings.append(no_echo_warning(values))
             log = without_no_echo_values(log, values)
         if unheard := unheard_warning(ring, log):
             warnings.append(unheard)
@@ -99,7 +99,7 @@ def prepared_log(ring: Ring, log: Log, *, on_note: Callable[[str], None]) -> Log
     return prepared.log
 
 
-def _no_echo_warning(values: Sequence[NoEchoValue]) -> Implausibility:
+def no_echo_warning(values: Sequence[NoEchoValue]) -> Implausibility:
     """A warning about ranges that mean no echo."""
     exact = " ".join(f"--no-echo {one.value:.6g}" for one in values if not one.sigma)
     what = f"most sensors read {', '.join(map(str, values))}, wherever the robot is"
