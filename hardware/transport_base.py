@@ -4,6 +4,7 @@ An opener takes a parsed ``Url`` and the keywords of ``open_source`` and returns
 register an opener under the entry point group ``jaxsonar.transports``. The name of the entry point is the scheme.
 """
 
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -28,6 +29,9 @@ EXAMPLES = {
 ENTRY_POINTS = "jaxsonar.transports"
 """Entry point group of openers from other packages."""
 
+RETRY_INTERVAL = 0.2
+"""Seconds between two attempts to open a device that is not there yet. Chosen by hand."""
+
 SILENCE_TIMEOUT = 2.0
 """Seconds without a byte after which a source reports a ``silent`` event. Chosen by hand."""
 
@@ -38,7 +42,7 @@ class LinkEvent:
 
     kind: str
     """``lost`` (the link broke; the source reconnects), ``back`` (data again), ``silent`` (no data for a while),
-    ``note`` (a choice or a warning about a file that is replayed)."""
+    ``waiting`` (the device cannot be opened yet), ``note`` (a choice or a warning about a file that is replayed)."""
     text: str
     """Message for the user, one line."""
     time: float = field(default_factory=time.time)
@@ -46,6 +50,10 @@ class LinkEvent:
 
 
 OnEvent = Callable[[LinkEvent], None]
+
+
+class NotOpenedError(SonarError):
+    """The URL is valid, but no device can be opened there now."""
 
 
 class EndOfStream(Exception):
@@ -174,7 +182,13 @@ def register_transport(scheme: str, opener: Opener) -> None:
 
 
 def open_source(
-    url: str, *, on_event: OnEvent | None = None, reconnect: bool = True, silence: float = SILENCE_TIMEOUT
+    url: str,
+    *,
+    on_event: OnEvent | None = None,
+    reconnect: bool = True,
+    silence: float = SILENCE_TIMEOUT,
+    wait: float = 0.0,
+    stop: threading.Event | None = None,
 ) -> Source:
     """Open a source of bytes.
 
@@ -183,13 +197,27 @@ def open_source(
         on_event: called for every ``LinkEvent``, in the reading thread.
         reconnect: reconnect with exponential backoff (0.1 s to 5 s) when a link breaks; False: end the stream.
         silence: seconds without a byte that count as a ``silent`` event.
+        wait: seconds in which a device that cannot be opened is tried again, such as one that starts at the same time.
+        stop: set this event to end the wait.
 
     Raises:
         SonarError: an invalid URL, or a device that cannot be opened.
     """
     parsed = parse_url(url)
     opener = _opener(parsed)
-    return opener(parsed, on_event=on_event or _ignore, reconnect=reconnect, silence=silence)
+    on_event = on_event or _ignore
+    stop = stop or threading.Event()
+    end, waiting = time.monotonic() + wait, False
+    while True:
+        try:
+            return opener(parsed, on_event=on_event, reconnect=reconnect, silence=silence)
+        except NotOpenedError as error:
+            if time.monotonic() >= end or stop.wait(RETRY_INTERVAL):
+                raise
+            if not waiting:
+                why = str(error).partition(";")[0]
+                on_event(LinkEvent("waiting", f"{why}; trying again for {wait:g} s"))
+            waiting = True
 
 
 def parse_url(text: str) -> Url:

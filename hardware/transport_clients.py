@@ -8,8 +8,8 @@ from abc import abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass
 
-from .errors import SonarError, reason
-from .transport_base import EndOfStream, LinkEvent, OnEvent, Source, Url
+from .errors import reason
+from .transport_base import EndOfStream, LinkEvent, NotOpenedError, OnEvent, Source, Url
 
 HELLO, GOODBYE = b"\0", b""
 """Datagrams that a udp client sends to its device: once per second, and when it closes."""
@@ -51,7 +51,7 @@ class ReconnectingSource(Source):
         """Connect.
 
         Raises:
-            SonarError: the device cannot be opened.
+            NotOpenedError: the device cannot be opened.
         """
         self.url = url.text
         self._parsed = url
@@ -68,7 +68,9 @@ class ReconnectingSource(Source):
             self._connect()
         except (OSError, UnicodeError) as failure:  # UnicodeError: an invalid host name
             self._disconnect()
-            raise SonarError(f"{self.url}: {reason(failure)}; needed is a device that can be opened there") from None
+            raise NotOpenedError(
+                f"{self.url}: {reason(failure)}; needed is a device that can be opened there"
+            ) from None
         self._connected = True
         self._last_data = time.monotonic()
         self._is_silent = False

@@ -67,6 +67,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="stop after N scans (default: at the end of the stream)",
     )
     parser.add_argument(
+        "--wait",
+        type=number(float, 0, 86400),
+        default=0.0,
+        metavar="S",
+        help="wait up to S seconds for a device that cannot be opened yet",
+    )
+    parser.add_argument(
         "--no-echo",
         action="append",
         default=[],
@@ -130,6 +137,7 @@ def run(options: argparse.Namespace) -> int:
                 trajectory=options.trajectory,
                 scans=options.scans,
                 no_echo=options.no_echo,
+                wait=options.wait,
                 view=view,
                 on_status=status_line.status,
                 on_event=status_line.event,

@@ -5,6 +5,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 
 from jaxsonar import kernels
 from jaxsonar.estimation.odometry_noise import OdometryNoise
@@ -12,7 +13,7 @@ from jaxsonar.hardware.drop_oldest_queue import DropOldestQueue
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.reader_thread import ReaderThread
 from jaxsonar.hardware.scan_assembler import RawScan
-from jaxsonar.hardware.transport_base import LinkEvent, open_source, parse_url, register_transport
+from jaxsonar.hardware.transport_base import LinkEvent, Source, open_source, parse_url, register_transport
 from jaxsonar.live.live_map import LiveMap, LiveScan
 from jaxsonar.live.replay import file_opener
 from jaxsonar.live.status import Status
@@ -37,6 +38,7 @@ def stream(
     trajectory: str | os.PathLike[str] | None = None,
     scans: int | None = None,
     no_echo: Sequence[float] = (),
+    wait: float = 0.0,
     view: Viewer | None = None,
     on_scan: Callable[[LiveScan], None] | None = None,
     on_status: Callable[[Status], None] | None = None,
@@ -61,6 +63,7 @@ def stream(
         trajectory: TUM file of the estimated poses, written at the end; needs ``odometry_noise``.
         scans: stop after this many scans.
         no_echo: ranges of a replayed log that mean no echo, metres (``InputOptions.no_echo``).
+        wait: seconds in which a device that cannot be opened is tried again.
         view: viewer of the stream.
         on_scan: called for every scan with its local model.
         on_status: called several times per second with the status.
@@ -84,7 +87,9 @@ def stream(
     mapping = bool(map_filename) or view is not None
     live = LiveMap(ring, method=method, settings=settings, sigma=sigma, mapping=mapping, odometry_noise=odometry_noise)
     queue = DropOldestQueue[RawScan](SETTINGS.warm_up_capacity, size_of=lambda scan: len(scan.echoes))
-    reader = _open_reader(url, ring, queue, record=record, scans=scans, no_echo=no_echo, on_event=on_event)
+    stop = threading.Event() if stop is None else stop
+    open_device = partial(open_source, url, wait=wait, stop=stop)
+    reader = _open_reader(url, open_device, ring, queue, record=record, scans=scans, no_echo=no_echo, on_event=on_event)
     # 2. The loop; it starts to compile in the background.
     loop = StreamLoop(
         live,
@@ -97,7 +102,6 @@ def stream(
         on_scan=on_scan,
         on_status=on_status,
     )
-    stop = threading.Event() if stop is None else stop
     with _switch_interval(SETTINGS.switch_interval):
         # 3. Read in a thread of its own.
         reader.start()
@@ -116,6 +120,7 @@ def stream(
 
 def _open_reader(
     url: str,
+    open_device: Callable[..., Source],
     ring: Ring,
     queue: DropOldestQueue[RawScan],
     *,
@@ -134,7 +139,7 @@ def _open_reader(
         if on_event is not None and not any(reader.decoder.ended for reader in readers):
             on_event(event)
 
-    source = open_source(url, on_event=on_link_event)
+    source = open_device(on_event=on_link_event)
     try:
         recorder = None if record is None else open_log_recorder(record)
     except SonarError:

@@ -10,9 +10,8 @@ import pytest
 from support.scripted_device import NEVER, ScriptedDevice
 
 from jaxsonar.hardware import transport_clients
-from jaxsonar.hardware.transport_base import EndOfStream, open_source
-
-"""A stop event that is never set."""
+from jaxsonar.hardware.errors import SonarError
+from jaxsonar.hardware.transport_base import EndOfStream, NotOpenedError, open_source
 
 
 @pytest.fixture
@@ -85,6 +84,47 @@ def test_waiting_uses_no_cpu_time():
         begin = time.thread_time()
         assert source.read(1.0) is None
         assert time.thread_time() - begin < 0.1
+
+
+# --- opening
+
+
+def free_url():
+    """A tcp address of this machine at which nothing listens."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+def test_a_device_that_starts_later_is_waited_for():
+    url, devices = free_url(), []
+    begins = threading.Timer(0.5, lambda: devices.append(ScriptedDevice(url)))
+    begins.start()
+    events, tell = events_of()
+    with open_source(url, on_event=tell, wait=30.0):
+        begins.join()
+    with devices[0]:
+        assert kinds(events) == ["waiting"]
+        assert "Connection refused; trying again for 30 s" in events[0].text
+
+
+@pytest.mark.parametrize("settings", [{}, {"wait": 0.3}])
+def test_a_device_that_does_not_start_is_an_error(settings):
+    url = free_url()
+    needed = "needed is a device that can be opened there"
+    with pytest.raises(NotOpenedError, match=f"^{url}: Connection refused; {needed}$"):
+        open_source(url, **settings)
+
+
+def test_a_wait_can_be_ended():
+    stop = threading.Event()
+    threading.Timer(0.3, stop.set).start()
+    with pytest.raises(NotOpenedError):
+        open_source(free_url(), wait=3600.0, stop=stop)
+
+
+def test_an_invalid_url_is_not_waited_for():
+    with pytest.raises(SonarError, match="no such address"):
+        open_source("tcp://127.0.0.1", wait=3600.0)
 
 
 # --- ends

@@ -4,12 +4,15 @@ A block that is not run has an HTML comment with the reason in the line above it
 that needs a recording has ``<!-- needs: NAME -->``; it is skipped where the recording is absent.
 """
 
+import contextlib
 import json
 import math
 import os
 import re
+import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -80,19 +83,27 @@ def test_a_block_runs_as_printed(block, folder):
     if block.recording:
         environment[block.recording.upper()] = str(recorded(block.recording))
     program = {"bash": ["bash", "-euo", "pipefail", "-c"], "python": [sys.executable, "-c"]}[block.language]
-    done = subprocess.run(
-        [*program, block.text],
-        cwd=folder,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=900,
-    )
-    assert done.returncode == 0, done.stdout[-2000:]
+    returncode, output = run_in_group([*program, block.text], folder, environment)
+    assert returncode == 0, output[-2000:]
     kind = (block.page, block.language, block.recording)
     if block is next(one for one in RUN if (one.page, one.language, one.recording) == kind):
-        CHECKS.get(kind, lambda output, folder: None)(done.stdout, folder)
+        CHECKS.get(kind, lambda output, folder: None)(output, folder)
+
+
+def run_in_group(command, folder, environment):
+    """(exit code, output) of a command; what it left running in the background is killed."""
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+        )
+        try:
+            returncode = process.wait(900)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait(60)
+        output.seek(0)
+        return returncode, output.read().decode()
 
 
 def check_first_example(output, folder):
