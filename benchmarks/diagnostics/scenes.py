@@ -52,7 +52,7 @@ class Scene:
         return echoes.as_log(ring, simulate_odometry(self.poses, distance=DRIFT[0], turn=DRIFT[1], seed=self.seed))
 
 
-def random_scene(seed: int, *, scans: int = 120, styles: tuple[str, ...] = STYLES) -> Scene:
+def random_scene(seed: int, *, scans: int = 240, styles: tuple[str, ...] = STYLES) -> Scene:
     """A random room, ring, trajectory and noise; the same arguments give the same scene."""
     rng = np.random.default_rng([seed, 20])
     style = styles[seed % len(styles)]

@@ -50,7 +50,7 @@ class CommonCauseSettings:
     """A time offset must be this many standard errors, ..."""
     min_nats: float = 20.0
     """... and raise the log-likelihood by this, nats, ..."""
-    nats_per_echo: float = 0.2
+    nats_per_echo: float = 0.05
     """... and by this for each echo."""
     min_groups: tuple[float, float] = (3.0, 2.0)
     """Groups of scans that scale and time offset must rest on."""
@@ -120,10 +120,16 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
         fit = _with_other_scale(echoes, _search_motion(ring, part, groups, echoes, step))
         if fit is not None and fit.explained < SETTINGS.min_explained * fit.echoes:
             fit = None
-        if fit is not None and (found := _lag_finding(echoes, fit, step)) is not None:
-            findings.append(found)
-            log = with_later_poses(log, float(fit.estimate[LAG]))
-        if fit is not None and (found := _scale_finding(ring, echoes, fit)) is not None:
+        lag = 0.0
+        if fit is not None:
+            as_recorded = fit_motion(echoes, free=(True, False))
+            if (found := _lag_finding(fit, as_recorded, step)) is not None:
+                findings.append(found)
+                lag = float(fit.estimate[LAG])
+                log = with_later_poses(log, lag)
+            elif as_recorded is not None:
+                fit = _with_other_scale(echoes, as_recorded, lag_is_free=False)
+        if fit is not None and (found := _scale_finding(ring, echoes, fit, lag)) is not None:
             findings.append(found)
             log = replace(log, range=log.range / (1 + fit.estimate[SCALE]))
     measured = range_noise(ring, log)
@@ -133,14 +139,13 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
     return CommonCauses(ring, log, sigma, tuple(findings))
 
 
-def _lag_finding(echoes: PosedEchoes, fit: MotionFit, step: float) -> Finding | None:
-    """The finding about a time offset; None if there is none."""
+def _lag_finding(fit: MotionFit, without: MotionFit | None, step: float) -> Finding | None:
+    """The finding about a time offset, by the fits with and without it; None if there is none."""
     lag, error = float(fit.estimate[LAG]), float(fit.error[LAG])
     if fit.groups[LAG] < SETTINGS.min_groups[LAG]:
         return None
     if not abs(lag) > max(SETTINGS.min_lag, SETTINGS.lag_steps * step, SETTINGS.lag_errors * error):
         return None
-    without = fit_motion(echoes, free=(True, False))
     if without is None or (nats := fit.log_likelihood - without.log_likelihood) < max(
         SETTINGS.min_nats, SETTINGS.nats_per_echo * fit.echoes
     ):
@@ -157,21 +162,18 @@ def _lag_finding(echoes: PosedEchoes, fit: MotionFit, step: float) -> Finding | 
     )
 
 
-def _scale_finding(ring: Ring, echoes: PosedEchoes, fit: MotionFit) -> Finding | None:
-    """The finding about the scale of the ranges; None if it is right."""
+def _scale_finding(ring: Ring, echoes: PosedEchoes, fit: MotionFit, lag: float) -> Finding | None:
+    """The finding about the scale of the ranges, by the fit with this time offset; None if it is right."""
     scale, groups = float(fit.estimate[SCALE]), float(fit.groups[SCALE])
     if not abs(scale) > SETTINGS.min_scale or groups < SETTINGS.min_groups[SCALE]:  # also if it is NaN
         return None
-    lag = float(fit.estimate[LAG]) if np.isfinite(fit.estimate[LAG]) else 0.0
-    without = fit_motion(echoes, lag=lag, free=(False, True))
+    without = fit_motion(echoes, lag=lag, free=(False, lag != 0))
     if without is None:
         return None
+    if abs(scale) > SETTINGS.large_scale and fit.explained < SETTINGS.clearly_more * without.explained:
+        return None
     # Odometry that swings while the robot drives straight on looks like motion that the ranges do not show.
-    bias = without.strain / fit.information
-    if abs(scale) > SETTINGS.large_scale:
-        if fit.explained < SETTINGS.clearly_more * without.explained:
-            return None
-        bias = max(bias - scale**2, 0.0)
+    bias = max(without.strain / without.information - scale**2, 0.0)
     error = float(np.linalg.norm([fit.error[SCALE], SETTINGS.odometry_scale, bias]))
     # Student's distribution: the standard error comes from the scatter of a few groups.
     nats = groups / 2 * float(np.log1p((scale / error) ** 2 / (groups - 1)))
@@ -239,12 +241,13 @@ def _mistake_findings(found: Alternative) -> Iterator[Finding]:
         )
 
 
-def _with_other_scale(echoes: PosedEchoes, fit: MotionFit | None) -> MotionFit | None:
+def _with_other_scale(echoes: PosedEchoes, fit: MotionFit | None, *, lag_is_free: bool = True) -> MotionFit | None:
     """The fit, or one of a very different scale that explains clearly more."""
     if fit is None or fit.explained > SETTINGS.badly_explained * fit.echoes:
         return fit
     lag = float(fit.estimate[LAG]) if np.isfinite(fit.estimate[LAG]) else 0.0
-    others = [fit_motion(echoes, scale=scale, lag=lag) for scale in SETTINGS.scale_starts]
+    free = True, lag_is_free
+    others = [fit_motion(echoes, scale=scale, lag=lag, free=free) for scale in SETTINGS.scale_starts]
     best = max((one for one in others if one is not None), key=lambda one: one.log_likelihood, default=fit)
     return best if best.log_likelihood > SETTINGS.clearly_more * fit.log_likelihood else fit
 
