@@ -43,8 +43,8 @@ class ConstantRangeSettings:
     """After the robot has left all walls and points that may have caused the echo, at least this share of the next
     measurements has the echo, ..."""
     returned_relative: float = 0.8
-    """... and at least this multiple of the share of all measurements. Along walls at equal distances, the share of all
-    measurements is larger."""
+    """... and, unless other sensors contradict a wall, at least this multiple of the share of all measurements. Along
+    walls at equal distances, the share of all measurements is larger."""
     extent: float = 0.25
     """Extent of these poses, at least, metres. A robot that only turns may be in the middle of a regular room."""
     same_view: float = 0.2
@@ -124,6 +124,33 @@ def independent_places(
         has_echo: whether each measurement has the echo.
         contradicted: whether other sensors contradict a wall (``is_contradicted``); fewer poses are enough then.
     """
+    margin = max(SETTINGS.min_change, half_width)
+    places, lost = _poses_apart(ring, path, distance, margin, pose, has_echo)
+    if not len(places):
+        return 0
+    driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
+    extent = float(np.hypot(*np.ptp(pose[places, :2], axis=0)))
+    least = SETTINGS.places + SETTINGS.places_per_metre * (driven[places[-1]] - driven[places[0]])
+    least = SETTINGS.places_if_contradicted if contradicted else min(least, SETTINGS.enough)
+    if extent < SETTINGS.extent or len(places) < least:
+        return 0
+    # A few losses may be chance: the same trajectory from its end and from its middle gives more comparisons.
+    found, half = len(places), len(pose) // 2
+    for order in (np.arange(len(pose))[::-1], np.roll(np.arange(len(pose)), half)):
+        again, lost_again = _poses_apart(ring, path, distance, margin, pose[order], has_echo[order])
+        found, lost = found + len(again), lost + lost_again
+    return len(places) if _is_found_again(found, lost, 0.0 if contradicted else float(has_echo.mean())) else 0
+
+
+def _poses_apart(
+    ring: Ring,
+    path: int,
+    distance: float,
+    margin: float,
+    pose: Float[np.ndarray, "measurements 3"],
+    has_echo: Bool[np.ndarray, " measurements"],
+) -> tuple[Int[np.ndarray, " places"], int]:
+    """Poses with the echo, none of which shares a wall or point with one before, and how many such poses lack it."""
     driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
     explained, places, lost, k = np.zeros(len(pose), bool), [], 0, 0
     while len(places) < SETTINGS.enough and len(fresh := np.flatnonzero(~explained[k:])):
@@ -133,16 +160,11 @@ def independent_places(
             k += 1
             continue
         places.append(k)
-        margin = max(SETTINGS.min_change, half_width) + SETTINGS.drift * (driven[k:] - driven[k])
-        here, same = np.broadcast_to(pose[k], pose[k:].shape), np.ones(len(margin))
-        explained[k:] |= may_stay(ring, np.full(len(same), path), distance * same, here, pose[k:], margin)
+        change = margin + SETTINGS.drift * (driven[k:] - driven[k])
+        here, same = np.broadcast_to(pose[k], pose[k:].shape), np.ones(len(change))
+        explained[k:] |= may_stay(ring, np.full(len(same), path), distance * same, here, pose[k:], change)
         explained[k] = True
-    if not places or not _is_found_again(len(places), lost, float(has_echo.mean())):
-        return 0
-    extent = float(np.hypot(*np.ptp(pose[places, :2], axis=0)))
-    least = SETTINGS.places + SETTINGS.places_per_metre * (driven[places[-1]] - driven[places[0]])
-    least = SETTINGS.places_if_contradicted if contradicted else min(least, SETTINGS.enough)
-    return len(places) if extent >= SETTINGS.extent and len(places) >= least else 0
+    return np.array(places, np.int64), lost
 
 
 def distinct_views(

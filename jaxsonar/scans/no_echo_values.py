@@ -60,8 +60,9 @@ class NoEchoSettings:
     """Number of different places at which each of these paths reads an exact value."""
     path_readings: int = 8
     """Paths with fewer readings do not count."""
-    coverage: float = 0.75
-    """Share of the measurements that have an echo, at least, in a log with a noisy value for no echo."""
+    coverage: float = 0.9
+    """Share of the measurements without a nearer echo that have a noisy value, or one beyond it, at least: a driver
+    that sends it instead of nothing sends it always. An echo of the floor is lost now and then."""
     noisy_readings: float = 0.2
     """Share of the echoes that have a noisy value, at least."""
     exact_readings: float = 0.01
@@ -259,8 +260,7 @@ def _found(sample: _Sample) -> Iterator[NoEchoValue]:
     for value in _frequent(sample.range):
         if (mark := _exact(sample, value)) is not None:
             yield mark
-    # A device that sends a noisy value instead of nothing reports every measurement.
-    if sample.has_poses and len(sample.range) >= SETTINGS.coverage * sample.measured.sum():
+    if sample.has_poses:
         for sigma in SETTINGS.noise:
             value = _mode(sample.range, sigma)
             if sigma <= SETTINGS.largest_noise * value and (mark := _noisy(sample, value, sigma)) is not None:
@@ -316,6 +316,9 @@ def _noisy(sample: _Sample, value: float, sigma: float) -> NoEchoValue | None:
     share = float(has_it.mean())
     beyond = np.mean(deviation > width)
     if not SETTINGS.noisy_readings <= share <= SETTINGS.most_readings or beyond > SETTINGS.beyond_noisy:
+        return None
+    nearer = int((deviation < -width).sum())
+    if len(deviation) - nearer < SETTINGS.coverage * (sample.measured.sum() - nearer):
         return None
     if sample.has_others_beside(has_it):
         return None
