@@ -10,8 +10,9 @@ from benchmarks.diagnostics.scenes import Scene, random_scene, with_geometry
 from jaxsonar import Log, Ring
 from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND
 
-LEAST_ECHOES = 25
-"""Direct echoes that a sensor has before its fault, so that the fault shows."""
+LEAST_ECHOES = 50
+"""Direct echoes that a sensor has before its fault, so that the fault shows. A turned or exchanged sensor has as many
+with its fault: one that hears nothing then might as well be dead."""
 SINGLE_ECHO = "direct", "half rings"
 """Styles of rings whose drivers report one range a sensor."""
 
@@ -182,8 +183,11 @@ def _weak(scene: Scene, rng: np.random.Generator) -> Case:
 
 
 def _swapped(scene: Scene, rng: np.random.Generator) -> Case:
+    """Two sensors, half of the time neighbors, are exchanged; each of them has the echoes of the other one."""
     a = _sensor(scene, rng)
-    b = (a + 1) % scene.ring.count if rng.random() < 0.5 else _sensor(scene, rng, other=a)
+    b = (a + 1) % scene.ring.count
+    if rng.random() < 0.5 or _direct_echoes(scene.log(), scene.ring.count)[b] < LEAST_ECHOES:
+        b = _sensor(scene, rng, other=a)
     place = np.arange(scene.ring.count)
     place[[a, b]] = b, a
     ring = scene.ring
@@ -192,10 +196,13 @@ def _swapped(scene: Scene, rng: np.random.Generator) -> Case:
 
 
 def _turned(scene: Scene, rng: np.random.Generator) -> Case:
-    k, turn = _sensor(scene, rng), rng.choice([-1, 1]) * np.radians(rng.uniform(20, 40))
-    ring, heading = scene.ring, np.array(scene.ring.heading, dtype=np.float64)
-    heading[k] += turn
-    log = scene.log(with_geometry(ring, np.asarray(ring.position), heading))
+    for _ in range(10):
+        k, turn = _sensor(scene, rng), rng.choice([-1, 1]) * np.radians(rng.uniform(20, 40))
+        ring, heading = scene.ring, np.array(scene.ring.heading, dtype=np.float64)
+        heading[k] += turn
+        log = scene.log(with_geometry(ring, np.asarray(ring.position), heading))
+        if _direct_echoes(log, ring.count)[k] >= LEAST_ECHOES:
+            break
     return Case("", ring, log, sensors=(k,), detail=f"{np.degrees(turn):.0f} deg")
 
 
@@ -264,10 +271,13 @@ ACCEPTED = {
 
 def _sensor(scene: Scene, rng: np.random.Generator, *, other: int = -1) -> int:
     """A random sensor, other than this one, with enough direct echoes; the one with most of them if none has."""
-    log, count = scene.log(), scene.ring.count
-    echoes = np.bincount(log.tx[log.tx == log.rx], minlength=count) * (np.arange(count) != other)
+    echoes = _direct_echoes(scene.log(), scene.ring.count) * (np.arange(scene.ring.count) != other)
     enough = np.flatnonzero(echoes >= LEAST_ECHOES)
     return int(rng.choice(enough)) if len(enough) else int(np.argmax(echoes))
+
+
+def _direct_echoes(log: Log, count: int) -> Int[np.ndarray, " sensors"]:
+    return np.bincount(log.tx[log.tx == log.rx], minlength=count)
 
 
 def _constant_echo(

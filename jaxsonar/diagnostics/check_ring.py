@@ -9,15 +9,14 @@ from jaxtyping import Int
 
 from jaxsonar.detection.settings import check_sigma
 from jaxsonar.diagnostics.common_causes import find_common_causes
+from jaxsonar.diagnostics.compared_sensors import Comparison, compare_sensors, without_sensors
 from jaxsonar.diagnostics.cross_counts import cross_counts
-from jaxsonar.diagnostics.echo_residuals import predict_and_match
 from jaxsonar.diagnostics.findings import Finding
 from jaxsonar.diagnostics.health_report import OF_SENSORS
 from jaxsonar.diagnostics.health_report import Health as Health
 from jaxsonar.diagnostics.local_scene import scene_from_groups
 from jaxsonar.diagnostics.log_findings import checked_log
 from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
-from jaxsonar.diagnostics.range_offsets import estimate_offsets, stretches_of_scans
 from jaxsonar.diagnostics.reference_scene import (
     ReferenceScene,
     empty_scene,
@@ -27,7 +26,6 @@ from jaxsonar.diagnostics.reference_scene import (
     select_scans,
 )
 from jaxsonar.diagnostics.repeated_ranges import RepeatedRanges
-from jaxsonar.diagnostics.sensor_alternatives import sensor_alternatives
 from jaxsonar.diagnostics.sensor_findings import (
     SensorEvidence,
     described,
@@ -40,7 +38,7 @@ from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.diagnostics.swapped_sensors import find_exchanged_sensors
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.flat_echoes import FlatEchoes
-from jaxsonar.scans.readings import is_repeated, without_readings
+from jaxsonar.scans.readings import is_repeated
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import check_speed_of_sound
@@ -90,16 +88,27 @@ def check(
         ring = replace(ring, beam=np.minimum(np.asarray(ring.beam) * factor, SETTINGS.cones.largest_beam))
         scene = _detect_walls(ring, part, sigma=sigma, by_poses=scene.by_poses)
         as_numbered = measure_sensors(ring, part, scene, sigma)
-    # Are sensors exchanged?
+    # Walls that longer pieces of the trajectory show tell best what a sensor hears.
     detect = partial(_detect_walls, ring, sigma=sigma, by_poses=scene.by_poses)
-    place = find_exchanged_sensors(ring, part, scene, detect) if source else np.arange(ring.count)
-    renumbered = renumber(part, place)
+    gather = partial(scene_from_groups, ring, long=True)
+    gathered = gather(log)
+    has_wall = np.flatnonzero(gathered.is_wall.any(axis=1))
+    # Are sensors exchanged?
+    place = np.arange(ring.count)
+    if len(has_wall):
+        place = find_exchanged_sensors(ring, log, gathered, gather)
+    elif source:
+        place = find_exchanged_sensors(ring, part, scene, detect)
+    renumbered, all_scans = renumber(part, place), renumber(log, place)
     repeated, measured = RepeatedRanges.of(reported, ring.count), MeasuredSensors.of(ring, log)
     heard = np.isfinite(log.range) & ~is_repeated(log)
     direct, cross = heard & (log.tx == log.rx), heard & (log.tx != log.rx)
 
-    def judge(scene: ReferenceScene) -> tuple[Health, SensorEvidence]:
-        """The health of all sensors by these walls, by the sensor numbers of the log."""
+    def walls_without(sensors: Int[np.ndarray, " without"]) -> ReferenceScene:
+        return gather(without_sensors(all_scans, sensors)).at(has_wall)
+
+    def judge(scene: ReferenceScene, known: Int[np.ndarray, " known"]) -> tuple[Health, SensorEvidence]:
+        """The health of all sensors by these walls, without faulty sensors, by the sensor numbers of the log."""
         found = measure_sensors(ring, renumbered, scene, sigma)
         health = Health(
             ring=nominal,
@@ -134,30 +143,27 @@ def check(
             unmeasured=measured.unmeasured,
         )
         without_worst, turn_nats = found.without_worst[place], found.cones.nats[place]
-        # The echoes of a faulty sensor may have spoiled the walls: judge suspects by walls without them.
-        alternatives = list(found.alternatives)
-        noise, offset, error = found.offsets.sigma, found.offsets.offset.copy(), found.offsets.error.copy()
-        for k in found.suspects:
-            apart = detect(_without_sensors(renumbered, np.append(place[accepted], k)))
-            table = predict_and_match(ring, apart, renumbered)
-            again = sensor_alternatives(table, np.asarray(ring.beam) / 2, noise, ring.max_range)[k]
-            by_others = estimate_offsets(table, ring.count, noise, stretches_of_scans(renumbered))
-            if np.isfinite(by_others.offset[k]):
-                offset[k], error[k] = by_others.offset[k], by_others.error[k]
-            # A wall that only this sensor hears is missing now: a fault must show with and without its own echoes.
-            given = alternatives[k]
-            alternatives[k] = again if given is not None and again is not None and given.cause == again.cause else None
-        health = replace(health, offset=offset[place], offset_error=error[place])
+        compared = Comparison((), {})
+        if len(has_wall):
+            compared = compare_sensors(ring, select_scans(all_scans, has_wall), walls_without, known)
+        if scene.by_poses:
+            offset, error = found.offsets.offset.copy(), found.offsets.error.copy()
+            for k, by_others in compared.offset.items():
+                offset[k], error[k] = by_others
+            health = replace(health, offset=offset[place], offset_error=error[place])
         faced = found.expected[place, 0]
         if source and not measured.any.all() and not measured.certain:  # silent, or not measured?
             faced = faced_walls(ring, renumbered, scene)[place]
-        better = {sensor: alternatives[k] for sensor, k in enumerate(place.tolist())} if alternatives else None
+        better = None
+        if compared.alternatives or (not ring.neighbors and scene.by_poses):
+            better = dict(enumerate(compared.alternatives[k] for k in place if compared.alternatives))
         return health, SensorEvidence(repeated.pairs, without_worst, turn_nats, cross_counts(ring, log), faced, better)
 
     accepted: list[int] = []
     # The most certain fault of a sensor is accepted; the others are judged by walls without the echoes of this sensor,
     # which may have spoiled them.
-    health, evidence = judge(scene if (place == np.arange(ring.count)).all() else detect(renumbered))
+    first = scene if (place == np.arange(ring.count)).all() else detect(renumbered)
+    health, evidence = judge(first, np.zeros(0, np.int64))
     findings = plain_findings(health, measured, evidence, faults)
     for _ in range(int(SETTINGS.findings.most_faulty * ring.count) + 1):
         named = {k for one in findings for k in one.sensors}
@@ -165,7 +171,9 @@ def check(
         if not found:
             break
         accepted, kept = [*accepted, *found[0].finding.sensors], list(accepted)
-        others, evidence = judge(detect(_without_sensors(renumbered, place[accepted])) if source else scene)
+        others, evidence = judge(
+            detect(without_sensors(renumbered, place[accepted])) if source else scene, place[accepted]
+        )
         # Measured by these walls, too, the same fault has a better size; otherwise its first measurement stays.
         again = sensor_findings(others, measured, evidence, sigma, named)
         same = [one.finding for one in again if (one.finding.cause, one.finding.sensors) == _key(found[0].finding)]
@@ -189,9 +197,9 @@ def _joined(health: Health, others: Health, accepted: list[int]) -> Health:
     return replace(others, **{name: joined(name) for name in OF_SENSORS})
 
 
-def _without_sensors(log: Log, sensors: Int[np.ndarray, " sensors"]) -> Log:
-    """The log without all readings of these sensors."""
-    return without_readings(log, np.isin(log.tx, sensors) | np.isin(log.rx, sensors))
+def _scans_with_walls(log: Log, scene: ReferenceScene) -> tuple[Log, ReferenceScene]:
+    rows = np.flatnonzero((scene.kind >= 0).any(axis=1))
+    return select_scans(log, rows), scene.at(rows)
 
 
 def _reference_walls(
@@ -210,17 +218,16 @@ def _reference_walls(
         reason = f"{reach}: are ranges half path lengths in metres?"
         return nothing, empty_scene(ring, len(nothing)), "", reason
     scene = scene_from_groups(ring, log)
-    rows = np.flatnonzero((scene.kind >= 0).any(axis=1))
     by_poses = int(scene.is_wall.sum())
     if not ring.neighbors and by_poses >= settings.min_walls:
-        return select_scans(log, rows), scene.at(rows), "poses", ""
+        return *_scans_with_walls(log, scene), "poses", ""
     part = select_scans(log, evenly_spaced(len(log), settings.max_scans))
     alone = scene_from_scans(ring, part, sigma, progress)
     walls = int(alone.is_wall.sum())
     if walls >= max(settings.min_walls, len(part) // 10, settings.min_share * by_poses):
         return part, alone, "scans", ""
     if by_poses:
-        return select_scans(log, rows), scene.at(rows), "poses", ""
+        return *_scans_with_walls(log, scene), "poses", ""
     if np.isfinite(log.pose).all(axis=1).sum() < 2:
         return part, alone, "", "single scans show too few walls, and the log has no poses to gather them by"
     return part, alone, "", "neither single scans nor pieces of the trajectory show walls"

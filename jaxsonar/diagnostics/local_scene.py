@@ -45,15 +45,16 @@ def groups_of_scans(log: Log, groups_of_piece: int = SETTINGS.reference.piece_gr
     return groups
 
 
-def scene_from_groups(ring: Ring, log: Log) -> ReferenceScene:
+def scene_from_groups(ring: Ring, log: Log, *, long: bool | None = None) -> ReferenceScene:
     """The reflectors that several scans of a piece of the trajectory support, in the robot frame of each of them.
 
     Args:
         ring: the sensors.
         log: scans with poses; the others have no reflectors.
+        long: whether pieces are long; None if the sensors do not hear their neighbors.
     """
     settings = SETTINGS.reference
-    long = not ring.neighbors
+    long = not ring.neighbors if long is None else long
     groups = groups_of_scans(log, settings.piece_groups[long])
     echoes = group_echoes(ring, log, groups)
     found = find_reflectors(echoes, echoes.pose, settings.walls_of_piece[long])

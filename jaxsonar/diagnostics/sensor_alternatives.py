@@ -1,6 +1,6 @@
 """What explains the direct echoes of a sensor best: no fault, an offset, another direction, or lost echoes?
 
-For rings whose sensors do not overlap and whose walls the poses of the log gather. Each explanation predicts which
+The poses of the log gather the walls. Each explanation predicts which
 walls the sensor must hear and at which ranges, so that echoes where none is expected and missing echoes both count. How
 often sound sensors miss an expected echo, and have echoes of something else, is measured on the sensors of the same
 log. Only walls that other sensors support are used.
@@ -93,6 +93,8 @@ def sensor_alternatives(
 ) -> list[SensorAlternative | None]:
     """The best explanation of the echoes of each sensor; None for a sound sensor, or one that cannot be judged.
 
+    Empty if the walls explain too little to judge any sensor.
+
     Args:
         table: expected and reported echoes.
         half_width: half width of the cone of each sensor, radians.
@@ -102,7 +104,7 @@ def sensor_alternatives(
     rows, stated, gate = _stated(table, half_width, noise)
     rates = _usual_rates(rows, stated)
     if rates is None:
-        return [None] * len(rows)
+        return []
     sides = zip(rows, stated, half_width, strict=True)
     return [_best(one, counts, half, gate, max_range, rates) for one, counts, half in sides]
 
@@ -255,7 +257,7 @@ def _best(
         best = int(np.argmin(np.abs(values - mean)))
         explained, before = int(tried[best].explained.sum()), int(stated.explained.sum())
         enough = explained >= max(_SETTINGS.fitting * usual_share, SETTINGS.findings.min_expected)
-        enough &= before < _SETTINGS.least_rate * usual_share
+        enough &= before < (1 - _SETTINGS.min_gain) * usual_share
         enough &= explained - before >= max(SETTINGS.findings.min_expected, _SETTINGS.min_gain * heard)
         # Another direction or an offset that explains some echoes is in doubt: then the sensor is not called astray.
         most = max(int(one.explained.sum()) for one in tried)

@@ -39,7 +39,7 @@ class SensorEvidence(NamedTuple):
     faced: Int[np.ndarray, " sensors"]
     """Expected direct echoes of walls well inside the cone, also of sensors that the log never measured."""
     alternatives: dict[int, SensorAlternative | None] | None = None
-    """``SensorMeasurements.alternatives`` by sensor; None if they were not compared."""
+    """``Comparison.alternatives`` by sensor; None if they were not compared."""
 
 
 def sensor_findings(

@@ -10,7 +10,6 @@ from jaxsonar.diagnostics.beam_width import EachCone, count_by_angle, fit_cone, 
 from jaxsonar.diagnostics.echo_residuals import ResidualTable, explained_fraction, predict_and_match
 from jaxsonar.diagnostics.range_offsets import OffsetEstimate, estimate_offsets, stretches_of_scans
 from jaxsonar.diagnostics.reference_scene import ReferenceScene
-from jaxsonar.diagnostics.sensor_alternatives import SensorAlternative, sensor_alternatives, suspects
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -44,11 +43,6 @@ class SensorMeasurements(NamedTuple):
     """Scatter of the residuals of its direct echoes, and of all its echoes, metres."""
     explained: Float[np.ndarray, " sensors"]
     """Fraction of its echoes that reflectors explain."""
-    alternatives: tuple[SensorAlternative | None, ...]
-    """What explains the echoes of each sensor better than a sound sensor; None where nothing does. Only for sensors
-    that do not overlap and walls that the poses gather; else empty."""
-    suspects: tuple[int, ...]
-    """Sensors whose echoes may have spoiled these walls."""
 
 
 def measure_sensors(ring: Ring, log: Log, scene: ReferenceScene, sigma: float | None) -> SensorMeasurements:
@@ -78,7 +72,6 @@ def measure_sensors(ring: Ring, log: Log, scene: ReferenceScene, sigma: float | 
     cones = fit_each_cone(expected_by_angle, detected_by_angle, curve)
     scale = beam[:, None] / beam.mean()  # angles were counted on the scale of the mean cone
     # Summarize residuals and explained echoes.
-    compared = scene.by_poses and not ring.neighbors
     gate = SETTINGS.detection.explained_gate * noise + SETTINGS.detection.explained_margin
     return SensorMeasurements(
         offsets,
@@ -92,8 +85,6 @@ def measure_sensors(ring: Ring, log: Log, scene: ReferenceScene, sigma: float | 
         EachCone(cones.half_width * scale, cones.direction * scale, cones.nats),
         *_residual_statistics(table, offsets, ring.count),
         explained_fraction(table, gate, ring.count),
-        tuple(sensor_alternatives(table, beam / 2, noise, ring.max_range)) if compared else (),
-        tuple(suspects(table, beam / 2, noise)) if compared else (),
     )
 
 

@@ -16,8 +16,8 @@ class ReferenceSettings:
     block_scans: int = 32
     """Scans per compiled step."""
     piece_groups: tuple[int, int] = (2, 6)
-    """Groups of ``pose_agreement`` that make one piece of the trajectory: up to 1.6 m; up to 5 m for sensors that do
-    not hear their neighbors, because they see the same walls on such a way only."""
+    """Groups of ``pose_agreement`` that make one piece of the trajectory: up to 1.6 m; up to 5 m to compare what
+    explains the echoes of a sensor, because sensors see the same walls on such a way only."""
     scans_of_group: int = 20
     """Largest number of scans of a piece for each of its groups."""
     min_share: float = 0.6
@@ -109,8 +109,9 @@ class OffsetSettings:
 class SwapSettings:
     """Search for exchanged sensors."""
 
-    max_scans: int = 100
-    """Number of scans that are analysed; longer logs are sampled evenly."""
+    max_scans: tuple[int, int] = (100, 300)
+    """Number of scans that are analysed; longer logs are sampled evenly. The second one counts if the poses gather the
+    walls."""
     iterations: int = 3
     """Largest number of successive exchanges."""
     discount: float = 0.25

@@ -71,9 +71,10 @@ def find_exchanged_sensors(
         scene: reference reflectors of this log.
         detect: gives the reflectors of a log.
     """
+    rows = evenly_spaced(len(log), SETTINGS.swaps.max_scans[scene.by_poses])
     if not scene.by_poses:
-        rows = evenly_spaced(len(log), SETTINGS.swaps.max_scans)
         log, scene = select_scans(log, rows), scene.at(rows)
+        rows = np.arange(len(log))
 
     def evaluate(place: Int[np.ndarray, " sensors"], before: Int[np.ndarray, " sensors"]) -> _Hypothesis:
         renumbered = renumber(log, place)
@@ -84,9 +85,11 @@ def find_exchanged_sensors(
         else:
             # Too few echoes for that. Detect the walls with the exchanged numbers: they improve if these are right.
             others = renumbered
-        return _Hypothesis(place, position_log_likelihood(ring, detect(others), renumbered))
+        of_rows = position_log_likelihood(ring, detect(others).at(rows), select_scans(renumbered, rows))
+        return _Hypothesis(place, of_rows)
 
-    current = _Hypothesis(np.arange(ring.count), position_log_likelihood(ring, scene, log))
+    as_numbered = position_log_likelihood(ring, scene.at(rows), select_scans(log, rows))
+    current = _Hypothesis(np.arange(ring.count), as_numbered)
     for _ in range(SETTINGS.swaps.iterations):
         before = current.place
         evaluated = (evaluate(found[before], before) for found in _propose_exchanges(current.log_likelihood))
