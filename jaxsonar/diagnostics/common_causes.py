@@ -40,6 +40,8 @@ _Groups = Sequence[Int[np.ndarray, "_"]]
 class CommonCauseSettings:
     """When a common cause is reported. Chosen by hand on random rooms of the simulator."""
 
+    group: int = 16
+    """Scans of a group in which scale and time offset are estimated: 1.3 m of the trajectory."""
     min_explained: float = 0.4
     """Share of the echoes that walls and points must explain before scale and time offset are judged."""
     min_lag: float = 0.03
@@ -54,7 +56,7 @@ class CommonCauseSettings:
     """... and by this for each echo."""
     min_groups: tuple[float, float] = (3.0, 2.0)
     """Groups of scans that scale and time offset must rest on."""
-    scale_nats: float = 3.5
+    scale_nats: float = 4.0
     """Evidence from which on a scale error is reported, nats."""
     scale_starts: tuple[float, ...] = (-0.5, 1.0)
     """Scale errors that are tried (one way instead of both, or the reverse) ..."""
@@ -112,7 +114,7 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
     # In a wrong unit, ordinary steps look like jumps.
     findings += [_jump_finding(one) for one in implausible_odometry(ring, log)]
     # Only the scans of some groups are compared: the rest of a long log costs nothing.
-    part, groups = part_of_groups(log, select_groups(log))
+    part, groups = part_of_groups(log, select_groups(log, SETTINGS.group))
     if (repeated := repeated_scans(log)) is not None:
         findings.append(repeated)
     elif groups:
@@ -167,14 +169,11 @@ def _scale_finding(ring: Ring, echoes: PosedEchoes, fit: MotionFit, lag: float) 
     scale, groups = float(fit.estimate[SCALE]), float(fit.groups[SCALE])
     if not abs(scale) > SETTINGS.min_scale or groups < SETTINGS.min_groups[SCALE]:  # also if it is NaN
         return None
-    without = fit_motion(echoes, lag=lag, free=(False, lag != 0))
-    if without is None:
-        return None
-    if abs(scale) > SETTINGS.large_scale and fit.explained < SETTINGS.clearly_more * without.explained:
-        return None
-    # Odometry that swings while the robot drives straight on looks like motion that the ranges do not show.
-    bias = max(without.strain / without.information - scale**2, 0.0)
-    error = float(np.linalg.norm([fit.error[SCALE], SETTINGS.odometry_scale, bias]))
+    if abs(scale) > SETTINGS.large_scale:
+        without = fit_motion(echoes, lag=lag, free=(False, lag != 0))
+        if without is None or fit.explained < SETTINGS.clearly_more * without.explained:
+            return None
+    error = float(np.hypot(fit.error[SCALE], SETTINGS.odometry_scale))
     # Student's distribution: the standard error comes from the scatter of a few groups.
     nats = groups / 2 * float(np.log1p((scale / error) ** 2 / (groups - 1)))
     if nats < SETTINGS.scale_nats:

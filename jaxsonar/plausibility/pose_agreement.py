@@ -128,22 +128,26 @@ def bounded(pose: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"
     return np.clip(pose, -limit, limit)
 
 
-def select_groups(log: Log) -> list[Int[np.ndarray, "_"]]:
+def select_groups(log: Log, group: int = SETTINGS.group) -> list[Int[np.ndarray, "_"]]:
     """Groups of scans that are compared with each other: rows of the log, in order.
 
     The scans of a group follow each other along the trajectory at distances at which echoes change. A robot that waits
     adds no scan. The list is empty if the log has no poses or the robot hardly moves.
+
+    Args:
+        log: the scans.
+        group: scans of a group.
     """
     posed = np.flatnonzero(np.isfinite(log.pose).all(axis=1))
     pose = bounded(log.pose[posed])
     if len(posed) <= SETTINGS.long_log:
         row = spaced_scans(pose, len(pose), spacing=SETTINGS.spacing, turn=SETTINGS.turn)
-        groups = [row[k : k + SETTINGS.group] for k in range(0, len(row), SETTINGS.group)]
+        groups = [row[k : k + group] for k in range(0, len(row), group)]
     else:
         bounds = np.linspace(0, len(pose), SETTINGS.groups + 1).astype(int)
         pairs = pairwise(bounds)
         limits = {"spacing": SETTINGS.spacing, "turn": SETTINGS.turn}
-        groups = [begin + spaced_scans(pose[begin:end], SETTINGS.group, **limits) for begin, end in pairs]
+        groups = [begin + spaced_scans(pose[begin:end], group, **limits) for begin, end in pairs]
     groups = [posed[one] for one in groups if len(one) >= SETTINGS.least_group]
     if len(groups) > SETTINGS.groups:
         groups = [groups[k] for k in np.linspace(0, len(groups) - 1, SETTINGS.groups).round().astype(int)]

@@ -43,6 +43,8 @@ class MotionFitSettings:
     """Errors of a short step of it."""
     slip: float = 0.01
     """Error of a turn, as a share of it."""
+    known_errors: float = 10.0
+    """Confidence in these errors of odometry: they count like this many errors that were observed."""
     min_information: float = 1.0
     """Information (inverse variance) from which on a parameter is observable."""
     largest_step: tuple[float, float] = (0.1, 0.2)
@@ -65,10 +67,6 @@ class MotionFit:
     """Standard errors, from the noise, the odometry, and the scatter between groups of scans."""
     groups: Float[np.ndarray, " 2"]
     """Number of groups of scans that the estimates rest on, each counted by its share of the information."""
-    information: float
-    """Information about the scale if the errors of the poses were as assumed: the inverse of its variance."""
-    strain: float
-    """Weighted sum of squares of the corrections of the poses."""
     noise: float
     """Robust standard deviation of the residuals, metres."""
     explained: int
@@ -115,10 +113,10 @@ def _solve(
 ) -> MotionFit:
     """Robust least squares over reflectors, poses and the two parameters."""
     value, parts = start.copy(), [_Part(groups, found, number) for number in np.unique(found.group).tolist()]
-    noise, residual = SETTINGS.first_noise, np.zeros(0)
+    noise, drift, residual = SETTINGS.first_noise, 1.0, np.zeros(0)
     reduced: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(SETTINGS.iterations):
-        reduced = [part.reduced_system(value, noise) for part in parts]
+        reduced = [part.reduced_system(value, noise, drift) for part in parts]
         total, pull = (np.sum(one, axis=0) for one in zip(*reduced, strict=True))
         step = _solution(total, pull, free)
         for part in parts:
@@ -128,14 +126,14 @@ def _solve(
         # Reflectors and poses adapt to the noise: the residuals are smaller than it.
         left = 1 - min(sum(part.fitted for part in parts) / len(residual), SETTINGS.most_fitted)
         noise = max(residual_noise(residual) / np.sqrt(left), SETTINGS.min_noise)
+        # The corrections of the poses show how good the odometry is, as far as they are observed.
+        strain, observed = sum(part.strain for part in parts), sum(part.observed for part in parts)
+        drift = max((strain + SETTINGS.known_errors) / (observed + SETTINGS.known_errors), 1.0)
     scatter = residual_noise(residual)
     explained = int((biweight(residual, scatter) > 0).sum())
     information, gradient = (np.array(one) for one in zip(*reduced, strict=True))
-    strain = sum(part.strain for part in parts)
     estimate, error, count = _errors(information, gradient, value, free)
-    known = _scale_information(information, free)
-    max_range = groups.ring.max_range
-    return MotionFit(estimate, error, count, known, strain, scatter, explained, len(groups.path), max_range)
+    return MotionFit(estimate, error, count, scatter, explained, len(groups.path), groups.ring.max_range)
 
 
 class _Part:
@@ -153,6 +151,7 @@ class _Part:
         self.correction = np.zeros((len(rows), 3))
         self.prior = _odometry_information(groups.pose[self.echo[first]])
         self.fitted = 0.0
+        self.observed = 0.0
         self.system: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def residual(self, value: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " echoes"]:
@@ -174,9 +173,12 @@ class _Part:
         return predicted, np.column_stack([predicted.d_range_d_midpoint, turning])
 
     def reduced_system(
-        self, value: Float[np.ndarray, " 2"], noise: float
+        self, value: Float[np.ndarray, " 2"], noise: float, drift: float
     ) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, " 2"]]:
-        """Normal equations of the two parameters; reflectors and poses are eliminated (Schur complement)."""
+        """Normal equations of the two parameters; reflectors and poses are eliminated (Schur complement).
+
+        ``drift`` is the variance of the odometry divided by the assumed one.
+        """
         predicted, d_pose = self._predict(value[LAG])
         factor, row = 1 + value[SCALE], np.arange(len(self.echo))
         residual = self.measured - factor * predicted.range
@@ -197,11 +199,13 @@ class _Part:
         gradient = jacobian.T @ (weight * residual)
         own, rest = slice(0, poses + landmarks), slice(poses + landmarks, None)
         data = information[own, own].copy()
-        information[:poses, :poses] += self.prior
-        gradient[:poses] -= self.prior @ self.correction.ravel()
+        prior = self.prior / drift
+        information[:poses, :poses] += prior
+        gradient[:poses] -= prior @ self.correction.ravel()
         information[own, own] += SETTINGS.prior_information * np.eye(poses + landmarks)
         cov = np.linalg.inv(information[own, own])
         self.fitted = float((cov * data).sum())
+        self.observed = poses - float((cov[:poses, :poses] * prior).sum())
         coupling = information[own, rest]
         self.system = cov, coupling, gradient[own]
         return information[rest, rest] - coupling.T @ cov @ coupling, gradient[rest] - coupling.T @ cov @ gradient[own]
@@ -244,13 +248,6 @@ def _solution(
     which = np.flatnonzero(free & (np.diag(information) > SETTINGS.min_information))
     step[which] = np.linalg.solve(information[np.ix_(which, which)], gradient[which]) if len(which) else 0
     return np.clip(step, -np.array(SETTINGS.largest_step), SETTINGS.largest_step)
-
-
-def _scale_information(information: Float[np.ndarray, "groups 2 2"], free: Bool[np.ndarray, " 2"]) -> float:
-    """Information about the scale, whether it is free or not."""
-    total = information.sum(axis=0)
-    shared = total[SCALE, LAG] ** 2 / total[LAG, LAG] if free[LAG] and total[LAG, LAG] > 0 else 0.0
-    return float(total[SCALE, SCALE] - shared)
 
 
 def _errors(
