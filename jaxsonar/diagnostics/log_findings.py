@@ -10,16 +10,10 @@ import numpy as np
 from jaxsonar.diagnostics.findings import Finding
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.plausibility.constant_ranges import range_resolution
-from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
 from jaxsonar.plausibility.implausibility import Implausibility
-from jaxsonar.plausibility.implausible_ring import implausible_ring
-from jaxsonar.plausibility.implausible_stamps import implausible_stamps
-from jaxsonar.plausibility.prepared_log import no_echo_warning
-from jaxsonar.plausibility.range_units import find_range_unit
-from jaxsonar.plausibility.robot_echoes import RobotEcho, RobotEchoes, find_robot_echoes, without_robot_echoes
-from jaxsonar.scans.no_echo_values import find_no_echo_values, without_no_echo_values
+from jaxsonar.plausibility.prepared_log import CleanedLog, no_echo_warning
+from jaxsonar.plausibility.robot_echoes import RobotEcho, RobotEchoes
 from jaxsonar.scans.scan_log import Log
-from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.sensors.ring import Ring
 
 _FINDINGS = SETTINGS.findings
@@ -41,10 +35,11 @@ def checked_log(ring: Ring, log: Log) -> CheckedLog:
 
     Args:
         ring: the sensors.
-        log: the scans, as they were recorded.
+        log: one scan or more, as they were recorded.
     """
-    findings = [_of_input(one) for one in implausible_stamps(log)]
-    if values := find_no_echo_values(log):
+    cleaned = CleanedLog.of(ring, log)
+    findings = [_of_input(one) for one in cleaned.stamps]
+    if values := cleaned.no_echo:
         listed = ", ".join(map(str, values))
         findings.append(
             Finding(
@@ -56,9 +51,7 @@ def checked_log(ring: Ring, log: Log) -> CheckedLog:
                 no_echo_warning(values).remedy,
             )
         )
-        log = without_no_echo_values(log, values)
-    log = group_firings(log)
-    if held := find_held_readings(ring, log):
+    if held := cleaned.held:
         findings.append(
             Finding(
                 "held readings",
@@ -69,18 +62,14 @@ def checked_log(ring: Ring, log: Log) -> CheckedLog:
                 "let the driver report nothing instead of the last range",
             )
         )
-    log = with_ages(log, held)
-    robot = find_robot_echoes(ring, log)
-    findings += _robot_findings(log, robot)
-    checked = without_robot_echoes(log, robot)
-    # Nothing is concluded from a ring that is wrong itself.
-    unit = None if any(implausible_ring(ring)) else find_range_unit(ring, checked)
+    findings += _robot_findings(cleaned.reported, cleaned.robot)
+    checked, reported, unit = cleaned.log, cleaned.reported, cleaned.unit
     if unit is not None:
         by_poses = bool(np.isfinite(unit.share))
         findings.insert(0, _of_input(unit.implausibility, _FINDINGS.certain if by_poses else 0.5))
         if by_poses:
-            checked, log = unit.corrected(checked), unit.corrected(log)
-    return CheckedLog(checked, log, tuple(findings))
+            checked, reported = unit.corrected(checked), unit.corrected(reported)
+    return CheckedLog(checked, reported, tuple(findings))
 
 
 def _of_input(found: Implausibility, confidence: float = _FINDINGS.certain) -> Finding:

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxsonar.plausibility.held_readings import find_held_readings, with_ages
+from jaxsonar.plausibility.held_readings import HeldReadings, find_held_readings, with_ages
 from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.plausibility.implausible_poses import implausible_poses
 from jaxsonar.plausibility.implausible_ring import implausible_ring
 from jaxsonar.plausibility.implausible_stamps import implausible_stamps
 from jaxsonar.plausibility.odometry_jumps import implausible_odometry
-from jaxsonar.plausibility.range_units import find_range_unit
-from jaxsonar.plausibility.robot_echoes import find_robot_echoes, without_robot_echoes
+from jaxsonar.plausibility.range_units import RangeUnit, find_range_unit
+from jaxsonar.plausibility.robot_echoes import RobotEchoes, find_robot_echoes, without_robot_echoes
 from jaxsonar.plausibility.unheard_paths import unheard_warning
 from jaxsonar.scans.no_echo_values import NoEchoValue, find_no_echo_values, without_no_echo_values
 from jaxsonar.scans.scan_log import Log
@@ -22,6 +22,59 @@ from jaxsonar.sensors.ring import Ring
 _EMPTY = Implausibility(
     "empty log", "the log has no scan", "the recording probably ended before the first scan", "record it again"
 )
+
+
+@dataclass(frozen=True, eq=False)
+class CleanedLog:
+    """A log without readings that are no echoes of the surroundings, with what was found on the way."""
+
+    log: Log
+    """Full scans without marks for no echo and without echoes of the robot; old readings have an age. A sound log of
+    full scans is unchanged."""
+    reported: Log
+    """The same with the echoes of the robot."""
+    heard: Log
+    """The log as it was recorded, without marks for no echo."""
+    is_merged: bool
+    """Whether firings were scans of their own."""
+    stamps: tuple[Implausibility, ...]
+    """Probable mistakes of the stamps."""
+    no_echo: tuple[NoEchoValue, ...]
+    """Ranges that mean no echo."""
+    held: HeldReadings
+    """Readings that repeat the last range because the sensor heard nothing."""
+    robot: RobotEchoes
+    """Echoes that move with the robot."""
+    unit: RangeUnit | None
+    """A probable other unit of the ranges; None if it is metres, or if the ring itself is implausible."""
+    ring_is_plausible: bool
+    """Whether something can be concluded from the ring."""
+
+    @classmethod
+    def of(cls, ring: Ring, log: Log) -> "CleanedLog":
+        """Remove what is no echo of the surroundings, and test stamps and units.
+
+        - Ranges that mean no echo (``find_no_echo_values``) become silent readings.
+        - Firings that are scans of their own are merged into scans (``group_firings``).
+        - Readings that repeat the last range because the sensor heard nothing get an age (``find_held_readings``).
+        - Echoes that move with the robot are removed (``find_robot_echoes``).
+
+        Args:
+            ring: the sensors.
+            log: one scan or more, as they were recorded.
+        """
+        stamps = tuple(implausible_stamps(log))
+        values = tuple(find_no_echo_values(log))
+        heard = without_no_echo_values(log, values) if values else log
+        grouped = group_firings(heard)
+        held = find_held_readings(ring, grouped)
+        reported = with_ages(grouped, held)
+        robot = find_robot_echoes(ring, reported)
+        cleaned = without_robot_echoes(reported, robot)
+        # Nothing is concluded from a ring that is wrong itself.
+        plausible = not any(implausible_ring(ring))
+        unit = find_range_unit(ring, cleaned) if plausible else None
+        return cls(cleaned, reported, heard, grouped is not heard, stamps, values, held, robot, unit, plausible)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +90,7 @@ class PreparedLog:
 
     @classmethod
     def of(cls, ring: Ring, log: Log) -> "PreparedLog":
-        """Prepare a log and look for mistakes.
-
-        - Ranges that mean no echo (``find_no_echo_values``) become silent readings.
-        - Firings that are scans of their own are merged into scans (``group_firings``).
-        - Readings that repeat the last range because the sensor heard nothing get an age (``find_held_readings``).
-        - Echoes that move with the robot are removed (``find_robot_echoes``).
+        """Prepare a log (``CleanedLog.of``) and look for mistakes.
 
         A probable mistake in the units or the numbering of a log is reported, but not corrected.
 
@@ -52,34 +100,30 @@ class PreparedLog:
         """
         if not len(log):
             return cls(log, (_EMPTY,), ())
-        warnings, notes = [*implausible_stamps(log)], []
-        if values := find_no_echo_values(log):
-            warnings.append(no_echo_warning(values))
-            log = without_no_echo_values(log, values)
-        if unheard := unheard_warning(ring, log):
+        found = CleanedLog.of(ring, log)
+        warnings, notes = [*found.stamps], []
+        if found.no_echo:
+            warnings.append(no_echo_warning(found.no_echo))
+        if unheard := unheard_warning(ring, found.heard):
             warnings.append(unheard)
-        grouped = group_firings(log)
-        if grouped is not log:
-            scans = f"{len(grouped)} scan{'s' * (len(grouped) != 1)}"
+        if found.is_merged:
+            scans = f"{len(found.log)} scan{'s' * (len(found.log) != 1)}"
             notes.append(f"{len(log)} scans with one firing each are merged into {scans}")
-        if held := find_held_readings(ring, grouped):
+        if found.held:
             remedy = "let the driver report nothing instead"
-            warnings.append(Implausibility("held readings", held.describe(), "each range counts once", remedy))
-        prepared = with_ages(grouped, held)
-        if robot := find_robot_echoes(ring, prepared):
-            warnings.append(robot.warning())
-            prepared = without_robot_echoes(prepared, robot)
+            warnings.append(Implausibility("held readings", found.held.describe(), "each range counts once", remedy))
+        if found.robot:
+            warnings.append(found.robot.warning())
+        unit = found.unit
+        if unit:
+            warnings.append(unit.implausibility)
         # Nothing is concluded from a ring that is wrong itself, nor from ranges whose unit is unknown.
-        if not any(implausible_ring(ring)):
-            unit = find_range_unit(ring, prepared)
-            if unit:
-                warnings.append(unit.implausibility)
-            if unit is None or np.isfinite(unit.scale):
-                warnings += implausible_poses(ring, unit.corrected(prepared) if unit else prepared)
+        if found.ring_is_plausible and (unit is None or np.isfinite(unit.scale)):
+            warnings += implausible_poses(ring, unit.corrected(found.log) if unit else found.log)
         # In a wrong unit, ordinary steps look like jumps.
         if not any(one.kind in ("pose unit", "heading unit") for one in warnings):
-            warnings += implausible_odometry(ring, prepared)
-        return cls(prepared, tuple(warnings), tuple(notes))
+            warnings += implausible_odometry(ring, found.log)
+        return cls(found.log, tuple(warnings), tuple(notes))
 
 
 def prepared_log(ring: Ring, log: Log, *, on_note: Callable[[str], None]) -> Log:
