@@ -1,6 +1,6 @@
 """``LiveMap``: raw scans of a device to lines at once, and to a map that grows."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -16,6 +16,7 @@ from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.trajectory import Trajectory
 from jaxsonar.graph_slam.incremental_mapper import Mapper
 from jaxsonar.hardware.scan_assembler import RawScan
+from jaxsonar.live.robot_echo_filter import RobotEchoFilter
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.scans.firing_poses import path_poses_of_scan
 from jaxsonar.scans.raw_scans import scan_from_raw
@@ -66,6 +67,7 @@ class LiveMap:
         sigma: float | None = None,
         mapping: bool = True,
         odometry_noise: OdometryNoise | None = None,
+        on_warning: Callable[[str], None] | None = None,
     ):
         """An empty map.
 
@@ -77,6 +79,7 @@ class LiveMap:
             mapping: False: detect lines only, at a fraction of the computing time.
             odometry_noise: noise of the device's poses. If given, they are odometry, and the poses of the robot are
                 estimated for the map and for the scans that ``process`` returns. By default they are exact.
+            on_warning: called with a message of one line, such as that a sensor hears the robot itself.
 
         Raises:
             SonarError: as in ``local_models``.
@@ -100,6 +103,7 @@ class LiveMap:
         self._stamps: list[float] = []
         self._temperature = float("nan")
         self._path_index = ring.path_index
+        self._robot_echoes = RobotEchoFilter(ring, on_warning=on_warning)
 
     def warm_up(self) -> None:
         """Compile the programs that the first scans need, by processing synthetic scans."""
@@ -136,7 +140,7 @@ class LiveMap:
         self._mapper.map(state)
 
     def process(self, raw_scans: Sequence[RawScan]) -> list[LiveScan]:
-        """Detect the lines of some scans.
+        """Detect the lines of some scans, without the echoes of the robot itself.
 
         Args:
             raw_scans: scans in order of arrival.
@@ -147,6 +151,7 @@ class LiveMap:
         scans = [scan_from_raw(raw) for raw in raw_scans]
         self._follow_temperature(raw_scans)
         self._count_echoes(scans)
+        scans = self._robot_echoes.clean(scans)
         poses = [self._path_pose(scan) for scan in scans]
         robot_stood = all(pose is None for pose in poses)
         if len(scans) >= SETTINGS.min_batch and self._options["method"] == "hough" and robot_stood:

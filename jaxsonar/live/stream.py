@@ -67,7 +67,7 @@ def stream(
         view: viewer of the stream.
         on_scan: called for every scan with its local model.
         on_status: called several times per second with the status.
-        on_event: called for every link event, in the reading thread.
+        on_event: called for every link event, in the reading thread, and for warnings about the echoes (``note``).
         stop: set this event, from any thread or signal handler, to stop. Everything received is still written. If only
             a recording is requested, a running compilation is not waited for: its daemon thread remains, and
             ``Status.warm`` is False.
@@ -85,7 +85,20 @@ def stream(
         )
     # 1. The live map, and the reader: device -> recording -> queue.
     mapping = bool(map_filename) or view is not None
-    live = LiveMap(ring, method=method, settings=settings, sigma=sigma, mapping=mapping, odometry_noise=odometry_noise)
+
+    def on_warning(text: str) -> None:
+        if on_event is not None:
+            on_event(LinkEvent("note", text))
+
+    live = LiveMap(
+        ring,
+        method=method,
+        settings=settings,
+        sigma=sigma,
+        mapping=mapping,
+        odometry_noise=odometry_noise,
+        on_warning=on_warning,
+    )
     queue = DropOldestQueue[RawScan](SETTINGS.warm_up_capacity, size_of=lambda scan: len(scan.echoes))
     stop = threading.Event() if stop is None else stop
     open_device = partial(open_source, url, wait=wait, stop=stop)

@@ -130,6 +130,11 @@ class RobotEchoes:
         """Sensors whose direct echo is of the robot."""
         return tuple(sorted({one.tx for one in self.echoes if one.tx == one.rx}))
 
+    @property
+    def paths(self) -> frozenset[tuple[int, int]]:
+        """Their paths (tx, rx)."""
+        return frozenset((one.tx, one.rx) for one in self.echoes)
+
     def mask(self, log: Log) -> Bool[np.ndarray, " readings"]:
         """The readings of a log that are echoes of the robot."""
         found = np.zeros(len(log.range), bool)
