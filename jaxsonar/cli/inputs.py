@@ -20,9 +20,6 @@ from jaxsonar.cli.console import errors_in, print_status
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.reports.text import plural
 
-_NO_FINDINGS = ("empty log", "unheard paths", "explained share")
-"""Kinds of probable mistakes of a log that ``check`` does not report itself, as findings."""
-
 LOG_HELP = "scan log (CSV, Parquet), raw record (MCAP, extra live), ROS bag (extra ros), or what --from names"
 
 _TABLE_OPTIONS = {"ranges": "range_columns", "time": "time_column", "pose": "pose_columns"}
@@ -246,7 +243,6 @@ def load_all_inputs(
     messages: InputMessages | None = None,
 ) -> tuple["Ring", list["Log"]]:
     """Load the ring of a command and several logs, as ``load_inputs``."""
-    from jaxsonar.plausibility.implausible_input import implausible_input
     from jaxsonar.plausibility.prepared_log import prepared_log
 
     messages = messages or InputMessages(strict=options.strict)
@@ -255,11 +251,7 @@ def load_all_inputs(
     for name in filenames:
         log = read_log(name, options, messages, ring=ring)
         with errors_in(name):
-            if as_recorded and not options.strict:
-                for found in implausible_input(ring, log):
-                    if found.kind in _NO_FINDINGS:
-                        messages.warn(str(found))
-            else:
+            if options.strict or not as_recorded:
                 prepared = prepared_log(ring, log, on_note=messages.note)
                 log = log if as_recorded else prepared
         logs.append(log)

@@ -17,6 +17,7 @@ from jaxsonar.diagnostics.time_offset import search_step, search_time_offsets, w
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.plausibility.alternatives import Alternative, find_mistakes
 from jaxsonar.plausibility.implausibility import Implausibility
+from jaxsonar.plausibility.implausible_poses import unrelated_poses
 from jaxsonar.plausibility.odometry_jumps import implausible_odometry
 from jaxsonar.plausibility.pose_agreement import part_of_groups, select_groups
 from jaxsonar.plausibility.range_noise import range_noise
@@ -134,6 +135,8 @@ def find_common_causes(ring: Ring, log: Log, *, sigma: float | None = None) -> C
         if fit is not None and (found := _scale_finding(ring, echoes, fit, lag)) is not None:
             findings.append(found)
             log = replace(log, range=log.range / (1 + fit.estimate[SCALE]))
+    if not findings:
+        findings += [Finding(one.kind, (), one.what, 0.99, one.cause, one.remedy) for one in unrelated_poses(ring, log)]
     measured = range_noise(ring, log)
     if sigma is not None and max(measured / sigma, sigma / measured) > SETTINGS.noise_ratio:
         findings.append(_noise_finding(sigma, measured))

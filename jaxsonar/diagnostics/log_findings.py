@@ -13,6 +13,7 @@ from jaxsonar.plausibility.constant_ranges import range_resolution
 from jaxsonar.plausibility.implausibility import Implausibility
 from jaxsonar.plausibility.prepared_log import CleanedLog, no_echo_warning
 from jaxsonar.plausibility.robot_echoes import RobotEcho, RobotEchoes
+from jaxsonar.plausibility.unheard_paths import unheard_warning
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -69,6 +70,8 @@ def checked_log(ring: Ring, log: Log) -> CheckedLog:
         findings.insert(0, _of_input(unit.implausibility, _FINDINGS.certain if by_poses else 0.5))
         if by_poses:
             checked, reported = unit.corrected(checked), unit.corrected(reported)
+    if unheard := unheard_warning(ring, cleaned.heard):
+        findings.append(_of_input(unheard))
     return CheckedLog(checked, reported, tuple(findings))
 
 

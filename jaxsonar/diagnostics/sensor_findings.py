@@ -359,15 +359,6 @@ def _ring_findings(health: Health, measured: MeasuredSensors, faults: Sequence[F
             f"if it means no echo, let the driver report nothing, or use --no-echo {value:.6g}",
         )
     all_echoes = int(health.direct.sum() + health.cross.sum() // 2)
-    if measured.any_cross and not health.cross.any() and all_echoes:
-        yield Finding(
-            "unheard paths",
-            (),
-            f"no cross echo in {health.scans} scans, the ring listens to {health.ring.neighbors} neighbors",
-            0.8,
-            "",
-            "let the device listen to its neighbors, or set neighbors = 0 in the ring",
-        )
     in_place = (health.place == np.arange(health.ring.count)).all()
     if health.left_out > max(2, 0.001 * all_echoes) and in_place:
         yield Finding(

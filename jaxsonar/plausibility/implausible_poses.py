@@ -50,8 +50,17 @@ def implausible_poses(ring: Ring, log: Log) -> Iterator[Implausibility]:
     for one in found:
         yield from one.implausibilities()
     if not found:
-        distant = _distant_scans(ring, log)
-        yield from distant or _unexplained_echoes(ring, log)
+        yield from unrelated_poses(ring, log)
+
+
+def unrelated_poses(ring: Ring, log: Log) -> Iterator[Implausibility]:
+    """Poses that have nothing to do with the echoes, whatever the mistake (see ``find_mistakes``).
+
+    Args:
+        ring: the sensors.
+        log: the scans; ranges in metres.
+    """
+    yield from _distant_scans(ring, log) or _unexplained_echoes(ring, log)
 
 
 def _distant_scans(ring: Ring, log: Log) -> list[Implausibility]:

@@ -135,6 +135,14 @@ def test_two_mistakes_are_found_one_after_the_other(sound):
     assert not find_common_causes(found.ring, found.log).findings
 
 
+def test_echoes_of_other_poses_are_named_without_a_cause(sound):
+    shuffled = dataclasses.replace(sound, range=np.random.default_rng(0).permutation(sound.range))
+    found = find_common_causes(RING, shuffled)
+    assert causes(found) == ["explained share"]
+    assert "of the echoes agree with the scans around them" in found.findings[0].sentence
+    assert found.log is shuffled
+
+
 def test_a_restart_of_the_odometry_is_named(sound):
     pose = POSE.copy()
     pose[90:] -= pose[90]
