@@ -129,6 +129,7 @@ class LiveMap:
         sizes = _WARM_UP_ECHOES if method == "hough" else (_WARM_UP_ECHOES[0], _WARM_UP_ECHOES[-1])
         with ThreadPoolExecutor(len(sizes)) as pool:
             warm = list(pool.map(synthetic_scan, sizes))
+        RobotEchoFilter(self.ring).warm_up(warm[0].scan)
         if self._mapper is None:
             return
         if not self.slam:
