@@ -100,7 +100,7 @@ def check(
     elif source:
         place = find_exchanged_sensors(ring, part, scene, detect)
     renumbered, all_scans = renumber(part, place), renumber(log, place)
-    repeated, measured = RepeatedRanges.of(reported, ring.count), MeasuredSensors.of(ring, log)
+    repeated, measured = RepeatedRanges.of(ring, reported), MeasuredSensors.of(ring, log)
     heard = np.isfinite(log.range) & ~is_repeated(log)
     direct, cross = heard & (log.tx == log.rx), heard & (log.tx != log.rx)
 

@@ -8,16 +8,19 @@ from jaxtyping import Float, Int
 
 from jaxsonar.diagnostics.findings import Finding
 from jaxsonar.diagnostics.settings import SETTINGS
-from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.geometry.se2 import transform_points, wrap_angle
+from jaxsonar.plausibility.constant_ranges import range_resolution
 from jaxsonar.scans.readings import is_repeated
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import has_moved
+from jaxsonar.sensors.ring import Ring
 
 
 class RepeatedRanges(NamedTuple):
     """Repeated direct ranges of each sensor while the robot moved: a robot at rest reads the same again and again.
 
-    All scans count if the log has no poses.
+    If the ranges are coarse, only motions count that change the range of every wall in the cone. All scans count if the
+    log has no poses.
     """
 
     repeats: Float[np.ndarray, " sensors"]
@@ -29,8 +32,9 @@ class RepeatedRanges(NamedTuple):
     fraction needs (``FindingSettings.min_samples``)."""
 
     @classmethod
-    def of(cls, log: Log, sensors: int) -> "RepeatedRanges":
+    def of(cls, ring: Ring, log: Log) -> "RepeatedRanges":
         """Count the repeated ranges of a log. Readings that are marked as old (``Log.age``) do not count again."""
+        sensors = ring.count
         if np.isfinite(log.pose).all(axis=1).any():
             moved = has_moved(log.pose) | ~np.isfinite(log.pose).all(axis=1)
         else:
@@ -39,6 +43,9 @@ class RepeatedRanges(NamedTuple):
         first = np.full((len(log), sensors), np.inf)
         np.minimum.at(first, (log.echo_scan[own], log.tx[own]), log.range[own])
         both = np.isfinite(first[1:]) & np.isfinite(first[:-1]) & moved[1:, None]
+        resolution = range_resolution(log.range)
+        if resolution >= SETTINGS.findings.fine_resolution:
+            both &= ~(_least_change(ring, log.pose) <= resolution)  # without poses it is NaN
         pairs = both.sum(axis=0)
         same = (both & (first[1:] == first[:-1])).sum(axis=0)
         constant = np.full((sensors, 2), np.nan)
@@ -48,6 +55,21 @@ class RepeatedRanges(NamedTuple):
             if times.sum() >= SETTINGS.findings.min_samples:
                 constant[k] = values[times.argmax()], times.max() / times.sum()
         return cls(np.where(pairs > 0, same / np.maximum(pairs, 1), np.nan), pairs, constant)
+
+
+def _least_change(ring: Ring, pose: Float[np.ndarray, "scans 3"]) -> Float[np.ndarray, "steps sensors"]:
+    """Least change of the direct range of a wall in any direction of the cone, between consecutive scans, metres.
+
+    The range changes by the motion of the sensor along the normal of the wall.
+    """
+    position = transform_points(pose[:, None], np.asarray(ring.position))
+    motion = np.diff(position, axis=0)
+    heading = pose[1:, None, 2] + np.asarray(ring.heading)
+    aside = wrap_angle(np.arctan2(motion[..., 1], motion[..., 0]) - heading)
+    half = np.asarray(ring.beam) / 2
+    # The angle between the motion and the nearest direction of the cone to a right angle with it.
+    off = np.maximum(np.abs(np.abs(aside) - np.pi / 2) - half, 0)
+    return np.hypot(motion[..., 0], motion[..., 1]) * np.sin(off)
 
 
 @dataclass(frozen=True)

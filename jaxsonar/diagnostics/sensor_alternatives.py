@@ -24,6 +24,8 @@ class Rates(NamedTuple):
     """Probability that an expected echo is detected."""
     foreign: float
     """Share of the echoes that do not come from a known wall."""
+    strange: float
+    """The same of the echoes in scans in which the sensor faces a known wall."""
     scatter: float
     """Standard deviation of the first among the sensors."""
 
@@ -86,6 +88,10 @@ class _Counts(NamedTuple):
     """The sensor has an echo that a wall in its cone explains."""
     walls: Int[np.ndarray, " scans"]
     """Number of walls in its cone."""
+    strange: Bool[np.ndarray, " scans"]
+    """It faces a wall, but its echoes come from elsewhere."""
+    known: Bool[np.ndarray, " scans"]
+    """It faces a wall, and has an echo of a known one."""
 
 
 def sensor_alternatives(
@@ -153,30 +159,50 @@ def _count(rows: _DirectEchoes, half_width: float, gate: float, turn: float, off
     match = np.abs(residual) < gate
     in_cone = (beside < _SETTINGS.cone_margin) & (rows.beyond_end <= SETTINGS.reference.end_margin)
     # A nearer echo may hide the one of this wall.
-    well_inside = (beside < -_SETTINGS.cone_margin) & (rows.beyond_end <= SETTINGS.detection.max_beyond_end)
-    tested = well_inside & rows.is_between & ~(residual < -gate)
+    faced = (beside < -_SETTINGS.cone_margin) & (rows.beyond_end <= SETTINGS.detection.max_beyond_end)
+    faced &= rows.is_between
+    tested = faced & ~(residual < -gate)
 
     def any_of(which: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " scans"]:
         return np.bincount(rows.scan[which], minlength=scans) > 0
 
-    explained = any_of(in_cone & match)
-    expected = any_of(tested)
-    return _Counts(expected, expected & explained, explained, np.bincount(rows.scan[in_cone], minlength=scans))
+    explained, expected, faces = any_of(in_cone & match), any_of(tested), any_of(faced)
+    walls = np.bincount(rows.scan[in_cone], minlength=scans)
+    strange = faces & rows.heard & ~explained
+    return _Counts(expected, expected & explained, explained, walls, strange, faces & explained)
 
 
 def _usual_rates(rows: list[_DirectEchoes], counts: list[_Counts]) -> Rates | None:
-    """Medians over the sensors; None if walls explain too little to judge any sensor."""
-    expected, detected, explained = (np.array([one[k].sum() for one in counts]) for k in range(3))
+    """Medians over the sensors; None if walls explain too little to judge any sensor.
+
+    Sensors of sparse rings hear walls that no other sensor hears, each as its direction has it. Therefore medians of
+    shares are weighted by the number of echoes, and what a sensor hears beside the known walls is judged in scans in
+    which it faces one.
+    """
+    expected, detected, explained, strange, known = (
+        np.array([getattr(one, name).sum() for one in counts])
+        for name in ("expected", "detected", "explained", "strange", "known")
+    )
     heard = np.array([one.heard.sum() for one in rows])
     enough = (expected >= SETTINGS.findings.min_expected) & (heard >= SETTINGS.findings.min_expected)
     if enough.sum() < _SETTINGS.min_sensors:
         return None
-    rate = float(np.median(detected[enough] / expected[enough]))
-    foreign = 1 - float(np.median(explained[enough] / heard[enough]))
-    if rate < _SETTINGS.least_rate or foreign > 1 - _SETTINGS.least_rate:
+    each = detected[enough] / expected[enough]
+    rate = float(np.median(each))
+    foreign = 1 - _weighted_median(explained[enough] / heard[enough], heard[enough])
+    faced = strange + known
+    beside = _weighted_median(strange / np.maximum(faced, 1), faced)
+    if rate < _SETTINGS.least_rate or beside > 1 - _SETTINGS.least_rate or foreign > 1 - _SETTINGS.least_explained:
         return None
-    scatter = 1.4826 * float(np.median(np.abs(detected[enough] / expected[enough] - rate)))
-    return Rates(min(rate, _SETTINGS.most_rate), max(foreign, 1 - _SETTINGS.most_rate), scatter)
+    scatter = 1.4826 * float(np.median(np.abs(each - rate)))
+    least = 1 - _SETTINGS.most_rate
+    return Rates(min(rate, _SETTINGS.most_rate), max(foreign, least), max(beside, least), scatter)
+
+
+def _weighted_median(values: Float[np.ndarray, " values"], weight: Int[np.ndarray, " values"]) -> float:
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
 
 
 def _log_likelihood(
@@ -230,20 +256,28 @@ def _best(
     usual = min(SETTINGS.findings.weak_rate * rates.detected, rates.detected - _SETTINGS.scatters * rates.scatter)
     if expected >= SETTINGS.findings.min_weak and rate < usual:
         lost = _log_likelihood(stated, rows.heard, rate, rates.foreign, odds)
-        explained = int(stated.explained.sum())
         few = heard < SETTINGS.findings.min_expected
-        # The echoes that a weak sensor has come from the known walls; those of a sensor astray do not. In between, it
+        # Facing a known wall, a weak sensor hears it or nothing; a sensor astray hears something else. In between, it
         # hears other walls than the known ones.
+        known, strange = int(stated.known.sum()), int(stated.strange.sum())
+        fits = known / max((1 - rates.strange) * (known + strange), 1)
+        missed = int((stated.expected & ~rows.heard).sum())
         silent = rate < SETTINGS.findings.dead_rate and few
         error = float(np.sqrt(rate * (1 - rate) / expected))
-        if few or explained >= _SETTINGS.fitting * usual_share:
+        most_heard = (rate + 2 * error) / rates.detected * len(rows.heard)  # it misses unknown walls as well
+        if few or fits >= _SETTINGS.fitting or (missed * _SETTINGS.unfitting > strange and heard < most_heard):
             propose("dead" if silent else "weak", rate, error, stated, robust(lost))
-        elif explained < _SETTINGS.unfitting * usual_share:
+        elif fits < _SETTINGS.unfitting:
             propose("astray", rate, error, stated, robust(lost))
     # Rotations and offsets.
     turns = np.radians(np.arange(-SETTINGS.cones.most_turn_deg, SETTINGS.cones.most_turn_deg + 1, 2.0))
     offsets = np.arange(-_SETTINGS.most_offset, _SETTINGS.most_offset + gate / 4, gate / 2)
     least_offset = max(SETTINGS.findings.min_offset_by_poses, gate)
+    gains: list[tuple[float, int]] = []
+    # A sensor that hears the walls that it faces neither points elsewhere nor has an offset.
+    known, faced = int(stated.known.sum()), int((stated.known | stated.strange).sum())
+    most = 1 - _SETTINGS.min_gain
+    misfits = detected <= most * rates.detected * expected or known <= most * (1 - rates.strange) * faced
     for cause, values, least in (
         ("turned", turns, np.radians(SETTINGS.findings.min_turn_deg)),
         ("offset", offsets, least_offset),
@@ -257,14 +291,14 @@ def _best(
         best = int(np.argmin(np.abs(values - mean)))
         explained, before = int(tried[best].explained.sum()), int(stated.explained.sum())
         enough = explained >= max(_SETTINGS.fitting * usual_share, SETTINGS.findings.min_expected)
-        enough &= before < (1 - _SETTINGS.min_gain) * usual_share
+        enough &= misfits and before < most * usual_share
         enough &= explained - before >= max(SETTINGS.findings.min_expected, _SETTINGS.min_gain * heard)
-        # Another direction or an offset that explains some echoes is in doubt: then the sensor is not called astray.
-        most = max(int(one.explained.sum()) for one in tried)
-        if most - before >= SETTINGS.findings.min_expected:
-            found = [one for one in found if one.cause != "astray"]
+        gains.append((float(total.max()), max(int(one.explained.sum()) for one in tried) - before))
         if abs(mean) >= least and abs(mean) > 4 * error and enough:
             propose(cause, mean, error, tried[best], robust(likelihood[best]) - float(np.log(len(values))))
+    # If the more likely one of them explains some echoes, it is in doubt: then the sensor is not called astray.
+    if max(gains)[1] >= SETTINGS.findings.min_expected:
+        found = [one for one in found if one.cause != "astray"]
     good = [one for one in found if one.nats > _SETTINGS.min_nats]
     # What explains the echoes that there are comes first.
     return max(good, key=lambda one: (one.is_moved, one.nats)) if good else None
@@ -288,9 +322,10 @@ def suspects(table: ResidualTable, half_width: Float[np.ndarray, " sensors"], no
         [
             max(
                 (one.expected.sum() * rates.detected - one.detected.sum()) / np.sqrt(max(one.expected.sum(), 1)),
-                (row.heard.sum() * (1 - rates.foreign) - one.explained.sum()) / np.sqrt(max(row.heard.sum(), 1)),
+                (one.strange.sum() - rates.strange * (one.strange.sum() + one.known.sum()))
+                / np.sqrt(max(one.strange.sum() + one.known.sum(), 1)),
             )
-            for row, one in zip(rows, counts, strict=True)
+            for one in counts
         ]
     )
     worst = np.argsort(-lost, kind="stable")[: _SETTINGS.most_suspects]

@@ -183,7 +183,10 @@ class ExplanationSettings:
     min_sensors: int = 3
     """Sensors from which the usual rates are taken."""
     least_rate: float = 0.5
-    """Usual rate of detection, and usual share of explained echoes, that the comparison needs."""
+    """Usual rate of detection, and usual share of explained echoes of sensors that face a wall, that the comparison
+    needs."""
+    least_explained: float = 0.2
+    """Usual share of explained echoes, whatever the sensors face, that it needs."""
     most_rate: float = 0.95
     """Both count as at most this."""
     fitting: float = 0.7

@@ -154,13 +154,31 @@ def test_a_robot_at_rest_repeats_its_ranges_without_a_fault():
     """Ranges in steps of 1 cm: only scans of a robot that moved are compared."""
     pose = np.repeat(trajectory(40), 10, axis=0)
     reported = ranges(pose, sigma=0.0, resolution=0.01)
-    moving = RepeatedRanges.of(log_of(reported[::10], pose[::10]), 12)
-    waiting = RepeatedRanges.of(log_of(reported, pose), 12)
-    unknown = RepeatedRanges.of(log_of(reported, np.full_like(pose, np.nan)), 12)
+    moving = RepeatedRanges.of(NARROW, log_of(reported[::10], pose[::10]))
+    waiting = RepeatedRanges.of(NARROW, log_of(reported, pose))
+    unknown = RepeatedRanges.of(NARROW, log_of(reported, np.full_like(pose, np.nan)))
     np.testing.assert_array_equal(waiting.constant, moving.constant)
     np.testing.assert_array_equal(waiting.pairs, moving.pairs)
     assert np.nanmin(unknown.repeats) > 0.8
-    assert np.isnan(RepeatedRanges.of(log_of(reported[:10], pose[:10]), 12).constant).all()
+    assert np.isnan(RepeatedRanges.of(NARROW, log_of(reported[:10], pose[:10])).constant).all()
+
+
+@pytest.mark.parametrize("resolution", [0.01, 0.03])
+def test_coarse_ranges_of_a_wall_along_the_path_do_not_count(resolution):
+    """A sensor that faces a wall beside the path keeps its range; one that faces a wall ahead cannot."""
+    pose = np.column_stack([np.random.default_rng(0).uniform(0, 2, 60), np.zeros(60), np.zeros(60)])
+    heading = np.radians([0.0, 90.0])
+    ring = Ring(np.zeros((2, 2)), heading, beam=np.radians([30.0, 30.0]), neighbors=0, max_range=5.0)
+    reported = np.round(np.column_stack([4.0 - pose[:, 0], np.full(60, 0.8)]) / resolution) * resolution
+    found = RepeatedRanges.of(ring, log_of(reported, pose))
+    assert found.pairs[0] > 50
+    assert found.repeats[0] == 0
+    assert found.pairs[1] == 0
+    # Fine ranges do not stay the same by chance.
+    assert (
+        RepeatedRanges.of(ring, log_of(reported + 1e-4 * np.arange(60)[:, None] ** 0.5, pose)).pairs.tolist()
+        == [59] * 2
+    )
 
 
 @pytest.mark.slow
