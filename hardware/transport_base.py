@@ -42,7 +42,7 @@ class LinkEvent:
 
     kind: str
     """``lost`` (the link broke; the source reconnects), ``back`` (data again), ``silent`` (no data for a while),
-    ``waiting`` (the device cannot be opened yet), ``note`` (a choice or a warning about a file that is replayed)."""
+    ``waiting`` (the device cannot be opened yet), ``note`` (a choice about a file that is replayed, or a warning)."""
     text: str
     """Message for the user, one line."""
     time: float = field(default_factory=time.time)
@@ -52,8 +52,17 @@ class LinkEvent:
 OnEvent = Callable[[LinkEvent], None]
 
 
+NEEDED = "needed is a device that can be opened there"
+"""End of the messages about a device that cannot be opened."""
+
+
 class NotOpenedError(SonarError):
-    """The URL is valid, but no device can be opened there now."""
+    """No device can be opened at a URL now; later there may be one."""
+
+    def __init__(self, url: str, why: str):
+        """An error with the URL and the message of the operating system, each of one line."""
+        super().__init__(f"{url}: {why}; {NEEDED}")
+        self.why = why
 
 
 class EndOfStream(Exception):
@@ -215,8 +224,7 @@ def open_source(
             if time.monotonic() >= end or stop.wait(RETRY_INTERVAL):
                 raise
             if not waiting:
-                why = str(error).partition(";")[0]
-                on_event(LinkEvent("waiting", f"{why}; trying again for {wait:g} s"))
+                on_event(LinkEvent("waiting", f"{url}: {error.why}; waiting up to {wait:g} s for the device"))
             waiting = True
 
 

@@ -8,8 +8,8 @@ from abc import abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass
 
-from .errors import reason
-from .transport_base import EndOfStream, LinkEvent, NotOpenedError, OnEvent, Source, Url
+from .errors import SonarError, reason
+from .transport_base import NEEDED, EndOfStream, LinkEvent, NotOpenedError, OnEvent, Source, Url
 
 HELLO, GOODBYE = b"\0", b""
 """Datagrams that a udp client sends to its device: once per second, and when it closes."""
@@ -52,6 +52,7 @@ class ReconnectingSource(Source):
 
         Raises:
             NotOpenedError: the device cannot be opened.
+            SonarError: an impossible host name.
         """
         self.url = url.text
         self._parsed = url
@@ -66,11 +67,11 @@ class ReconnectingSource(Source):
         self._connected = False
         try:
             self._connect()
-        except (OSError, UnicodeError) as failure:  # UnicodeError: an invalid host name
+        except UnicodeError as failure:
+            raise SonarError(f"{self.url}: no host name: {reason(failure)}; {NEEDED}") from None
+        except OSError as failure:
             self._disconnect()
-            raise NotOpenedError(
-                f"{self.url}: {reason(failure)}; needed is a device that can be opened there"
-            ) from None
+            raise NotOpenedError(self.url, reason(failure)) from None
         self._connected = True
         self._last_data = time.monotonic()
         self._is_silent = False

@@ -93,7 +93,7 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.detection.settings_toml import load_settings
     from jaxsonar.fileio.atomic_files import check_outputs, shown
     from jaxsonar.fileio.compilation_cache import use_compilation_cache
-    from jaxsonar.hardware.transport_base import parse_url
+    from jaxsonar.hardware.transport_base import NotOpenedError, parse_url
     from jaxsonar.live.stream import stream as stream_scans
 
     check_sigma_is_used(options.sigma, options.method, None)
@@ -143,6 +143,11 @@ def run(options: argparse.Namespace) -> int:
                 on_event=status_line.event,
                 stop=stop,
             )
+    except NotOpenedError:
+        if status_line.stop is None or not status_line.stop.is_set():
+            raise
+        print_status("jaxsonar stream: interrupted")
+        return 1
     except KeyboardInterrupt:
         print_status("jaxsonar stream: interrupted")
         _exit_now(1)

@@ -37,11 +37,11 @@ class RobotEchoFilter:
 
         Args:
             ring: the sensors.
-            on_warning: called with a message of one line when the sensors that hear the robot change.
+            on_warning: called with a message of one line when a path is found that was not named before.
         """
         self._ring, self._on_warning = ring, on_warning
         self._history: deque[Scan] = deque(maxlen=SETTINGS.history)
-        self._new = 0
+        self._new, self._named = 0, frozenset[tuple[int, int]]()
         self.found = RobotEchoes((), is_floor=False)
         """Echoes of the robot in the scans that are remembered."""
 
@@ -76,10 +76,11 @@ class RobotEchoFilter:
         self._new += 1
 
     def _search(self) -> None:
-        before, self._new = self.found.paths, 0
+        self._new = 0
         self.found = find_robot_echoes(self._ring, _log(self._history))
-        if self._on_warning is not None and self.found.paths - before:
+        if self._on_warning is not None and self.found.paths - self._named:
             self._on_warning(f"warning: {self.found.warning()}")
+        self._named |= self.found.paths
 
 
 def _log(scans: Iterable[Scan]) -> Log:

@@ -67,7 +67,8 @@ def stream(
         view: viewer of the stream.
         on_scan: called for every scan with its local model.
         on_status: called several times per second with the status.
-        on_event: called for every link event, in the reading thread, and for warnings about the echoes (``note``).
+        on_event: called for every link event, in the reading thread, and for warnings about the echoes (``note``), in
+            the calling thread.
         stop: set this event, from any thread or signal handler, to stop. Everything received is still written. If only
             a recording is requested, a running compilation is not waited for: its daemon thread remains, and
             ``Status.warm`` is False.

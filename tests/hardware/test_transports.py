@@ -104,7 +104,7 @@ def test_a_device_that_starts_later_is_waited_for():
         begins.join()
     with devices[0]:
         assert kinds(events) == ["waiting"]
-        assert "Connection refused; trying again for 30 s" in events[0].text
+        assert events[0].text == f"{url}: Connection refused; waiting up to 30 s for the device"
 
 
 @pytest.mark.parametrize("settings", [{}, {"wait": 0.3}])
@@ -122,9 +122,12 @@ def test_a_wait_can_be_ended():
         open_source(free_url(), wait=3600.0, stop=stop)
 
 
-def test_an_invalid_url_is_not_waited_for():
-    with pytest.raises(SonarError, match="no such address"):
-        open_source("tcp://127.0.0.1", wait=3600.0)
+@pytest.mark.parametrize(
+    ("url", "words"), [("tcp://127.0.0.1", "no such address"), (f"tcp://{'x' * 70}.org:7361", "no host name")]
+)
+def test_an_invalid_url_is_not_waited_for(url, words):
+    with pytest.raises(SonarError, match=words):
+        open_source(url, wait=3600.0)
 
 
 # --- ends
