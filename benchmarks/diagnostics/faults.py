@@ -10,6 +10,8 @@ from benchmarks.diagnostics.scenes import Scene, random_scene, with_geometry
 from jaxsonar import Log, Ring
 from jaxsonar.sensors.ring import REFERENCE_SPEED_OF_SOUND
 
+LEAST_NOISE = 0.003
+"""Least true standard deviation of the ranges where a wrong one is stated, metres."""
 LEAST_ECHOES = 50
 """Direct echoes that a sensor has before its fault, so that the fault shows. A turned or exchanged sensor has as many
 with its fault: one that hears nothing then might as well be dead."""
@@ -133,7 +135,7 @@ def _no_echo_value(scene: Scene, rng: np.random.Generator) -> Case:
 
 def _noise(scene: Scene, rng: np.random.Generator) -> Case:
     """The stated standard deviation is a fifth to a tenth of the true one."""
-    scene = replace(scene, sigma=max(scene.sigma, 0.003))
+    scene = replace(scene, sigma=max(scene.sigma, LEAST_NOISE))
     stated = scene.sigma / rng.uniform(5, 10)
     detail = f"{1e3 * scene.sigma:g} mm, stated {1e3 * stated:.2f} mm"
     return Case("", scene.ring, scene.log(), sigma=stated, detail=detail)

@@ -1,20 +1,28 @@
 """What explains the direct echoes of a sensor best: no fault, an offset, another direction, or lost echoes?
 
-The poses of the log gather the walls. Each explanation predicts which
-walls the sensor must hear and at which ranges, so that echoes where none is expected and missing echoes both count. How
-often sound sensors miss an expected echo, and have echoes of something else, is measured on the sensors of the same
-log. Only walls that other sensors support are used.
+The poses of the log gather the walls. Each explanation predicts which walls the sensor must hear and at which ranges,
+so that echoes where none is expected and missing echoes both count. How often sound sensors miss an expected echo, and
+have echoes of something else, is measured on the sensors of the same log. Only walls that other sensors support are
+used.
 """
 
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.diagnostics.echo_residuals import ResidualTable
+from jaxsonar.diagnostics.findings import Finding, GradedFinding, confidence_of
 from jaxsonar.diagnostics.settings import SETTINGS
 
 _SETTINGS = SETTINGS.alternatives
+
+_REMEDIES = {
+    "turned": "turn the sensor in its mount, or calibrate the ring (jaxsonar calibrate)",
+    "weak": "clean its membrane, and check what covers it, its supply and its gain",
+    "dead": "check its plug, its cable and its membrane, and replace it",
+}
 
 
 class Rates(NamedTuple):
@@ -330,3 +338,34 @@ def suspects(table: ResidualTable, half_width: Float[np.ndarray, " sensors"], no
     )
     worst = np.argsort(-lost, kind="stable")[: _SETTINGS.most_suspects]
     return [int(k) for k in worst if lost[k] > _SETTINGS.suspicious]
+
+
+def explained_otherwise(alternatives: Mapping[int, SensorAlternative | None]) -> Iterator[GradedFinding]:
+    """Findings about sensors whose echoes are explained better by a fault."""
+    for sensor, one in alternatives.items():
+        if one is None or one.cause == "offset":  # measured more exactly with all walls: ``range_offsets``
+            continue
+        cause = "turned" if one.cause == "astray" else one.cause
+        evidence = (
+            f"explains {one.explained} of {one.echoes} echoes, a sound sensor {one.as_stated}; log-likelihood ratio "
+            f"{one.nats:.0f} nats without the part of the log that supports it most"
+        )
+        finding = Finding(cause, (sensor,), _sentence(sensor, one), confidence_of(one.nats), evidence, _REMEDIES[cause])
+        yield GradedFinding(one.nats, finding)
+
+
+def _sentence(sensor: int, one: SensorAlternative) -> str:
+    heard = f"{one.detected} of {one.expected} expected direct echoes"
+    match one.cause:
+        case "turned":
+            turn, error = np.degrees([abs(one.value), one.error])
+            side = "left" if one.value > 0 else "right"
+            return f"sensor {sensor} points {turn:.0f} ± {error:.0f} deg too far to the {side}"
+        case "astray":
+            elsewhere = f"{one.echoes - one.explained} of its {one.echoes} echoes come from elsewhere"
+            return f"sensor {sensor} does not point where it should: it hears {heard}, and {elsewhere}"
+        case "dead":
+            amount = "nothing" if one.detected == 0 else "hardly anything"
+            return f"sensor {sensor} hears {amount}: {heard}"
+        case _:
+            return f"sensor {sensor} hears {heard}, clearly less than the others"

@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsonar.diagnostics.alternative_findings import explained_otherwise
 from jaxsonar.diagnostics.cross_counts import one_sided_sensors
 from jaxsonar.diagnostics.findings import Finding, GradedFinding, confidence_of
 from jaxsonar.diagnostics.health_report import Health
 from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
-from jaxsonar.diagnostics.sensor_alternatives import SensorAlternative
+from jaxsonar.diagnostics.sensor_alternatives import SensorAlternative, explained_otherwise
 from jaxsonar.diagnostics.settings import SETTINGS
 from jaxsonar.sensors.ring import Ring
 

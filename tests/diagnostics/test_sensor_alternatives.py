@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
-from jaxsonar.diagnostics.alternative_findings import explained_otherwise
 from jaxsonar.diagnostics.echo_residuals import ResidualTable
-from jaxsonar.diagnostics.sensor_alternatives import SensorAlternative, sensor_alternatives, suspects
+from jaxsonar.diagnostics.sensor_alternatives import (
+    SensorAlternative,
+    explained_otherwise,
+    sensor_alternatives,
+    suspects,
+)
 
 SENSORS, FAULTY, NOISE = 8, 3, 0.003
 HALF = np.full(SENSORS, np.radians(15.0))

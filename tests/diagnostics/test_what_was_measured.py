@@ -34,7 +34,8 @@ def test_paths_that_are_never_heard_are_named_and_accuse_nobody(log):
     """Direct echoes only: every result is that of the ring without neighbors."""
     direct = only(log, log.tx == log.rx)
     found, alone = check(RING, direct), check(replace(RING, neighbors=0), direct)
-    assert found.findings == ()
+    assert [(one.cause, one.sensors) for one in found.findings] == [("unheard paths", ())]
+    assert alone.findings == ()
     assert found.unmeasured == ("echoes from neighbors 1, 2 and 3",)
     assert alone.unmeasured == ()
     assert (found.expected[:, 1:] == 0).all()
