@@ -59,6 +59,7 @@ def test_the_fault_that_made_the_echoes_explains_them_best(rng, cause, value):
     found = sensor_alternatives(table, HALF, NOISE, 5.0)
     assert [k for k, one in enumerate(found) if one] == [FAULTY]
     one = found[FAULTY]
+    assert one is not None
     assert one.cause == cause
     assert abs(one.value - value) < max(4 * one.error, 1e-9)
     assert one.nats > 12
