@@ -260,6 +260,8 @@ def _best(
 
     # Lost echoes.
     expected, detected = int(stated.expected.sum()), int(stated.detected.sum())
+    known, strange = int(stated.known.sum()), int(stated.strange.sum())
+    faced = known + strange
     rate = float(np.clip(detected / max(expected, 1), 0.01, 0.99))
     usual = min(SETTINGS.findings.weak_rate * rates.detected, rates.detected - _SETTINGS.scatters * rates.scatter)
     if expected >= SETTINGS.findings.min_weak and rate < usual:
@@ -267,8 +269,7 @@ def _best(
         few = heard < SETTINGS.findings.min_expected
         # Facing a known wall, a weak sensor hears it or nothing; a sensor astray hears something else. In between, it
         # hears other walls than the known ones.
-        known, strange = int(stated.known.sum()), int(stated.strange.sum())
-        fits = known / max((1 - rates.strange) * (known + strange), 1)
+        fits = known / max((1 - rates.strange) * faced, 1)
         missed = int((stated.expected & ~rows.heard).sum())
         silent = rate < SETTINGS.findings.dead_rate and few
         error = float(np.sqrt(rate * (1 - rate) / expected))
@@ -283,7 +284,6 @@ def _best(
     least_offset = max(SETTINGS.findings.min_offset_by_poses, gate)
     gains: list[tuple[float, int]] = []
     # A sensor that hears the walls that it faces neither points elsewhere nor has an offset.
-    known, faced = int(stated.known.sum()), int((stated.known | stated.strange).sum())
     most = 1 - _SETTINGS.min_gain
     misfits = detected <= most * rates.detected * expected or known <= most * (1 - rates.strange) * faced
     for cause, values, least in (

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.plausibility.robot_echoes import SETTINGS as SEARCH_SETTINGS
-from jaxsonar.plausibility.robot_echoes import RobotEchoes, find_robot_echoes, without_robot_echoes
+from jaxsonar.plausibility.robot_echoes import RobotEchoes, find_robot_echoes, is_apart, without_robot_echoes
 from jaxsonar.scans.scan_log import Log, Scan
 from jaxsonar.sensors.ring import Ring
 
@@ -68,10 +67,8 @@ class RobotEchoFilter:
     def _remember(self, scan: Scan) -> None:
         if not np.isfinite(scan.pose).all():
             return
-        if self._history:
-            x, y, theta = scan.pose - self._history[-1].pose
-            if np.hypot(x, y) < SEARCH_SETTINGS.spacing and abs(wrap_angle(theta)) < SEARCH_SETTINGS.rotation:
-                return
+        if self._history and not is_apart(self._history[-1].pose, scan.pose):
+            return
         self._history.append(scan)
         self._new += 1
 

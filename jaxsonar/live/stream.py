@@ -5,7 +5,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 
 from jaxsonar import kernels
 from jaxsonar.estimation.odometry_noise import OdometryNoise
@@ -13,7 +12,7 @@ from jaxsonar.hardware.drop_oldest_queue import DropOldestQueue
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.reader_thread import ReaderThread
 from jaxsonar.hardware.scan_assembler import RawScan
-from jaxsonar.hardware.transport_base import LinkEvent, Source, open_source, parse_url, register_transport
+from jaxsonar.hardware.transport_base import LinkEvent, open_source, parse_url, register_transport
 from jaxsonar.live.live_map import LiveMap, LiveScan
 from jaxsonar.live.replay import file_opener
 from jaxsonar.live.status import Status
@@ -102,8 +101,9 @@ def stream(
     )
     queue = DropOldestQueue[RawScan](SETTINGS.warm_up_capacity, size_of=lambda scan: len(scan.echoes))
     stop = threading.Event() if stop is None else stop
-    open_device = partial(open_source, url, wait=wait, stop=stop)
-    reader = _open_reader(url, open_device, ring, queue, record=record, scans=scans, no_echo=no_echo, on_event=on_event)
+    reader = _open_reader(
+        url, ring, queue, record=record, scans=scans, no_echo=no_echo, on_event=on_event, wait=wait, stop=stop
+    )
     # 2. The loop; it starts to compile in the background.
     loop = StreamLoop(
         live,
@@ -134,7 +134,6 @@ def stream(
 
 def _open_reader(
     url: str,
-    open_device: Callable[..., Source],
     ring: Ring,
     queue: DropOldestQueue[RawScan],
     *,
@@ -142,6 +141,8 @@ def _open_reader(
     scans: int | None,
     no_echo: Sequence[float],
     on_event: Callable[[LinkEvent], None] | None,
+    wait: float,
+    stop: threading.Event,
 ) -> ReaderThread:
     """Open the device and the recording."""
     register_transport("file", file_opener(ring, InputOptions(no_echo=tuple(no_echo))))
@@ -153,7 +154,7 @@ def _open_reader(
         if on_event is not None and not any(reader.decoder.ended for reader in readers):
             on_event(event)
 
-    source = open_device(on_event=on_link_event)
+    source = open_source(url, on_event=on_link_event, wait=wait, stop=stop)
     try:
         recorder = None if record is None else open_log_recorder(record)
     except SonarError:

@@ -355,14 +355,16 @@ class _Search:
 def _spaced_scans(pose: Float[np.ndarray, "scans 3"]) -> Int[np.ndarray, " chosen"]:
     """Scans with a pose that lie apart from the one before."""
     chosen: list[int] = []
-    x, y, theta = pose.T
-    last = np.full(3, np.nan)
     for k in np.flatnonzero(np.isfinite(pose).all(axis=1)).tolist():
-        far = np.hypot(x[k] - last[0], y[k] - last[1]) >= SETTINGS.spacing
-        if far or abs(wrap_angle(theta[k] - last[2])) >= SETTINGS.rotation or not chosen:
+        if not chosen or is_apart(pose[chosen[-1]], pose[k]):
             chosen.append(k)
-            last = pose[k]
     return np.array(chosen, np.int64)
+
+
+def is_apart(last: Float[np.ndarray, " 3"], pose: Float[np.ndarray, " 3"]) -> bool:
+    """Whether two poses are far enough from each other for their scans to be compared."""
+    x, y, theta = (pose - last).tolist()
+    return bool(np.hypot(x, y) >= SETTINGS.spacing or abs(wrap_angle(theta)) >= SETTINGS.rotation)
 
 
 def _fullest_window(
