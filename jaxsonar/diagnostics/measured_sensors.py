@@ -19,8 +19,6 @@ class MeasuredSensors(NamedTuple):
     cross: Bool[np.ndarray, "sensors 2"]
     """Whether any cross path was measured with the sensor as transmitter, as receiver; True if it has no such path, or
     if such paths were measured for no sensor."""
-    any_cross: bool
-    """Whether any cross path was measured."""
     certain: bool
     """Whether the log marks paths that heard nothing. Otherwise a path that is never heard may be silent or unmeasured,
     and it counts as unmeasured."""
@@ -60,8 +58,7 @@ class MeasuredSensors(NamedTuple):
         absent = np.flatnonzero(~either & (has(exists, tx) | has(exists, rx)))
         absent = tuple(absent.tolist()) if len(absent) < ring.count else ()
         roles = np.stack([~has(cross, sensor) | has(cross & measured, sensor) for sensor in (tx, rx)], axis=-1)
-        any_cross = bool((measured & (tx != rx)).any())
-        return cls(either, roles, any_cross, bool(np.isnan(log.range).any()), tuple(kinds), absent)
+        return cls(either, roles, bool(np.isnan(log.range).any()), tuple(kinds), absent)
 
 
 def _listed(numbers: list[int]) -> str:
