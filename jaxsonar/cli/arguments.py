@@ -17,7 +17,10 @@ SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for e
 
 SETTINGS_HELP = "settings of accumulator and low pass, for hough also threshold (default: the paper's)"
 
-ODOMETRY_HELP = "standard deviation of the odometry after 1 m: %% of the distance and deg (default: 3,1.5)"
+ODOMETRY_HELP = (
+    "standard deviation of the odometry after 1 m: %% of the distance and deg (default: 3,1.5; slam with few sensors: "
+    "3,0.6)"
+)
 
 
 def number(kind: type, least: float | int, most: float | int):

@@ -87,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
                 log,
                 sigma=options.sigma,
                 window=options.window,
-                odometry_noise=odometry_noise(options.odometry),
+                odometry_noise=None if options.odometry is None else odometry_noise(options.odometry),
                 smooth=options.smoothing,
                 speed=options.speed,
                 scale=options.scale,

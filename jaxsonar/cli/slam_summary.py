@@ -16,6 +16,7 @@ from jaxsonar.loop_closure.closure_candidate import ACCEPTED, WITHDRAWN
 from jaxsonar.plausibility.odometry_jumps import OdometryJump
 from jaxsonar.reports.text import plural
 from jaxsonar.scans.scan_log import Log
+from jaxsonar.smoothing.sparse_smoother import SPARSE_SETTINGS
 
 STAMP_TOLERANCE = 0.01
 """Maximum difference of the stamps of an estimated and a true pose, seconds. Chosen by hand."""
@@ -105,6 +106,7 @@ def as_json(result: Slam, errors: Errors | None) -> dict[str, Any]:
             for jump in result.jumps
         ],
     }
+    table["heading_slips"] = [{"scan": slip.scan, "angle": slip.angle, "gain": slip.gain} for slip in result.slips]
     table |= {"explained": result.explained.measured, "explained_required": result.explained.required}
     smoothed = result.smoothed
     if smoothed is not None:
@@ -115,6 +117,7 @@ def as_json(result: Slam, errors: Errors | None) -> dict[str, Any]:
             "speed_of_sound_sd": smoothed.speed_of_sound_sd or None,
             "scale": smoothed.scale if any(smoothed.scale_sd) else None,
             "scale_sd": smoothed.scale_sd if any(smoothed.scale_sd) else None,
+            "keeps_odometry": smoothed.keeps_odometry,
         }
     if errors is not None:
         table["errors"] = {name: None if one is None else _errors_as_json(one) for name, one in errors.items()}
@@ -167,6 +170,12 @@ def summary_lines(result: Slam, errors: Errors | None) -> list[str]:
             )
             line += f"; scale error of the odometry: distances {distance}, rotations {rotation}"
         lines.append(line)
+        if smoothed.keeps_odometry:
+            gain, least = (100 * (share or 0) for share in (smoothed.heading_gain, SPARSE_SETTINGS.least_heading_gain))
+            lines.append(
+                f"the poses are those of the odometry: long walls would remove {gain:.0f} % of the variance of its "
+                f"headings; {least:.0f} % is the least to move poses"
+            )
     covariance = result.trajectory.covariance
     if covariance is not None and len(covariance) > 1:  # the first pose is exact by definition
         sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0))
@@ -175,6 +184,7 @@ def summary_lines(result: Slam, errors: Errors | None) -> list[str]:
             f"{np.degrees(sd[2]):.2f} deg"
         )
     lines += _jump_lines(result)
+    lines += [f"{slip}; the poses after it are turned by {np.degrees(slip.angle):+.0f} deg" for slip in result.slips]
     lines += [f"{_ERROR_LABELS[name]}: {_error_text(one)}" for name, one in (errors or {}).items() if one is not None]
     return lines
 

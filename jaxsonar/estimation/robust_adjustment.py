@@ -77,7 +77,7 @@ def gnc_adjust(
         sigma: standard deviation of the range noise, metres; estimated if left out.
         settings: constants of the algorithm.
     """
-    job = _GncJob(ring, data, basis, poses_free, settings)
+    job = RobustAdjustment(ring, data, basis, poses_free, settings)
     # 1. Shrink the scale of the robust loss.
     state, noise = job.anneal(state, initial_scale, sigma)
     dof = 0.0
@@ -116,7 +116,7 @@ def anneal(
     settings: GncSettings = SETTINGS,
 ) -> AdjustmentState:
     """Only the annealing of ``gnc_adjust``, with free poses: better initial values."""
-    return _GncJob(ring, data, basis, True, settings).anneal(state, initial_scale, sigma)[0]
+    return RobustAdjustment(ring, data, basis, True, settings).anneal(state, initial_scale, sigma)[0]
 
 
 def explained_echoes(
@@ -133,7 +133,7 @@ def explained_echoes(
     """
     basis = parameter_basis(ring, (), poses_free=False, speed_sd=PRIOR.speed_sd)
     state = AdjustmentState(np.zeros(basis.columns.shape[1]), data.poses, landmark_map)
-    return _GncJob(ring, data, basis, False, settings)._associate(state, gate=gate, ambiguity=0.0).used
+    return RobustAdjustment(ring, data, basis, False, settings).associate(state, gate=gate, ambiguity=0.0).used
 
 
 def least_squares_problem(
@@ -178,7 +178,7 @@ def to_jax(tree):
     return jax.tree.map(jnp.asarray, tree)
 
 
-class _Association(NamedTuple):
+class Association(NamedTuple):
     """Data association of all echoes."""
 
     used: Bool[np.ndarray, "scans echoes"]
@@ -187,7 +187,7 @@ class _Association(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _GncJob:
+class RobustAdjustment:
     """Measurements and model of one robust adjustment."""
 
     ring: Ring
@@ -207,12 +207,12 @@ class _GncJob:
         scale, spread, last = initial_scale, initial_scale / settings.gate_sigmas, False
         for _ in range(settings.max_annealing_rounds):
             gate = settings.loss_gate * scale
-            used, _, reflection = self._associate(state, gate=gate, ambiguity=0.0)
-            residual = self._residual(state, reflection)
+            used, _, reflection = self.associate(state, gate=gate, ambiguity=0.0)
+            residual = self.residual(state, reflection)
             # Geman-McClure weights, normalized so that an echo within the scale counts as one within the gate.
             weight = used / (1 + (residual / scale) ** 2) ** 2 * (settings.gate_sigmas / scale) ** 2
-            state, _, _ = self._adjust(state, reflection, weight)
-            residual = self._residual(state, reflection)
+            state, _, _ = self.adjust(state, reflection, weight)
+            residual = self.residual(state, reflection)
             inliers = np.abs(residual[used & (np.abs(residual) < gate)])
             median = float(np.median(inliers)) if len(inliers) else None
             spread = scale / settings.gate_sigmas if median is None else settings.mad_to_sigma * median
@@ -226,12 +226,12 @@ class _GncJob:
     def reassociate(self, state: AdjustmentState, noise: float) -> AdjustmentResult:
         """One round of association with a hard gate, and least squares."""
         gate, ambiguity = self.settings.gate_sigmas * noise, self.settings.ambiguity_sigmas * noise
-        used, candidate, reflection = self._associate(state, gate=gate, ambiguity=ambiguity)
-        state, problem, solution = self._adjust(state, reflection, used / noise**2)
-        residual = np.where(used, self._residual(state, reflection), 0)
+        used, candidate, reflection = self.associate(state, gate=gate, ambiguity=ambiguity)
+        state, problem, solution = self.adjust(state, reflection, used / noise**2)
+        residual = np.where(used, self.residual(state, reflection), 0)
         return AdjustmentResult(state, problem, solution, used, candidate, residual, noise)
 
-    def _associate(self, state: AdjustmentState, *, gate: float, ambiguity: float) -> _Association:
+    def associate(self, state: AdjustmentState, *, gate: float, ambiguity: float) -> Association:
         """Assign each echo to the closest reflection; use it if within the gate and no second reflection is near."""
         data, landmark_map, settings = self.data, state.landmark_map, self.settings
         # 1. The closest reflection of every echo, in rows of a few echoes each.
@@ -277,11 +277,12 @@ class _GncJob:
         echoes = np.bincount(first[used], minlength=count)
         used &= (echoes[first] >= settings.min_landmark_echoes) | (kind == kernels.SECOND_ORDER)
         reflection = kernels.Reflection(*(leaf.astype(np.int32) for leaf in (kind, first, second)))
-        return _Association(used, candidate, reflection)
+        return Association(used, candidate, reflection)
 
-    def _adjust(
+    def adjust(
         self, state: AdjustmentState, reflection: kernels.Reflection, weight: Float[np.ndarray, "scans echoes"]
     ) -> tuple[AdjustmentState, kernels.LeastSquaresProblem, AdjustmentSolution]:
+        """Least squares of a given association and weights: the new state, the problem and its solution."""
         problem = least_squares_problem(self.ring, self.data, self.basis, state, reflection, weight)
         solution = solve_adjustment(
             problem,
@@ -292,7 +293,8 @@ class _GncJob:
         )
         return state.with_unknowns(solution.unknowns), problem, solution
 
-    def _residual(self, state: AdjustmentState, reflection: kernels.Reflection) -> Float[np.ndarray, "scans echoes"]:
+    def residual(self, state: AdjustmentState, reflection: kernels.Reflection) -> Float[np.ndarray, "scans echoes"]:
+        """Reported minus predicted range of each echo for a given association, metres."""
         no_weight = np.zeros_like(self.data.reported)
         problem = least_squares_problem(self.ring, self.data, self.basis, state, reflection, no_weight)
         return np.asarray(kernels.residuals(problem, state.unknowns()))

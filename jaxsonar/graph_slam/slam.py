@@ -13,16 +13,18 @@ from jaxsonar.estimation.batch_data import BatchData
 from jaxsonar.estimation.estimation_log import estimation_log
 from jaxsonar.estimation.explained_share import ExplainedShare
 from jaxsonar.estimation.landmark_map import landmark_map_of
-from jaxsonar.estimation.odometry_noise import OdometryNoise
+from jaxsonar.estimation.odometry_noise import OdometryNoise, OdometryNoiseModel
 from jaxsonar.estimation.robust_adjustment import explained_echoes
 from jaxsonar.estimation.trajectory import Trajectory, stamps_of
 from jaxsonar.graph_slam.initial_poses import InitialPoses, LoopClosure, detect, initial_poses
 from jaxsonar.graph_slam.interrupted_odometry import InterruptedOdometryNoise, continue_odometry
+from jaxsonar.graph_slam.slipped_odometry import SlippedOdometryNoise, repair_heading_slips
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.plausibility.odometry_jumps import OdometryJump
+from jaxsonar.registration.heading_slips import HeadingSlip
 from jaxsonar.scans.measured_paths import measured_paths
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import check_window
@@ -30,6 +32,7 @@ from jaxsonar.sensors.ring import Ring
 from jaxsonar.smoothing.smooth_log import Smoothed
 from jaxsonar.smoothing.smooth_log import smooth as smooth_poses
 from jaxsonar.smoothing.smoother import NothingExplained
+from jaxsonar.smoothing.sparse_smoother import SPARSE_ODOMETRY_NOISE
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,8 @@ class Slam:
     jumps: tuple[OdometryJump, ...] = ()
     """Steps at which the odometry jumps, in rows of the scans. The result does not use them: the motion before and
     after a jump is continued, if the ranges go on; otherwise the smaller part of the log has no poses."""
+    slips: tuple[HeadingSlip, ...] = ()
+    """Heading slips of the odometry of a sparse ring, in rows of the scans. The poses after them are turned."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -129,7 +134,6 @@ def slam(
             found, too few echoes explained.
     """
     report = progress or (lambda task, done, total: None)
-    noise = odometry_noise or OdometryNoise()
     log = estimation_log(log)
     continued = continue_odometry(ring, log)
     if len(continued.parts) > 1:
@@ -137,7 +141,7 @@ def slam(
         options = {"sigma": sigma, "window": window, "odometry_noise": odometry_noise, "smooth": smooth}
         options |= {"speed": speed, "scale": scale, "live": live, "progress": progress}
         return _of_whole_log(slam(ring, continued.log[part], **options), log, part, continued.jumps)
-    log, odometry = continued.log, log.pose
+    log, odometry, slips = continued.log, log.pose, ()
     has_odometry = np.asarray(np.isfinite(log.pose).all(axis=1))
     if window is None and len(log) and _echoes_of_a_long_wall(ring, log) < SETTINGS.sparse_echoes:
         if not has_odometry.any():
@@ -147,6 +151,12 @@ def slam(
         stays = _distance_driven(log.pose[has_odometry]) < SETTINGS.sparse_window
         window = None if stays else SETTINGS.sparse_window
     _check(log, has_odometry, sigma=sigma, window=window, smooth=smooth, speed=speed, scale=scale)
+    noise = odometry_noise or (OdometryNoise() if window is None else SPARSE_ODOMETRY_NOISE)
+    step_noise: OdometryNoiseModel = InterruptedOdometryNoise(noise, continued.bridged)
+    if window is not None:
+        report("heading slips", 0, 0)
+        log, slips = repair_heading_slips(ring, log)
+        step_noise = SlippedOdometryNoise(step_noise, slips)
     # 1. Detect: the local model of every scan, unless maps of windows or the tracker do so.
     scan_by_scan = live and has_odometry.any()
     models = None if window is not None or scan_by_scan else detect(ring, log, sigma=sigma, progress=report)
@@ -165,7 +175,7 @@ def slam(
                 window=window,
                 speed=speed,
                 scale=scale,
-                odometry_noise=InterruptedOdometryNoise(noise, continued.bridged),
+                odometry_noise=step_noise,
                 models=initial.models,
                 traversals=initial.traversals,
                 progress=lambda task: report(task, 0, 0),
@@ -188,8 +198,8 @@ def slam(
             "radians?"
         )
     stamp, closures = stamps_of(log), initial.closures
-    jumps = continued.jumps
-    return Slam(poses, covariance, stamp, world, odometry, closures, initial.step_ms, smoothed, explained, jumps)
+    jumps, step_ms = continued.jumps, initial.step_ms
+    return Slam(poses, covariance, stamp, world, odometry, closures, step_ms, smoothed, explained, jumps, slips)
 
 
 def _of_whole_log(found: Slam, log: Log, part: slice, jumps: tuple[OdometryJump, ...]) -> Slam:
@@ -218,6 +228,7 @@ def _of_whole_log(found: Slam, log: Log, part: slice, jumps: tuple[OdometryJump,
         closures=tuple(one._replace(first=one.first + first, second=one.second + first) for one in found.closures),
         smoothed=smoothed,
         jumps=jumps,
+        slips=tuple(replace(one, row=one.row + first) for one in found.slips),
     )
 
 

@@ -27,7 +27,7 @@ class SmoothingSettings:
     initial_scale: float = 0.04
     """Scale of the first association of echoes with landmarks, metres."""
     min_echoes_per_landmark: int = 4
-    """Least number of echoes of one landmark in a scan for them to count; 1 with windows."""
+    """Least number of echoes of one landmark in a scan for them to count."""
 
     # Limits
     cost_tolerance: float = 0.01

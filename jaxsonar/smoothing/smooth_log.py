@@ -1,7 +1,7 @@
 """Smoothing of a log: ``smooth`` and its result."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -25,6 +25,7 @@ from jaxsonar.smoothing.covisibility import Traversals
 from jaxsonar.smoothing.settings import SETTINGS
 from jaxsonar.smoothing.smoothed_map import adjusted_map
 from jaxsonar.smoothing.smoother import Smoother, SmoothingFit, has_pose
+from jaxsonar.smoothing.sparse_smoother import SPARSE_ODOMETRY_NOISE, SPARSE_SETTINGS, SparseSmoother
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +54,13 @@ class Smoothed:
     """Relative errors of the odometry's displacements and rotations (positive: too large); 0 if they were fixed."""
     scale_sd: tuple[float, float]
     """Standard deviations of ``scale``."""
+    heading_gain: float | None = None
+    """With windows: share of the variance of the headings by odometry that the walls remove."""
+
+    @property
+    def keeps_odometry(self) -> bool:
+        """Whether the walls add so little to the odometry that its poses are kept."""
+        return self.heading_gain is not None and self.heading_gain < SPARSE_SETTINGS.least_heading_gain
 
     @property
     def left_out(self) -> Int[np.ndarray, " rows"]:
@@ -88,7 +96,8 @@ def smooth(
         window: metres of trajectory gathered into one local model of the map, for sparse rings.
         speed: whether the speed of sound is estimated.
         scale: whether the scale factors of the odometry's displacements and rotations are estimated.
-        odometry_noise: noise model of the odometry; default ``OdometryNoise()``.
+        odometry_noise: noise model of the odometry; default ``OdometryNoise()``, or ``SPARSE_ODOMETRY_NOISE`` with
+            windows.
         models: the local models of the scans, if they are known already; not with windows.
         traversals: segments of the trajectory and how well they are known relative to each other; if left out, all
             scans may observe the same landmarks.
@@ -99,7 +108,22 @@ def smooth(
     """
     start, measured = _checked(log, poses, odometry, sigma, window, scale)
     report = progress or (lambda task: None)
-    if window is None and models is None:
+    if window is not None:
+        sparse = SparseSmoother(
+            ring=ring,
+            log=log,
+            odometry=measured,
+            basis=_parameter_basis(ring, speed=speed, scale=scale),
+            odometry_noise=odometry_noise or SPARSE_ODOMETRY_NOISE,
+            sigma=sigma,
+            window=window,
+            fixed_row=int(has_pose(start).argmax()),
+            progress=report,
+        )
+        found = sparse.fit(_with_predicted_poses(start, measured))
+        report("covariances")
+        return replace(_result(sparse, found.fit, found.world), heading_gain=found.heading_gain)
+    if models is None:
         report("local models")
         models = list(local_models(ring, log, sigma=sigma))
     smoother = Smoother(
@@ -109,7 +133,6 @@ def smooth(
         basis=_parameter_basis(ring, speed=speed, scale=scale),
         odometry_noise=odometry_noise or OdometryNoise(),
         sigma=sigma,
-        window=window,
         models=models,
         traversals=traversals,
         fixed_row=int(has_pose(start).argmax()),
@@ -119,12 +142,12 @@ def smooth(
     fit = smoother.fit(_with_predicted_poses(start, measured))
     # 2. Register scans without a pose on the better map, and adjust again.
     margins = SETTINGS.registration_margins[: None if has_pose(measured).any() else 1]
-    for margin in margins if models is not None else ():
+    for margin in margins:
         if has_pose(fit.poses).all():
             break
         report("registering scans without a pose")
         registered = register_remaining(
-            models or [],
+            models,
             fit.poses,
             measured,
             margin=margin,
@@ -144,8 +167,8 @@ def _better_fit(before: SmoothingFit, after: SmoothingFit) -> SmoothingFit:
     return after if after.explained_count > before.explained_count and same_noise else before
 
 
-def _result(smoother: Smoother, fit: SmoothingFit) -> Smoothed:
-    """The result of a fit, with marginal covariances."""
+def _result(smoother: Smoother | SparseSmoother, fit: SmoothingFit, world: GlobalMap | None = None) -> Smoothed:
+    """The result of a fit, with marginal covariances; without another map, with that of the adjusted landmarks."""
     found, rows, log = fit.adjustment, fit.data.scan_rows[0], smoother.log
     with jax.enable_x64(True):
         cov = marginal_covariances(found.problem, found.solution.unknowns, poses_free=True)
@@ -161,7 +184,7 @@ def _result(smoother: Smoother, fit: SmoothingFit) -> Smoothed:
         poses=fit.poses,
         pose_cov=pose_cov,
         explained_counts=fit.echo_counts,
-        world=adjusted_map(fit.alternation.maps[0], found, cov.landmarks),
+        world=adjusted_map(fit.alternation.maps[0], found, cov.landmarks) if world is None else world,
         used=float(found.used.sum() / max(fit.data.echo_count, 1)),
         sigma=found.sigma if found.sigma_dof >= SETTINGS.min_sigma_dof else None,
         ring=ring,

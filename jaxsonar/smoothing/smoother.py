@@ -32,6 +32,8 @@ from jaxsonar.smoothing.odometry_outliers import OdometryOutliers, find_odometry
 from jaxsonar.smoothing.settings import SETTINGS
 from jaxsonar.smoothing.wall_echo_mask import wall_explained_mask
 
+NO_WALL = "smooth: no wall found; allowed are scans of a place with straight walls in reach"
+
 
 class NothingExplained(SonarError):
     """No wall, or no echo that fits one."""
@@ -71,10 +73,8 @@ class Smoother:
     odometry_noise: OdometryNoiseModel
     sigma: float | None
     """Standard deviation of the ranges, metres; None: estimated."""
-    window: float | None
-    """Metres of trajectory gathered into one local model; None: every scan has one."""
-    models: Sequence[LocalModel] | None
-    """Local models of all scans; None with windows."""
+    models: Sequence[LocalModel]
+    """Local models of all scans."""
     traversals: Traversals | None
     """Segments of the trajectory; None: all scans may observe the same landmarks."""
     fixed_row: int
@@ -138,7 +138,7 @@ class Smoother:
             landmark_prior_sd=SETTINGS.free_pose_sd[0],
             min_echoes_per_landmark=self._min_echoes_per_landmark,
             cost_tolerance=SETTINGS.cost_tolerance,
-            wall_explained=None if self.models is None else wall_explained_mask(self.ring, data, self.models),
+            wall_explained=wall_explained_mask(self.ring, data, self.models),
             max_iterations=SETTINGS.large_problem_iterations if is_large else data.max_iterations,
         )
 
@@ -180,9 +180,9 @@ class Smoother:
     def _build_map(self, data: BatchData, log: Log, state: AdjustmentState, outliers: OdometryOutliers) -> GlobalMap:
         """The map at the poses of a state, with landmarks split by covisibility and odometry outliers."""
         placed = data.logs_with_poses([log], state.poses)[0]
-        world = map_with_tentative_points(self.ring_of(state), placed, window=self.window, models=self.models)
+        world = map_with_tentative_points(self.ring_of(state), placed, window=None, models=self.models)
         if not len(world):
-            raise NothingExplained("smooth: no wall found; allowed are scans of a place with straight walls in reach")
+            raise NothingExplained(NO_WALL)
         if self.traversals is not None:
             world = self.traversals.split_landmarks(world, self._row_of_scan)
         return outliers.split_landmarks(world) if len(outliers.steps) else world
@@ -229,8 +229,7 @@ class Smoother:
     def _min_echoes_per_landmark(self) -> int:
         """Least number of echoes of one landmark in a scan; a sparse ring has fewer than usual of a whole wall."""
         of_a_long_wall = float(np.asarray(self.ring.echo_paths.width).sum() / (2 * np.pi))
-        usual = SETTINGS.min_echoes_per_landmark if self.window is None else 1
-        return min(usual, max(1, int(of_a_long_wall)))
+        return min(SETTINGS.min_echoes_per_landmark, max(1, int(of_a_long_wall)))
 
     @cached_property
     def _row_of_scan(self) -> dict[int, int]:

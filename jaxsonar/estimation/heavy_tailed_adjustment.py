@@ -1,0 +1,136 @@
+"""Adjustment of poses and walls to echoes of real rooms: heavy tails, uneven walls, correlated echoes.
+
+Walls of real rooms are not plane: door frames, skirting and posters stand out by some centimetres. Echoes of one path
+from one stretch of a wall have this error in common, so that many of them determine the wall hardly better than one.
+Persons and reflections are tails of the distribution of the ranges (Student's t); slipping wheels are tails of that of
+the odometry.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxsonar import kernels
+from jaxsonar.estimation.adjustment_state import AdjustmentResult, AdjustmentState
+from jaxsonar.estimation.batch_data import BatchData
+from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
+from jaxsonar.estimation.robust_adjustment import RobustAdjustment
+from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.sensors.ring import Ring
+from jaxsonar.sensors.ring_parameters import ParameterBasis
+
+
+@dataclass(frozen=True)
+class HeavyTailSettings:
+    """Constants of the adjustment. Chosen by hand on the parts of one recorded run, and checked on those of another."""
+
+    gate: float = 0.3
+    """Largest residual of an echo of a wall, metres."""
+    range_dof: float = 3.0
+    """Degrees of freedom of Student's distribution of the ranges."""
+    odometry_dof: float = 4.0
+    """The same of the rotations of the odometry."""
+    relief: float = 0.025
+    """Standard deviation of the surface of a wall from a plane, metres."""
+    stretch: tuple[float, float] = (0.6, float(np.radians(30.0)))
+    """Motion of the robot, metres or radians, during which it sees the same surface."""
+    iterations: int = 6
+    """Reweighted least-squares adjustments, with a new association each."""
+    min_sigma: float = 1e-5
+    """Least standard deviation of the ranges, metres."""
+
+
+SETTINGS = HeavyTailSettings()
+
+
+class _Weights(NamedTuple):
+    """Echoes of walls, and their inverse variances."""
+
+    weight: Float[np.ndarray, "scans echoes"]
+    """1 / square metres."""
+    sigma: float
+    """Robust standard deviation of the ranges, metres."""
+
+
+def heavy_tailed_adjust(
+    ring: Ring,
+    data: BatchData,
+    basis: ParameterBasis,
+    state: AdjustmentState,
+    *,
+    sigma: float | None = None,
+    settings: HeavyTailSettings = SETTINGS,
+) -> AdjustmentResult:
+    """Adjust ring parameters, poses and walls. To be called with 64-bit floats enabled.
+
+    Args:
+        ring: the ring at coordinates 0.
+        data: the measurements of one log, with odometry.
+        basis: basis of the ring parameters.
+        state: initial values; the landmarks are walls.
+        sigma: standard deviation of the range noise, metres; estimated if left out.
+        settings: constants of the algorithm.
+    """
+    stretch = _stretches(data, settings)
+    information, result = data.odometry_information, None
+    for _ in range(settings.iterations):
+        job = RobustAdjustment(ring, data, basis, poses_free=True, settings=GNC_SETTINGS)
+        # 1. The wall of each echo, and the weight of the echo.
+        used, candidate, reflection = job.associate(state, gate=settings.gate, ambiguity=0.0)
+        wall = np.asarray(reflection.first)
+        found = _weights(job.residual(state, reflection), used, wall, data.path, stretch, sigma, settings)
+        # 2. Least squares.
+        state, problem, solution = job.adjust(state, reflection, found.weight)
+        # 3. Rotations that the odometry measures badly count less.
+        turn = np.asarray(kernels.odometry_residuals(problem, solution.unknowns))[:, 2]
+        heading = information.copy()
+        heading[: len(turn), 2] *= _student_weight(turn**2 * information[: len(turn), 2], settings.odometry_dof)
+        data = replace(data, odometry_information=heading)
+        residual = np.where(used, job.residual(state, reflection), 0)
+        dof = 0.0 if sigma is not None else float(used.sum())
+        result = AdjustmentResult(state, problem, solution, used, candidate, residual, found.sigma, dof)
+    assert result is not None
+    return result
+
+
+def _weights(
+    residual: Float[np.ndarray, "scans echoes"],
+    used: Bool[np.ndarray, "scans echoes"],
+    wall: Int[np.ndarray, "scans echoes"],
+    path: Int[np.ndarray, "scans echoes"],
+    stretch: Int[np.ndarray, " scans"],
+    sigma: float | None,
+    settings: HeavyTailSettings,
+) -> _Weights:
+    """Inverse variances of the echoes that walls explain.
+
+    ``count`` echoes of one path, wall and stretch have the variance sigma^2 / count + relief^2 together.
+    """
+    if not used.any():
+        return _Weights(np.zeros(residual.shape), settings.min_sigma if sigma is None else sigma)
+    off = residual[used]
+    noise = (
+        max(GNC_SETTINGS.mad_to_sigma * float(np.median(np.abs(off))), settings.min_sigma) if sigma is None else sigma
+    )
+    group = np.stack([np.broadcast_to(stretch[:, None], used.shape)[used], wall[used], path[used]])
+    _, same, count = np.unique(group, axis=1, return_inverse=True, return_counts=True)
+    variance = noise**2 + count[same.ravel()] * settings.relief**2
+    tail = _student_weight(off**2 / (noise**2 + settings.relief**2), settings.range_dof)
+    weight = np.zeros(residual.shape)
+    weight[used] = tail / variance
+    return _Weights(weight, noise)
+
+
+def _student_weight(squared: Float[np.ndarray, "*any"], dof: float) -> Float[np.ndarray, "*any"]:
+    """Weight in reweighted least squares of a residual of Student's distribution, from its square in variances."""
+    return (dof + 1) / (dof + squared)
+
+
+def _stretches(data: BatchData, settings: HeavyTailSettings) -> Int[np.ndarray, " scans"]:
+    """Number of the stretch of the trajectory of each scan, by the odometry."""
+    length = np.hypot(data.odometry[:, 0], data.odometry[:, 1]) / settings.stretch[0]
+    turn = np.abs(wrap_angle(data.odometry[:, 2])) / settings.stretch[1]
+    motion = np.append(0.0, np.cumsum(length + turn)[:-1])
+    return np.floor(motion).astype(np.int64)
