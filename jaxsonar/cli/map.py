@@ -145,7 +145,8 @@ def run(options: argparse.Namespace) -> int:
         )
     save_map(world, options.output)
     if settings_file is not None:
-        choices = {name: getattr(options, name) for name in ("method", "sigma", "merging")} | {"window": window}
+        choices: dict[str, object] = {name: getattr(options, name) for name in ("method", "sigma", "merging")}
+        choices["window"] = window
         write_toml(_run_settings(settings, choices), settings_file)
     if grid is not None:
         from jaxsonar.occupancy.nav2_map import save_nav2

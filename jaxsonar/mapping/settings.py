@@ -248,7 +248,9 @@ class GrowthSettings:
     footprint: tuple[float, ...] = (0.25, 0.5, 0.25)
     """Share of an echo's evidence for each cell around its foot: the first Fresnel zone is 0.1 m wide at 1 m."""
     cost: float = 4.0
-    """Log-likelihood that each metre beyond the known wall costs, nats. An echo (2 to 3 nats) bridges about 0.6 m."""
+    """Log-likelihood that each metre beyond the known wall costs, nats. A single echo bridges 0.6 to 0.8 m."""
+    max_gain: float = 3.5
+    """Largest log-likelihood ratio of a single echo, nats."""
     switch: float = 2.0
     """Log-likelihood that each end of a wall costs, nats."""
     driven_cost: float = 10.0
@@ -258,11 +260,15 @@ class GrowthSettings:
     iterations: int = 2
     """Iterations of growth and fit."""
     min_score: float = 9.0
-    """Log-likelihood ratio that a wall must have, nats: three to four independent echoes."""
+    """Log-likelihood ratio that a wall must have, nats: three independent echoes."""
     min_echoes: int = 4
     """Echoes that a wall must have: two determine its line, and a third may lie on it by chance."""
     min_length: float = 0.2
     """Shortest wall, metres."""
+    max_corner_line: float = 1.0
+    """Longest line that echoes of a corner or an edge produce, metres."""
+    corner_share: float = 0.75
+    """Share of a line's echoes that a corner or an edge must explain before the line is dropped."""
     hidden_depth: float = 0.15
     """A wall hides what is behind it by more than this, metres."""
     refit_iterations: int = 8

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
-from jaxsonar.geometry.segments import crossings
+from jaxsonar.geometry.segments import crossings, point_to_segments
+from jaxsonar.mapping.artifact_removal import angle_between_lines
 from jaxsonar.mapping.driven_space import DrivenSpace
 from jaxsonar.mapping.observations import unique_pairs
 from jaxsonar.mapping.settings import SETTINGS
@@ -107,7 +108,7 @@ def _supported_parts(
     cells = int(np.ceil((high - low) / settings.cell))
     position = low + (np.arange(cells) + 0.5) * settings.cell
     cell = np.minimum(((evidence.foot[used] - low) / settings.cell).astype(np.int64), cells - 1)
-    ratio = evidence.log_ratio[used] * independent_weights(measurements.section[used])
+    ratio = np.minimum(evidence.log_ratio[used], settings.max_gain) * independent_weights(measurements.section[used])
     score = np.convolve(np.bincount(cell, ratio, cells), settings.footprint, mode="same")
     is_known = (position >= line.extent[0]) & (position <= line.extent[1])
     score -= np.where(is_known, 0.0, settings.cost * settings.cell)
@@ -125,7 +126,7 @@ def _supported_parts(
         extent = np.array([evidence.foot[own].min(), evidence.foot[own].max()])
         if extent[1] - extent[0] >= settings.min_length:
             parts.append(replace(line, extent=extent, echoes=rows[own], score=total))
-    return parts
+    return [part for part in parts if not _is_corner_line(part, index.measurements.take(part.echoes), stronger, sigma)]
 
 
 def _best_intervals(score: Float[np.ndarray, " cells"], switch: float) -> list[tuple[int, int]]:
@@ -155,6 +156,38 @@ def _is_hidden(
     sight, wall = crossings(np.stack([origin, foot], axis=1), np.array([one.endpoints for one in walls]))
     before = (1 - sight) * np.linalg.norm(foot - origin, axis=1)[:, None]
     return ((sight > 0) & (before > SETTINGS.growth.hidden_depth) & (wall >= 0) & (wall <= 1)).any(axis=1)
+
+
+def _is_corner_line(line: WallLine, echoes: RangeMeasurements, walls: list[WallLine], sigma: float) -> bool:
+    """Whether a short line consists of echoes of a corner where two walls meet, or of an edge where one ends.
+
+    Such a line touches the arcs of the echoes, and has the direction of neither wall.
+    """
+    settings, artifacts = SETTINGS.growth, SETTINGS.artifacts
+    if not walls or line.extent[1] - line.extent[0] > settings.max_corner_line:
+        return False
+    theta = np.array([wall.theta for wall in walls])
+    ends = np.array([wall.endpoints for wall in walls])
+    differs = angle_between_lines(theta, np.array([line.theta])) > artifacts.same_direction
+    # Both ends of each wall, and the points where two walls would meet.
+    share, _ = crossings(ends, ends)
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
+    beyond = np.maximum(np.abs(share - 0.5) - 0.5, 0) * length[:, None]
+    meets = (np.maximum(beyond, beyond.T) <= artifacts.max_extension) & differs[:, None] & differs
+    meets &= angle_between_lines(theta[:, None], theta) > 2 * artifacts.same_direction
+    first, second = np.nonzero(np.triu(meets))
+    crossing = ends[first, 0] + share[first, second, None] * (ends[first, 1] - ends[first, 0])
+    points = np.concatenate([ends[differs].reshape(-1, 2), crossing])
+    if not len(points):
+        return False
+    near = point_to_segments(points, line.endpoints[None])[:, 0] < artifacts.max_extension / 2
+    points = points[near]
+    offset = echoes.origin[:, None] - points
+    edge = sum(np.linalg.norm(offset + sign * echoes.half_baseline[:, None], axis=-1) for sign in (-1, 1)) / 2
+    corner = np.linalg.norm(offset, axis=-1)
+    residual = np.minimum(*(np.abs(model - echoes.distance[:, None]) for model in (edge, corner)))
+    explained = (residual <= SETTINGS.support.gate * sigma).mean(axis=0)
+    return bool((explained >= settings.corner_share).any())
 
 
 def _fitted(line: WallLine, measurements: RangeMeasurements, sigma: float) -> WallLine:
