@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.fileio.atomic_files import shown
     from jaxsonar.hardware.errors import SonarError
 
-    check_sigma_is_used(options.sigma, options.method, None)
+    check_sigma_is_used(options.sigma, options.method)
     if options.output == "-":
         raise SonarError("-o - came; allowed is a folder, which can hold tables")
     messages = InputMessages(strict=options.strict)

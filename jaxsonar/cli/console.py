@@ -135,7 +135,7 @@ def ascii_name(filename: str) -> str:
     return Path(filename).name.encode("ascii", "replace").decode()
 
 
-def check_sigma_is_used(sigma: float | None, method: str, window: float | None) -> None:
+def check_sigma_is_used(sigma: float | None, method: str) -> None:
     """Check that the method uses ``--sigma``.
 
     Raises:
@@ -143,9 +143,8 @@ def check_sigma_is_used(sigma: float | None, method: str, window: float | None) 
     """
     from jaxsonar.hardware.errors import SonarError
 
-    other = f"--method {method}" if method != "ml" else "--window" if window is not None else ""
-    if sigma is not None and other:
-        raise SonarError(f"--sigma {sigma:g} came with {other}; allowed is --sigma with --method ml, without --window")
+    if sigma is not None and method != "ml":
+        raise SonarError(f"--sigma {sigma:g} came with --method {method}; allowed is --sigma with --method ml")
 
 
 def laser_files(recording: str | None) -> list[Path]:

@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
     check_outputs({"-o": options.output, "--figure": options.figure}, [options.log, options.ring, options.settings])
     if options.scan is not None and not options.figure:
         raise SonarError(f"--scan {options.scan} came alone; allowed is --scan with --figure, to which it belongs")
-    check_sigma_is_used(options.sigma, options.method, None)
+    check_sigma_is_used(options.sigma, options.method)
     ring, log = load_inputs(options)
     settings = hough_settings(ring, load_settings(options.settings) if options.settings else None)
     if options.scan is not None and options.scan not in log.scan:

@@ -1,6 +1,7 @@
 """``jaxsonar map``: a map from scans with known poses."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,10 @@ if TYPE_CHECKING:
 
     from jaxsonar.detection.local_model import LocalModel
     from jaxsonar.kernels import HoughSettings
+    from jaxsonar.mapping.global_map import GlobalMap
     from jaxsonar.mapping.map_evidence import MapEvidence
+    from jaxsonar.scans.scan_log import Log
+    from jaxsonar.sensors.ring import Ring
 
 from jaxsonar.cli.arguments import (
     add_detection_arguments,
@@ -43,7 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--window",
         type=finite(0.01, 100),
         metavar="METRES",
-        help="combine the echoes of this distance driven into one local model, for rings with few sensors (try 1.5)",
+        help="combine the echoes of this distance driven into one local model (default: none, or for rings with few "
+        "sensors a length that is chosen from ring and trajectory)",
     )
     parser.add_argument(
         "--merging",
@@ -71,15 +76,13 @@ def run(options: argparse.Namespace) -> int:
     """Run ``jaxsonar map``. Returns 1 if no echo could be used."""
     import numpy as np
 
-    from jaxsonar.detection.extract import local_models
-    from jaxsonar.detection.settings import hough_settings
+    from jaxsonar.detection.settings import hough_settings, widened
     from jaxsonar.detection.settings_toml import load_settings
     from jaxsonar.fileio.atomic_files import check_outputs, write_toml
     from jaxsonar.hardware.errors import SonarError
-    from jaxsonar.mapping.build_map import assemble_map, check_poses, required_scans
-    from jaxsonar.mapping.map_evidence import gather_evidence
+    from jaxsonar.mapping.build_map import check_poses, required_scans
     from jaxsonar.mapping.map_geojson import save_map
-    from jaxsonar.scans.sliding_windows import check_window
+    from jaxsonar.scans.sliding_windows import automatic_window, check_window
 
     settings_file = settings_filename(options.output)
     if settings_file and options.settings and Path(options.settings).resolve() == settings_file.resolve():
@@ -102,31 +105,23 @@ def run(options: argparse.Namespace) -> int:
 
         load_ezdxf(options.dxf)
     check_window(options.window)
-    check_sigma_is_used(options.sigma, options.method, options.window)
+    check_sigma_is_used(options.sigma, options.method)
     ring, log = load_inputs(options)
     given = None if options.settings is None else load_settings(options.settings)
-    settings = hough_settings(ring, given, window=options.window)
+    window = options.window
+    settings = hough_settings(ring, given, window=window)
     if nothing_used(ring, log, options.log):
         return 1
     with errors_in(options.log):
         check_poses(log)
     if nothing_used(ring, log, options.log, with_poses=True):
         return 1
-    left_out: list[int] = []
-    with errors_in(options.log):
-        models = local_models(
-            ring,
-            log,
-            method=options.method,
-            settings=settings,
-            sigma=options.sigma,
-            window=options.window,
-            on_left_out=left_out.append,
-        )
+    if window is None and (window := automatic_window(ring, log)) is not None:
+        print_status(f"single scans of {ring.name!r} do not determine lines: --window {window:g} is used")
+        settings = hough_settings(ring, None, window=window) if given is None else widened(ring, given, window=window)
     points = None if options.laser is None else _laser_points(options.laser)
-    models = list(with_progress(models, len(log) if options.window is None else None, "local models"))
-    evidence = gather_evidence(ring, log, models)
-    world = assemble_map(evidence, merging=options.merging, min_scans=required_scans(options.window))
+    left_out: list[int] = []
+    models, evidence, world = _build(ring, log, settings, options, window, left_out.append)
 
     # Compute everything before the first file is written.
     grid = figure = None
@@ -150,8 +145,9 @@ def run(options: argparse.Namespace) -> int:
         )
     save_map(world, options.output)
     if settings_file is not None:
-        names = ("method", "sigma", "window", "merging")
-        write_toml(_run_settings(settings, {name: getattr(options, name) for name in names}), settings_file)
+        choices: dict[str, object] = {name: getattr(options, name) for name in ("method", "sigma", "merging")}
+        choices["window"] = window
+        write_toml(_run_settings(settings, choices), settings_file)
     if grid is not None:
         from jaxsonar.occupancy.nav2_map import save_nav2
 
@@ -166,12 +162,53 @@ def run(options: argparse.Namespace) -> int:
     without_pose = int((~has_pose).sum())
     remark = f"; {plural(without_pose, 'scan')} without a pose left out" if without_pose else ""
     if not len(world):
-        print_status(f"no wall: {_why_no_wall(models, evidence, options.merging, required_scans(options.window))}")
+        print_status(f"no wall: {_why_no_wall(models, evidence, options.merging, required_scans(window))}")
     print_status(
         f"{plural(len(log), 'scan')}, {plural(len(models), 'local model')}, "
         f"{plural(len(evidence.segments), 'segment')}, {plural(len(world), 'wall')}, {world.length.sum():.1f} m{remark}"
     )
     return 0
+
+
+def _build(
+    ring: "Ring",
+    log: "Log",
+    settings: "HoughSettings",
+    options: argparse.Namespace,
+    window: float | None,
+    on_left_out: Callable[[int], None],
+) -> "tuple[list[LocalModel], MapEvidence, GlobalMap]":
+    """The map of a log as ``build_map`` makes it, with progress; also the local models and their evidence.
+
+    With windows, these are those of the given length. Walls are sought in windows of other lengths, too, unless the
+    paper's merging is requested.
+    """
+    from jaxsonar.detection.extract import local_models
+    from jaxsonar.detection.settings import widened
+    from jaxsonar.mapping.build_map import assemble_grown_map, assemble_map, required_scans
+    from jaxsonar.mapping.map_evidence import gather_evidence
+    from jaxsonar.scans.sliding_windows import window_lengths
+
+    lengths = window_lengths(window) if window is not None and options.merging == "fused" else (window,)
+    models, evidence = [], []
+    for length in lengths:
+        with errors_in(options.log):
+            found = local_models(
+                ring,
+                log,
+                method=options.method,
+                settings=widened(ring, settings, window=length),
+                sigma=options.sigma,
+                window=length,
+                on_left_out=on_left_out,
+            )
+        models.append(list(with_progress(found, len(log) if length is None else None, "local models")))
+        evidence.append(gather_evidence(ring, log, models[-1]))
+    if window is not None and options.merging == "fused":
+        world = assemble_grown_map(ring, log, evidence, sigma=options.sigma)
+    else:
+        world = assemble_map(evidence[0], merging=options.merging, min_scans=required_scans(window))
+    return models[0], evidence[0], world
 
 
 def _why_no_wall(models: "list[LocalModel]", evidence: "MapEvidence", merging: str, min_scans: int) -> str:

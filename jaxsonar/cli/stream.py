@@ -96,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.hardware.transport_base import NotOpenedError, parse_url
     from jaxsonar.live.stream import stream as stream_scans
 
-    check_sigma_is_used(options.sigma, options.method, None)
+    check_sigma_is_used(options.sigma, options.method)
     url = parse_url(options.url)
     replayed = url.path if url.scheme == "file" else None
     if (options.trajectory or options.odometry) and not options.slam:

@@ -108,7 +108,8 @@ def local_models(
             "hough": the method of the paper, lines only.
         settings: accumulator and low pass, for "hough" also threshold and smallest number of echoes; if omitted, the
             paper's values with an accumulator that is large enough for the ring.
-        sigma: standard deviation of the ranges, metres, for "ml"; estimated for each scan if omitted.
+        sigma: standard deviation of the ranges, metres, for "ml" and for windows; if omitted, estimated for each scan,
+            or for windows a tolerance that covers rounded and old readings.
         window: gather the scans of this length of trajectory into one local model, metres (``gather_windows``). For
             rings with so few sensors that the echoes of one scan do not determine a line. Both methods then report the
             lines of the Hough step that pass the test of plane against point. No windows if omitted.
@@ -130,7 +131,7 @@ def local_models(
         on_left_out(left_out)
     if window is None and method == "ml":
         return ml_models(ring, log, windows.echoes, settings, sigma)
-    return hough_models(ring, log, windows, settings)
+    return hough_models(ring, log, windows, settings, sigma=sigma)
 
 
 def _join_batches(scan_count: int, batches: list[tuple[Int[np.ndarray, " _"], Lines]]) -> Lines:

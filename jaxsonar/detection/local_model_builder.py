@@ -11,6 +11,7 @@ from jaxsonar.detection.hough_detector import HoughBatch, LineCandidate, hough_d
 from jaxsonar.detection.local_model import KIND_NAMES, Line, LocalModel, Point, Undecided
 from jaxsonar.detection.ml_detector import DetectionBatch, ml_detections
 from jaxsonar.detection.plane_point_test import confirmed_walls
+from jaxsonar.detection.settings import window_tolerance
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.scans.echo_batches import EchoBatch, restore_order
 from jaxsonar.scans.flat_echoes import FlatEchoes
@@ -19,7 +20,9 @@ from jaxsonar.scans.sliding_windows import Windows
 from jaxsonar.sensors.ring import Ring
 
 
-def hough_models(ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSettings) -> Iterator[LocalModel]:
+def hough_models(
+    ring: Ring, log: Log, windows: Windows, settings: kernels.HoughSettings, *, sigma: float | None = None
+) -> Iterator[LocalModel]:
     """A local model of every window of a log, in order, by method "hough".
 
     Args:
@@ -28,11 +31,15 @@ def hough_models(ring: Ring, log: Log, windows: Windows, settings: kernels.Hough
         windows: the windows; those of single scans (``Windows.of_scans``) give a model of every scan. Lines of longer
             windows must pass the test of plane against point.
         settings: accumulator, low pass, threshold and smallest number of echoes.
+        sigma: standard deviation of the ranges, metres, for that test; a tolerance for unknown noise if omitted.
     """
+    tolerance = window_tolerance(sigma)
 
     def models() -> Iterator[tuple[int, LocalModel]]:
         for found in hough_detections(ring, windows.echoes, settings):
-            walls = confirmed_walls(ring, found, settings, gap=windows.gap) if windows.gap else found.candidates
+            walls = found.candidates
+            if windows.gap:
+                walls = confirmed_walls(ring, found, settings, gap=windows.gap, tolerance=tolerance)
             for row, window in enumerate(found.batch.scans.tolist()):
                 yield window, _hough_model(ring, log, windows, found, row, walls[row], settings)
 

@@ -19,7 +19,7 @@ from jaxsonar.sensors.ring import Ring
 
 
 def confirmed_walls(
-    ring: Ring, detections: HoughBatch, settings: kernels.HoughSettings, *, gap: float
+    ring: Ring, detections: HoughBatch, settings: kernels.HoughSettings, *, gap: float, tolerance: float
 ) -> list[list[LineCandidate]]:
     """The walls of each window of a batch.
 
@@ -29,6 +29,7 @@ def confirmed_walls(
         ring: the sensors.
         detections: the candidates.
         settings: settings of the Hough step that found them.
+        tolerance: largest range residual of an echo that a reflector explains, metres.
         gap: a wall without echoes over more than this length is split into two, metres.
     """
     batch, lines = detections.batch, detections.lines
@@ -38,7 +39,7 @@ def confirmed_walls(
     candidates[:, :rows, :columns] = lines.rho, lines.theta
     rho, theta = (jnp.asarray(values) for values in candidates)
     arcs = arc_tables(ring, settings).arcs
-    fits = kernels.fit_candidates(arcs, batch.packed, rho, theta, tolerance=SETTINGS.window_tolerance)
+    fits = kernels.fit_candidates(arcs, batch.packed, rho, theta, tolerance=tolerance)
     plane, point = np.asarray(fits.plane_score), np.asarray(fits.point_score)
     rho, theta, foot = (np.asarray(values) for values in (fits.rho, fits.theta, fits.footpoint))
     # Keep the candidates that the plane model explains clearly better; scores are NaN where there is no candidate.

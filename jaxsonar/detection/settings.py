@@ -25,6 +25,8 @@ class DecisionSettings:
     window_tolerance: float = 0.03
     """Largest range residual of an echo that a reflector explains, metres. Covers range steps of 10 mm, readings that
     are 0.2 s old, and odometry errors."""
+    window_gate: float = 3.0
+    """The same in standard deviations of the ranges, where these are given."""
     plane_to_point_ratio: float = 4 / 3
     """A plane must explain this many times the echoes that a point explains; otherwise the candidate is dropped."""
     min_wall_echoes: int = 4
@@ -40,6 +42,15 @@ MIN_SIGMA = kernels.DetectionSettings().min_sigma
 
 DEFAULT_SIGMA = 0.003
 """Standard deviation of ranges that is assumed where a local model has no estimate, metres; chosen by hand."""
+
+
+def window_tolerance(sigma: float | None) -> float:
+    """Largest range residual of an echo that a reflector of a window explains, metres.
+
+    Args:
+        sigma: standard deviation of the ranges, metres; None if unknown.
+    """
+    return SETTINGS.window_tolerance if sigma is None else SETTINGS.window_gate * sigma
 
 
 def check_method(method: str) -> None:
@@ -67,7 +78,7 @@ def hough_settings(
     Raises:
         SonarError: the given accumulator is too small for the lines that this ring can observe.
     """
-    max_rho = float(np.linalg.norm(ring.position, axis=1).max() + ring.max_range) + (window or 0.0)
+    max_rho = _max_rho(ring, window)
     if settings is None:
         return _default_settings(max_rho, windows=window is not None)
     if settings.max_rho < max_rho:
@@ -76,6 +87,17 @@ def hough_settings(
             f"allowed is {max_rho:.3f} m or more, the reach of {ring.name!r}"
         )
     return settings
+
+
+def widened(ring: Ring, settings: kernels.HoughSettings, *, window: float | None) -> kernels.HoughSettings:
+    """The settings with at least as many cells in rho as a window of this length (metres) needs."""
+    cells = int(np.ceil(_max_rho(ring, window) / settings.rho_cell))
+    return replace(settings, rho_cells=max(settings.rho_cells, cells))
+
+
+def _max_rho(ring: Ring, window: float | None) -> float:
+    """Largest distance of a line that a ring observes, metres."""
+    return float(np.linalg.norm(ring.position, axis=1).max() + ring.max_range) + (window or 0.0)
 
 
 @lru_cache(maxsize=8)

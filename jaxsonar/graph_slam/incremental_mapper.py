@@ -64,7 +64,7 @@ class Mapper:
 
     Evidence adds up: the order of the scans does not matter, and the map equals that of ``build_map`` for the same
     scans (up to rounding, 1e-6 m and rad; only the latest scans of each wall are listed). With windows the scans must
-    come in the order of the trajectory.
+    come in the order of the trajectory, and the map equals that of ``build_map`` with ``grow=False``.
 
     Raises:
         SonarError: invalid arguments, as for ``build_map``.

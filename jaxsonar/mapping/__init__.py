@@ -16,6 +16,9 @@ Design decisions:
   paper's merging can be selected.
 - **Single linkage through a Delaunay triangulation.** Its edges contain the minimum spanning tree, so the cost is
   O(n log n) however dense the midpoints are, unlike enumerating all pairs within a distance.
+- **Known walls grow, echoes create none.** With few sensors, many walls have too few echoes for a local model of their
+  own, but most of these walls continue a known one. A log-likelihood ratio of single measurements decides how far
+  (``wall_growth``, ``wall_support``). It needs the measurements of the whole log, so that a ``Mapper`` does not use it.
 - **The scatter sets the uncertainty.** Standard deviations include the observed scatter of the fused observations
   (variance factor), because odometry and foreign echoes add errors that the covariances of single lines do not contain.
 """

@@ -1,12 +1,13 @@
 """Global maps from logs: local models, evidence, and the assembly of walls and points (paper, section 5)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
 from jaxsonar import kernels
 from jaxsonar.detection.extract import local_models
+from jaxsonar.detection.settings import hough_settings, widened
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.artifact_removal import (
@@ -19,14 +20,17 @@ from jaxsonar.mapping.artifact_removal import (
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.hough_merging import merge_by_hough
 from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
-from jaxsonar.mapping.observations import merge_cells
+from jaxsonar.mapping.observations import concatenate, merge_cells
 from jaxsonar.mapping.point_landmarks import PointLandmarks, cluster_points, is_static
 from jaxsonar.mapping.segment_fusion import estimate_systematic_error, fuse_segments, robust_refit
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_endpoints import blocks_gap, detached_points, snap_endpoints, spurious_walls
+from jaxsonar.mapping.wall_growth import grow_walls
 from jaxsonar.mapping.wall_segments import WallSegments
+from jaxsonar.mapping.wall_support import RangeMeasurements
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import group_firings
+from jaxsonar.scans.sliding_windows import window_lengths
 from jaxsonar.sensors.ring import Ring
 
 MERGING_METHODS = ("fused", "paper")
@@ -42,11 +46,13 @@ def build_map(
     sigma: float | None = None,
     window: float | None = None,
     merging: str = "fused",
+    grow: bool = True,
     on_left_out: Callable[[int], None] | None = None,
 ) -> GlobalMap:
     """The walls, corners and edges of the world, from a log of scans with poses (paper, section 5).
 
     Firings that stand in scans of their own are grouped (``group_firings``). The map names the first scan of a group.
+    With windows, walls are found in windows of several lengths, and grow over single echoes (``grow_walls``).
 
     Args:
         ring: the sensors.
@@ -56,6 +62,8 @@ def build_map(
         sigma: standard deviation of the ranges, as for ``local_models``.
         window: length of trajectory gathered into one local model, metres, as for ``local_models``.
         merging: "fused", or "paper" for the paper's method.
+        grow: with windows and merging "fused": whether to use several lengths and growth. False: the walls of windows
+            of one length, as ``Mapper`` finds them scan by scan.
         on_left_out: called with the number of echoes on pairs of sensors that this ring does not listen to.
 
     Raises:
@@ -64,14 +72,43 @@ def build_map(
     check_merging(merging)
     check_poses(log)
     log = group_firings(log)
-    # Detect lines, corners and edges in every scan or window.
-    models = local_models(
-        ring, log, method=method, settings=settings, sigma=sigma, window=window, on_left_out=on_left_out
-    )
-    # Transform them to the world frame, and find the free space from missing echoes.
-    evidence = gather_evidence(ring, log, models)
+    settings = hough_settings(ring, settings, window=window)
+    is_grown = grow and merging == "fused" and window is not None
+    evidence = []
+    for length in window_lengths(window) if is_grown and window is not None else (window,):
+        # Detect lines, corners and edges in every scan or window.
+        models = local_models(
+            ring,
+            log,
+            method=method,
+            settings=widened(ring, settings, window=length),
+            sigma=sigma,
+            window=length,
+            on_left_out=on_left_out if length == window else None,
+        )
+        # Transform them to the world frame, and find the free space from missing echoes.
+        evidence.append(gather_evidence(ring, log, models))
     # Merge the observations of each wall and point.
-    return assemble_map(evidence, merging=merging, min_scans=required_scans(window))
+    if is_grown:
+        return assemble_grown_map(ring, log, evidence, sigma=sigma)
+    return assemble_map(evidence[0], merging=merging, min_scans=required_scans(window))
+
+
+def assemble_grown_map(
+    ring: Ring, log: Log, evidence: Sequence[MapEvidence], *, sigma: float | None = None
+) -> GlobalMap:
+    """The walls that windows of several lengths show, grown over the single measurements of their log.
+
+    Args:
+        ring: the sensors.
+        log: the scans with poses, in the order of the trajectory.
+        evidence: the evidence of each window length.
+        sigma: standard deviation of the ranges, metres; ``SupportSettings.sigma`` if omitted.
+    """
+    merged = [_merged(one, 1) for one in evidence]
+    seeds = concatenate([walls for walls, _ in merged])
+    walls = grow_walls(seeds, RangeMeasurements.from_log(ring, log), evidence[0].driven, sigma=sigma)
+    return _as_global_map(walls, merged[0][1])
 
 
 def assemble_map(
@@ -88,6 +125,11 @@ def assemble_map(
     if merging == "paper":
         walls = merge_by_hough(evidence.segments, linkage_distance=evidence.linkage_distance)
         return _as_global_map(walls, evidence.points.take(np.arange(0)))
+    return _as_global_map(*_merged(evidence, min_scans))
+
+
+def _merged(evidence: MapEvidence, min_scans: int) -> tuple[WallSegments, PointLandmarks]:
+    """Walls and points from the observations of all scans."""
     min_scans = min(min_scans, max(1, evidence.models - 1))
     segments, free_space = merge_cells(evidence.segments), evidence.free_space
     segments = remove_driven_through(segments, evidence.driven)
@@ -123,7 +165,7 @@ def assemble_map(
     walls = robust_refit(segments.take(used), final_of[wall_of[used]], walls, systematic_error=systematic_error)
     # 6. Move the ends of the walls to corners and edges, and drop points that lie on the face of a wall.
     walls = snap_endpoints(walls, points, is_opening)
-    return _as_global_map(walls, points.take(~detached_points(walls, points)))
+    return walls, points.take(~detached_points(walls, points))
 
 
 def required_scans(window: float | None) -> int:

@@ -104,11 +104,11 @@ def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> MapEv
     # Where the robot was.
     robot_cells = np.round(poses[has_pose, :2] / SETTINGS.evidence.position_cell).astype(np.int64)
     before = np.arange(len(log)) <= rows.max(initial=-1)
-    driven = DrivenSpace.of(ring, log.pose[before], _times(log)[before])
+    driven = DrivenSpace.of(ring, log.pose[before], scan_times(log)[before])
     return MapEvidence(segments, points, free_space, np.unique(robot_cells, axis=0), int(has_pose.sum()), driven)
 
 
-def _times(log: Log) -> Float[np.ndarray, " scans"]:
+def scan_times(log: Log) -> Float[np.ndarray, " scans"]:
     """Time of each scan as in ``WallSegments.last_seen``."""
     return np.where(np.isnan(log.stamp), log.scan, log.stamp)
 
@@ -128,7 +128,7 @@ def _free_space(
     distance = np.asarray(ring.corrected(flat.reported, *ring.paths[flat.path].T))
     posed = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1))
     posed = posed[posed <= rows.max(initial=-1)]
-    time = _times(log)
+    time = scan_times(log)
     free_space = DirectionalFreeSpace()
     for first in range(0, len(posed), SETTINGS.evidence.block_scans):
         block = posed[first : first + SETTINGS.evidence.block_scans]

@@ -37,6 +37,15 @@ def measured_paths(ring: Ring, log: Log) -> Bool[np.ndarray, "scans paths"]:
     return measured
 
 
+def echoes_of_long_wall(ring: Ring, log: Log) -> float:
+    """Number of paths that receive a long wall, of those that a scan measures (median)."""
+    if not len(log):
+        return 0.0
+    width, measured = np.asarray(ring.exact_paths.width), measured_paths(ring, log)
+    rows = measured[:1] if measured.all() else measured
+    return round(float(np.median([width[paths].sum() for paths in rows]) / (2 * np.pi)), 6)
+
+
 def full_wall_paths(
     ring: Ring, counts: Float[np.ndarray, "rows paths"], *, directions: int = 360
 ) -> Float[np.ndarray, " rows"]:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.flat_echoes import FlatEchoes
-from jaxsonar.scans.measured_paths import equivalent_scans, path_rows
+from jaxsonar.scans.measured_paths import echoes_of_long_wall, equivalent_scans, path_rows
 from jaxsonar.scans.readings import SETTINGS as AGES
 from jaxsonar.scans.readings import measurement_times
 from jaxsonar.scans.scan_log import Log, Scan
@@ -40,6 +40,17 @@ class WindowSettings:
     """Rotation after which a robot has moved to another place, radians."""
     min_gap: float = 0.4
     """Readings of a wall that are closer than this along the wall belong to one segment, metres."""
+    scales: tuple[float, ...] = (1.0, 0.5, 2.0)
+    """Lengths of the windows of a map, in multiples of the given length. A wall that windows of one length cut badly is
+    found in windows of another one."""
+    sparse_echoes: float = 4.0
+    """Number of measured paths that receive a long wall in one scan; with fewer, scans are gathered over windows."""
+    sparse_length: float = 1.5
+    """Length of such a window, metres of trajectory, ..."""
+    sparse_places: int = 12
+    """... and at least this many places of the robot at which it measured."""
+    max_sparse_length: float = 6.0
+    """Longest window that is chosen automatically, metres."""
 
 
 SETTINGS = WindowSettings()
@@ -85,16 +96,47 @@ def gather_windows(ring: Ring, log: Log, *, length: float) -> tuple[Windows, int
         SonarError: a length out of range, or a sensor index that the ring does not have.
     """
     check_window(length)
+    found = independent_measurements(ring, log)
+    flat, new = found.echoes, found.independent if found.is_explicit else None
+    ever = np.any(_measured(ring, flat), axis=0)
+    begin, last = _window_bounds(log.pose, length)
+    windows = _build_windows(ring, flat, log.pose, found.used, new, ever, begin, last, length=length)
+    return windows, found.left_out
+
+
+class IndependentMeasurements(NamedTuple):
+    """The measurements of a log that are new: renewed readings, one of each path at each place of the robot."""
+
+    echoes: FlatEchoes
+    """All echoes of the log."""
+    used: Bool[np.ndarray, " echoes"]
+    """Echoes that count."""
+    independent: Bool[np.ndarray, "scans paths"]
+    """Measurements that count, whether or not they heard anything."""
+    is_explicit: bool
+    """Whether the log shows which readings were renewed. Otherwise that of echoes is guessed, and ``independent``
+    contains all measurements of scans at new places."""
+    left_out: int
+    """Number of echoes of (tx, rx) pairs that are no paths of the ring."""
+
+
+def independent_measurements(ring: Ring, log: Log) -> IndependentMeasurements:
+    """The measurements of a log that count in windows.
+
+    Args:
+        ring: the sensors.
+        log: scans in the order of the trajectory; nothing counts in scans without a pose.
+
+    Raises:
+        SonarError: a sensor index that the ring does not have.
+    """
     flat, left_out = FlatEchoes.from_log(ring, log)
     if _lists_measurements(log) or log.age.any():
         new = _first_at_place(_measured(ring, flat), log.pose)
-        used = new[flat.scan, flat.path]
-    else:
-        new = None
-        used = is_fresh_reading(flat) & has_moved(log.pose)[flat.scan]
-    ever = np.any(_measured(ring, flat), axis=0)
-    begin, last = _window_bounds(log.pose, length)
-    return _build_windows(ring, flat, log.pose, used, new, ever, begin, last, length=length), left_out
+        return IndependentMeasurements(flat, new[flat.scan, flat.path], new, True, left_out)
+    moved = has_moved(log.pose)
+    used = is_fresh_reading(flat) & moved[flat.scan]
+    return IndependentMeasurements(flat, used, _measured(ring, flat) & moved[:, None], False, left_out)
 
 
 class Measurement(NamedTuple):
@@ -314,6 +356,37 @@ def _rows_of_paths(ring: Ring, pairs: Iterable[Pair]) -> Int[np.ndarray, " rows"
     tx, rx = np.array([*pairs], np.int64).reshape(-1, 2).T
     rows = path_rows(ring, tx, rx)
     return rows[rows >= 0]
+
+
+def window_lengths(length: float) -> tuple[float, ...]:
+    """Lengths of the windows in which the walls of a map are sought, metres; the given one is the first.
+
+    Raises:
+        SonarError: the length is out of range.
+    """
+    check_window(length)
+    low, high = SETTINGS.min_length, SETTINGS.max_length
+    return tuple(dict.fromkeys(min(max(scale * length, low), high) for scale in SETTINGS.scales))
+
+
+def automatic_window(ring: Ring, log: Log) -> float | None:
+    """Length of the windows for a log whose single scans cannot determine a line; None for other logs.
+
+    A scan determines lines if enough of its measured paths receive a long wall (``sparse_echoes``). A window is longer
+    if the robot measured at few places. None, too, if the robot has driven less than a window, or has no poses.
+
+    Args:
+        ring: the sensors.
+        log: scans with poses, in the order of the trajectory.
+    """
+    known = np.isfinite(log.pose).all(axis=1)
+    if not known.any() or echoes_of_long_wall(ring, log) >= SETTINGS.sparse_echoes:
+        return None
+    steps = np.hypot(*np.diff(log.pose[known, :2], axis=0).T)
+    moving = steps[steps >= SETTINGS.place_distance]
+    spacing = float(np.median(moving)) if len(moving) else 0.0
+    length = min(max(SETTINGS.sparse_length, SETTINGS.sparse_places * spacing), SETTINGS.max_sparse_length)
+    return round(length, 1) if float(steps.sum()) >= length else None
 
 
 def check_window(length: float | None) -> None:

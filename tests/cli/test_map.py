@@ -288,6 +288,44 @@ def test_a_recording_through_all_three_commands(tmp_path, monkeypatch, capsys):
     assert found["distance_rms_m"] < 0.08
 
 
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory):
+    """A log of a ring with eight narrow sonars that drives along a corridor."""
+    folder = tmp_path_factory.mktemp("corridor")
+    write_features([feature("LineString", [[-1, y], [6, y]]) for y in (-0.9, 1.0)], folder / "room.geojson")
+    rows = [f"{x:.2f},{0.05 * math.sin(x):.4f},0" for x in np.arange(0, 4, 0.08)]
+    (folder / "path.csv").write_text("\n".join(["x,y,theta", *rows]) + "\n")
+    simulated = ["simulate", folder / "room.geojson", "--ring", "corridor8", "--path", folder / "path.csv"]
+    assert call(*simulated, "--sigma", 0.005, "--seed", 3, "-o", folder / "log.csv") == 0
+    return folder / "log.csv"
+
+
+@pytest.mark.slow
+def test_windows_are_chosen_if_single_scans_determine_no_lines(corridor, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert call("map", corridor, "--ring", "corridor8", "-o", "chosen.geojson") == 0
+    assert "--window 1.5 is used" in capsys.readouterr().err
+    assert call("map", corridor, "--ring", "corridor8", "--window", 1.5, "-o", "given.geojson") == 0
+    assert "is used" not in capsys.readouterr().err
+    assert Path("chosen.geojson").read_bytes() == Path("given.geojson").read_bytes()
+    assert Path("chosen.settings.toml").read_bytes() == Path("given.settings.toml").read_bytes()
+    assert len(segments("chosen.geojson")) == 2
+    # The settings of the run give the same map again.
+    again = ["--settings", "chosen.settings.toml", "-o", "again.geojson"]
+    assert call("map", corridor, "--ring", "corridor8", *again) == 0
+    assert Path("again.geojson").read_bytes() == Path("given.geojson").read_bytes()
+
+
+@pytest.mark.slow
+def test_sigma_applies_to_windows(corridor, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for sigma in (0.005, 0.03):
+        options = ["--window", 1.5, "--sigma", sigma, "-o", f"{sigma}.geojson"]
+        assert call("map", corridor, "--ring", "corridor8", *options) == 0
+        assert len(segments(f"{sigma}.geojson")) == 2
+    assert Path("0.005.geojson").read_bytes() != Path("0.03.geojson").read_bytes()
+
+
 # Errors: one line with what came and what is allowed, and nothing is written
 
 

@@ -17,7 +17,15 @@ from jaxsonar.scans.readings import is_repeated
 from jaxsonar.scans.scan_log import Scan
 from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.scans.sliding_windows import SETTINGS as WINDOWS
-from jaxsonar.scans.sliding_windows import WindowBuffer, gather_windows, has_moved, is_fresh_reading
+from jaxsonar.scans.sliding_windows import (
+    WindowBuffer,
+    automatic_window,
+    gather_windows,
+    has_moved,
+    independent_measurements,
+    is_fresh_reading,
+    window_lengths,
+)
 
 FOUR = Ring.circular(count=4, beam=1.0, neighbors=0)
 SETTINGS = HoughSettings()
@@ -541,3 +549,64 @@ def test_echoes_of_a_window_have_the_poses_of_their_own_times():
             world.append({(int(p), round(float(x), 6)) for p, x in zip(flat.path, at[:, 0], strict=True)})
         assert world[0] == world[1]
         assert len(world[0]) == 40
+
+
+# The choice of windows
+
+
+def straight_drive(ring, *, spacing=0.05, scans=100, poses=True):
+    """A log in which every sensor hears a wall from positions on a line."""
+    pose = np.column_stack([spacing * np.arange(scans), np.zeros(scans), np.zeros(scans)])
+    sensor = np.tile(np.arange(ring.count), scans)
+    return Log.from_echoes(
+        np.repeat(np.arange(scans), ring.count),
+        sensor,
+        sensor,
+        np.full(len(sensor), 1.0),
+        stamp=np.arange(float(scans)),
+        pose=pose if poses else np.full((scans, 3), np.nan),
+        asked=ring.paths,
+    )
+
+
+@pytest.mark.parametrize(
+    ("count", "beam_deg", "sparse"), [(24, 60, False), (24, 59, True), (8, 30, True), (8, 180, False)]
+)
+def test_windows_are_chosen_for_rings_of_which_few_paths_receive_a_wall(count, beam_deg, sparse):
+    """A long wall is received by count x beam / 360 deg direct paths."""
+    ring = Ring.circular(count=count, beam=math.radians(beam_deg), neighbors=0)
+    chosen = automatic_window(ring, straight_drive(ring))
+    assert chosen == (WINDOWS.sparse_length if sparse else None)
+
+
+def test_windows_are_longer_for_logs_with_few_places():
+    lengths = [automatic_window(FOUR, straight_drive(FOUR, spacing=spacing)) for spacing in (0.02, 0.1, 0.3, 0.5, 2.0)]
+    assert lengths == [1.5, 1.5, 3.6, 6.0, 6.0]
+
+
+def test_no_window_is_chosen_without_a_trajectory():
+    assert automatic_window(FOUR, straight_drive(FOUR, scans=20)) is None  # less than a window
+    assert automatic_window(FOUR, straight_drive(FOUR, poses=False)) is None
+    assert automatic_window(FOUR, straight_drive(FOUR)[:0]) is None
+
+
+@given(length=st.floats(0.01, 100))
+def test_windows_of_a_map_have_several_lengths_within_the_limits(length):
+    found = window_lengths(length)
+    assert found[0] == length
+    assert all(WINDOWS.min_length <= one <= WINDOWS.max_length for one in found)
+    assert len(set(found)) == len(found) >= 2
+    with pytest.raises(SonarError, match="window"):
+        window_lengths(-length)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_independent_measurements_are_those_of_windows(seed):
+    """A window of the whole trajectory holds each of them once."""
+    log = replace(a_log(seed, missing=0.0, strangers=False))
+    found = independent_measurements(FOUR, log)
+    windows, left_out = gather_windows(FOUR, log, length=90.0)
+    assert found.left_out == left_out
+    last = windows.echoes.scan == len(windows.last) - 1
+    assert last.sum() == found.used.sum()
+    assert found.independent[found.echoes.scan, found.echoes.path][found.used].all()
