@@ -25,9 +25,10 @@ from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.plausibility.odometry_jumps import OdometryJump
 from jaxsonar.registration.heading_slips import HeadingSlip
-from jaxsonar.scans.measured_paths import measured_paths
+from jaxsonar.scans.measured_paths import echoes_of_long_wall
 from jaxsonar.scans.scan_log import Log
-from jaxsonar.scans.sliding_windows import check_window
+from jaxsonar.scans.sliding_windows import SETTINGS as WINDOWS
+from jaxsonar.scans.sliding_windows import automatic_window, check_window
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.smoothing.smooth_log import Smoothed
 from jaxsonar.smoothing.smooth_log import smooth as smooth_poses
@@ -47,10 +48,6 @@ class SlamSettings:
     """Metres; without smoothing, echoes nearer to the range of a wall, corner or edge are explained by it."""
     judged_scans: int = 500
     """Number of scans, evenly selected, of which that is determined."""
-    sparse_echoes: float = 4.0
-    """Number of measured paths that receive a long wall in one scan; with fewer, scans are gathered over windows."""
-    sparse_window: float = 1.5
-    """Length of such a window, metres of trajectory."""
 
 
 SETTINGS = SlamSettings()
@@ -114,13 +111,13 @@ def slam(
     Firings that are scans of their own are merged into full scans first (``estimation_log``).
     Logs with odometry are tracked scan by scan, loops are closed, and all poses and landmarks are smoothed together.
     Logs without odometry are registered by the ranges of their echoes, long ones by walls and corners. For sparse rings
-    (``SlamSettings.sparse_echoes``) the odometry is smoothed directly, with maps of windows.
+    (``automatic_window``) the odometry is smoothed directly, with maps of windows.
 
     Args:
         ring: the sensors, calibrated.
         log: scans; their poses are odometry, and may be missing.
         sigma: standard deviation of the ranges, metres; estimated if left out.
-        window: metres of trajectory gathered into one local model; for sparse rings 1.5 m if left out.
+        window: metres of trajectory gathered into one local model; if left out, ``automatic_window``.
         odometry_noise: noise model of the odometry.
         smooth: whether to smooth. If left out: logs of up to ``SlamSettings.max_smoothed`` scans, except logs that are
             registered by ranges, unless ``speed`` is set.
@@ -143,13 +140,11 @@ def slam(
         return _of_whole_log(slam(ring, continued.log[part], **options), log, part, continued.jumps)
     log, odometry, slips = continued.log, log.pose, ()
     has_odometry = np.asarray(np.isfinite(log.pose).all(axis=1))
-    if window is None and len(log) and _echoes_of_a_long_wall(ring, log) < SETTINGS.sparse_echoes:
+    if window is None and len(log) and echoes_of_long_wall(ring, log) < WINDOWS.sparse_echoes:
         if not has_odometry.any():
-            paths = f"fewer than {SETTINGS.sparse_echoes:g} paths of {ring.name!r} receive a long wall in one scan"
+            paths = f"fewer than {WINDOWS.sparse_echoes:g} paths of {ring.name!r} receive a long wall in one scan"
             raise SonarError(f"slam: no scan has odometry, and {paths}; allowed is a log with odometry for such a ring")
-        # A robot that drives less than a window stays at one place, as far as windows are concerned.
-        stays = _distance_driven(log.pose[has_odometry]) < SETTINGS.sparse_window
-        window = None if stays else SETTINGS.sparse_window
+        window = automatic_window(ring, log)
     _check(log, has_odometry, sigma=sigma, window=window, smooth=smooth, speed=speed, scale=scale)
     noise = odometry_noise or (OdometryNoise() if window is None else SPARSE_ODOMETRY_NOISE)
     step_noise: OdometryNoiseModel = InterruptedOdometryNoise(noise, continued.bridged)
@@ -230,19 +225,6 @@ def _of_whole_log(found: Slam, log: Log, part: slice, jumps: tuple[OdometryJump,
         jumps=jumps,
         slips=tuple(replace(one, row=one.row + first) for one in found.slips),
     )
-
-
-def _echoes_of_a_long_wall(ring: Ring, log: Log) -> float:
-    """Number of paths that receive a long wall, of those that a scan measures (median)."""
-    width = np.asarray(ring.echo_paths.width)
-    measured = measured_paths(ring, log)
-    whole = measured[:1] if measured.all() else measured
-    return float(np.median([width[paths].sum() for paths in whole]) / (2 * np.pi))
-
-
-def _distance_driven(poses: Float[np.ndarray, "scans 3"]) -> float:
-    """Length of a trajectory, metres."""
-    return float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
 
 
 def _explained_share(ring: Ring, log: Log, world: GlobalMap) -> float:
