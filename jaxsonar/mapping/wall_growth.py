@@ -18,7 +18,13 @@ from jaxsonar.mapping.driven_space import DrivenSpace
 from jaxsonar.mapping.observations import unique_pairs
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_segments import WallSegments
-from jaxsonar.mapping.wall_support import MeasurementIndex, RangeMeasurements, independent_weights, line_evidence
+from jaxsonar.mapping.wall_support import (
+    MeasurementIndex,
+    RangeMeasurements,
+    independent_weights,
+    largest_log_ratio,
+    line_evidence,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +121,9 @@ def _supported_parts(
     crossed_at = driven.latest(line.center + position[:, None] * tangent)
     was_crossed = crossed_at > walls.last_seen[line.seed] - SETTINGS.artifacts.door_time
     score -= np.where(was_crossed, settings.driven_cost, 0.0)
-    # The most likely parts.
+    # The most likely parts. Short ones need echoes of high evidence, and hardly any against them.
+    largest = min(largest_log_ratio(measurements.max_range, sigma), settings.max_gain)
+    least_mean = settings.short_share * largest
     fitting, parts = np.flatnonzero(used & evidence.fits), []
     for first, last in _best_intervals(score, settings.switch):
         start, stop = low + first * settings.cell, low + (last + 1) * settings.cell
@@ -124,7 +132,8 @@ def _supported_parts(
         if not is_known[first : last + 1].any() or total < settings.min_score or len(own) < settings.min_echoes:
             continue
         extent = np.array([evidence.foot[own].min(), evidence.foot[own].max()])
-        if extent[1] - extent[0] >= settings.min_length:
+        is_weak = total < least_mean * len(np.unique(measurements.section[own]))
+        if extent[1] - extent[0] >= (settings.short if is_weak else settings.min_length):
             parts.append(replace(line, extent=extent, echoes=rows[own], score=total))
     return [part for part in parts if not _is_corner_line(part, index.measurements.take(part.echoes), stronger, sigma)]
 
@@ -164,7 +173,7 @@ def _is_corner_line(line: WallLine, echoes: RangeMeasurements, walls: list[WallL
     Such a line touches the arcs of the echoes, and has the direction of neither wall.
     """
     settings, artifacts = SETTINGS.growth, SETTINGS.artifacts
-    if not walls or line.extent[1] - line.extent[0] > settings.max_corner_line:
+    if not walls or line.extent[1] - line.extent[0] > settings.short:
         return False
     theta = np.array([wall.theta for wall in walls])
     ends = np.array([wall.endpoints for wall in walls])

@@ -198,3 +198,15 @@ def line_evidence(
     # Of several echoes of one measurement only the first one proves that there is nothing in front of it.
     log_ratio[~measurements.is_first & ~fits] = 0.0
     return LineEvidence(foot, np.where(silent, np.inf, residual), log_ratio, fits)
+
+
+def largest_log_ratio(max_range: float, sigma: float) -> float:
+    """Log-likelihood ratio of an echo that fits exactly, from a wall that the sensor faces exactly, nats.
+
+    Args:
+        max_range: largest distance of an echo, metres.
+        sigma: standard deviation of the ranges, metres.
+    """
+    settings = SETTINGS.support
+    core = (1 - settings.too_short) / (np.sqrt(2 * np.pi) * sigma)
+    return float(np.log(1 - settings.detection + settings.detection * core * max_range / settings.heard))

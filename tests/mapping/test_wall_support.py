@@ -9,7 +9,13 @@ import pytest
 from jaxsonar import Log, Ring, Room, simulate
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.mapping.settings import SETTINGS
-from jaxsonar.mapping.wall_support import MeasurementIndex, RangeMeasurements, independent_weights, line_evidence
+from jaxsonar.mapping.wall_support import (
+    MeasurementIndex,
+    RangeMeasurements,
+    independent_weights,
+    largest_log_ratio,
+    line_evidence,
+)
 
 SONARS = Ring.circular(count=8, radius=0.2, beam=math.radians(30.0), neighbors=0, max_range=3.0)
 CENTER, NORMAL, SIGMA = np.array([0.3, 1.5]), math.pi / 2, 0.02
@@ -66,6 +72,15 @@ def test_a_wall_out_of_view_has_no_evidence():
 def test_only_the_first_echo_of_a_measurement_shows_that_nothing_is_in_front():
     assert log_ratio(1.9, is_first=False) == 0
     assert log_ratio(1.5, is_first=False) == log_ratio(1.5)
+
+
+@pytest.mark.parametrize("sigma", [0.003, 0.02, 0.05])
+def test_no_echo_has_more_evidence_than_one_that_fits_exactly(rng, sigma):
+    most = largest_log_ratio(3.0, sigma)
+    for degrees in (-10, 0, 5):
+        many = measured(rng.uniform(0.1, 2.9, 500), axis=math.pi / 2 + math.radians(degrees))
+        assert line_evidence(many, CENTER, NORMAL, sigma=sigma).log_ratio.max() <= most + 0.05
+    assert line_evidence(measured(1.5), CENTER, NORMAL, sigma=sigma).log_ratio == pytest.approx(most)
 
 
 @pytest.mark.parametrize("degrees", [0, 10, 20])
