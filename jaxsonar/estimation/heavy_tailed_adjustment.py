@@ -33,7 +33,11 @@ class HeavyTailSettings:
     odometry_dof: float = 4.0
     """The same of the rotations of the odometry."""
     relief: float = 0.025
-    """Standard deviation of the surface of a wall from a plane, metres."""
+    """Usual standard deviation of the surface of a wall from a plane, metres, ..."""
+    relief_groups: float = 4.0
+    """... which counts like that of so many groups of echoes."""
+    relief_factor: float = 2.0
+    """Standard deviation of the surface over that of the mean residuals of groups: walls and poses adapt to them."""
     stretch: tuple[float, float] = (0.6, float(np.radians(30.0)))
     """Motion of the robot, metres or radians, during which it sees the same surface."""
     iterations: int = 6
@@ -52,6 +56,10 @@ class _Weights(NamedTuple):
     """1 / square metres."""
     sigma: float
     """Robust standard deviation of the ranges, metres."""
+    pairs: int
+    """Number of pairs of echoes that it was estimated from; 0 if it was given."""
+    relief: float
+    """Estimated standard deviation of the surface of walls from planes, metres."""
 
 
 def heavy_tailed_adjust(
@@ -74,13 +82,14 @@ def heavy_tailed_adjust(
         settings: constants of the algorithm.
     """
     stretch = _stretches(data, settings)
-    information, result = data.odometry_information, None
+    information, relief, result = data.odometry_information, settings.relief, None
     for _ in range(settings.iterations):
         job = RobustAdjustment(ring, data, basis, poses_free=True, settings=GNC_SETTINGS)
         # 1. The wall of each echo, and the weight of the echo.
         used, candidate, reflection = job.associate(state, gate=settings.gate, ambiguity=0.0)
         wall = np.asarray(reflection.first)
-        found = _weights(job.residual(state, reflection), used, wall, data.path, stretch, sigma, settings)
+        found = _weights(job.residual(state, reflection), used, wall, data.path, stretch, sigma, relief, settings)
+        relief = found.relief
         # 2. Least squares.
         state, problem, solution = job.adjust(state, reflection, found.weight)
         # 3. Rotations that the odometry measures badly count less.
@@ -89,8 +98,7 @@ def heavy_tailed_adjust(
         heading[: len(turn), 2] *= _student_weight(turn**2 * information[: len(turn), 2], settings.odometry_dof)
         data = replace(data, odometry_information=heading)
         residual = np.where(used, job.residual(state, reflection), 0)
-        dof = 0.0 if sigma is not None else float(used.sum())
-        result = AdjustmentResult(state, problem, solution, used, candidate, residual, found.sigma, dof)
+        result = AdjustmentResult(state, problem, solution, used, candidate, residual, found.sigma, found.pairs)
     assert result is not None
     return result
 
@@ -102,25 +110,39 @@ def _weights(
     path: Int[np.ndarray, "scans echoes"],
     stretch: Int[np.ndarray, " scans"],
     sigma: float | None,
+    relief: float,
     settings: HeavyTailSettings,
 ) -> _Weights:
     """Inverse variances of the echoes that walls explain.
 
-    ``count`` echoes of one path, wall and stretch have the variance sigma^2 / count + relief^2 together.
+    ``count`` echoes of one path, wall and stretch have the variance sigma^2 / count + relief^2 together. They have the
+    error of the wall and of the poses in common, so that their differences show the noise of the ranges.
     """
-    if not used.any():
-        return _Weights(np.zeros(residual.shape), settings.min_sigma if sigma is None else sigma)
-    off = residual[used]
-    noise = (
-        max(GNC_SETTINGS.mad_to_sigma * float(np.median(np.abs(off))), settings.min_sigma) if sigma is None else sigma
-    )
     group = np.stack([np.broadcast_to(stretch[:, None], used.shape)[used], wall[used], path[used]])
     _, same, count = np.unique(group, axis=1, return_inverse=True, return_counts=True)
-    variance = noise**2 + count[same.ravel()] * settings.relief**2
-    tail = _student_weight(off**2 / (noise**2 + settings.relief**2), settings.range_dof)
+    same, off = same.ravel(), residual[used]
+    order = np.argsort(same, kind="stable")  # the echoes of a group in the order of the scans
+    change = np.diff(off[order])[np.diff(same[order]) == 0]
+    noise, pairs = sigma, 0
+    if noise is None:
+        spread = GNC_SETTINGS.mad_to_sigma * float(np.median(np.abs(change))) / np.sqrt(2) if len(change) else 0.0
+        noise, pairs = max(float(spread), settings.min_sigma), len(change)
+    tail = _student_weight(off**2 / (noise**2 + relief**2), settings.range_dof)
+    mean = np.bincount(same, tail * off) / np.maximum(np.bincount(same, tail), 1e-12)
+    relief = _relief(mean, relief, settings)
     weight = np.zeros(residual.shape)
-    weight[used] = tail / variance
-    return _Weights(weight, noise)
+    weight[used] = tail / (noise**2 + count[same] * relief**2)
+    return _Weights(weight, noise, pairs, relief)
+
+
+def _relief(mean: Float[np.ndarray, " groups"], start: float, settings: HeavyTailSettings) -> float:
+    """Standard deviation of the surface of walls, metres, from the mean residuals of groups of echoes."""
+    spread = start / settings.relief_factor
+    for _ in range(settings.iterations):
+        weight = _student_weight((mean / spread) ** 2, settings.range_dof)
+        squares = settings.relief_groups * (settings.relief / settings.relief_factor) ** 2 + (weight * mean**2).sum()
+        spread = float(np.sqrt(squares / (settings.relief_groups + len(mean))))
+    return settings.relief_factor * spread
 
 
 def _student_weight(squared: Float[np.ndarray, "*any"], dof: float) -> Float[np.ndarray, "*any"]:

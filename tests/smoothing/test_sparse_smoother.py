@@ -1,0 +1,79 @@
+"""Smoothing for sparse rings: better than the odometry where walls tell, the odometry itself where they do not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.wandering_robot import RING, log_of, ranges, trajectory
+
+from jaxsonar import SonarError
+from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.simulation.wheel_odometry import simulate_odometry
+from jaxsonar.smoothing.smooth_log import smooth
+from jaxsonar.smoothing.sparse_smoother import SPARSE_SETTINGS
+
+TRUE = trajectory(260)
+SPARSE = replace(RING, beam=np.full(RING.count, np.radians(24.0)))
+
+
+def uneven(reported, rng, *, relief=0.02, tail=0.1):
+    """Ranges to walls whose surface changes every 0.6 m of the way, and some of persons in front of them."""
+    stretch = np.arange(len(reported)) // 15
+    off = relief * rng.standard_normal((stretch.max() + 1, reported.shape[1]))[stretch]
+    person = rng.random(reported.shape) < tail
+    return np.maximum(reported + off - np.where(person, rng.exponential(0.3, reported.shape), 0.0), 0.1)
+
+
+def drifting(seed):
+    return simulate_odometry(TRUE, distance=0.02, turn=float(np.radians(1.0)), seed=seed)
+
+
+def rms(poses):
+    """RMS error of position (metres) and heading (radians); the first pose is the true one."""
+    off = poses - TRUE
+    return np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))), np.sqrt(np.mean(wrap_angle(off[:, 2]) ** 2))
+
+
+@pytest.fixture(scope="module")
+def results():
+    found = []
+    for seed in range(3):
+        odometry = drifting(seed)
+        reported = uneven(ranges(TRUE, sigma=0.01, seed=seed, ring=SPARSE), np.random.default_rng(seed))
+        found.append((odometry, smooth(SPARSE, log_of(reported, odometry), odometry, odometry=odometry, window=1.5)))
+    return found
+
+
+def test_uneven_walls_and_persons_leave_poses_better_than_the_odometry(results):
+    before = np.mean([rms(odometry) for odometry, _ in results], axis=0)
+    after = np.mean([rms(found.poses) for _, found in results], axis=0)
+    assert (after < 0.8 * before).all()
+
+
+def test_the_covariance_is_consistent(results):
+    nees = []
+    for _, found in results:
+        off = found.poses - TRUE
+        off[:, 2] = wrap_angle(off[:, 2])
+        rows = np.arange(20, len(TRUE), 10)
+        nees.append(np.mean([off[k] @ np.linalg.solve(found.pose_cov[k], off[k]) for k in rows]) / 3)
+    assert 0.1 < np.mean(nees) < 2
+
+
+def test_where_walls_are_seen_for_a_short_time_the_odometry_is_kept():
+    """The poses are exactly those of the odometry, and the result says so."""
+    odometry = drifting(5)
+    reported = ranges(TRUE, ring=SPARSE)
+    reported[60:] = np.nan
+    found = smooth(SPARSE, log_of(reported, odometry), odometry, odometry=odometry, window=1.5)
+    assert found.heading_gain is not None
+    assert found.keeps_odometry == (found.heading_gain < SPARSE_SETTINGS.least_heading_gain)
+    assert found.keeps_odometry
+    np.testing.assert_array_equal(found.poses, odometry)
+
+
+def test_without_any_wall_nothing_is_called_a_result():
+    odometry = drifting(6)
+    reported = np.random.default_rng(0).uniform(0.3, 4.5, (len(TRUE), SPARSE.count))
+    with pytest.raises(SonarError, match="no wall found"):
+        smooth(SPARSE, log_of(reported, odometry), odometry, odometry=odometry, window=1.5)
