@@ -190,6 +190,7 @@ def _build(
     from jaxsonar.scans.sliding_windows import window_lengths
 
     lengths = window_lengths(window) if window is not None and options.merging == "fused" else (window,)
+    settings = widened(ring, settings, window=max(length or 0.0 for length in lengths))
     models, evidence = [], []
     for length in lengths:
         with errors_in(options.log):
@@ -197,7 +198,7 @@ def _build(
                 ring,
                 log,
                 method=options.method,
-                settings=widened(ring, settings, window=length),
+                settings=settings,
                 sigma=options.sigma,
                 window=length,
                 on_left_out=on_left_out,

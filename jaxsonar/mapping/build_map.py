@@ -74,14 +74,16 @@ def build_map(
     log = group_firings(log)
     settings = hough_settings(ring, settings, window=window)
     is_grown = grow and merging == "fused" and window is not None
+    lengths = window_lengths(window) if is_grown and window is not None else (window,)
+    settings = widened(ring, settings, window=max(length or 0.0 for length in lengths))
     evidence = []
-    for length in window_lengths(window) if is_grown and window is not None else (window,):
+    for length in lengths:
         # Detect lines, corners and edges in every scan or window.
         models = local_models(
             ring,
             log,
             method=method,
-            settings=widened(ring, settings, window=length),
+            settings=settings,
             sigma=sigma,
             window=length,
             on_left_out=on_left_out if length == window else None,

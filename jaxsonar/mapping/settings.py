@@ -269,8 +269,8 @@ class GrowthSettings:
     """Lines below this length may be artifacts: of corners, edges, and obstacles at several distances, metres."""
     short_share: float = 0.7
     """Mean evidence of the independent echoes of a short wall, minus that against it, as a share of the largest
-    evidence that an echo can have. Chosen on simulated corridors with recesses: 30 % of the length below this share is not on a
-    wall, 12 % of the length above it. Two recorded runs, whole and in halves, confirm it."""
+    evidence that an echo can have. Chosen on simulated corridors with recesses: 30 % of the length below this share is
+    not on a wall, 12 % of the length above it. Two recorded runs, whole and in halves, confirm it."""
     corner_share: float = 0.75
     """Share of a line's echoes that a corner or an edge must explain before the line is dropped."""
     hidden_depth: float = 0.15

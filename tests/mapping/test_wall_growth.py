@@ -203,6 +203,7 @@ def test_the_map_hardly_depends_on_the_length_of_the_windows():
     assert min(covered(world) for world in worlds) > 0.5
 
 
+@pytest.mark.slow
 def test_the_map_moves_with_the_poses():
     log = drive()
     turn, shift = 0.7, np.array([30.0, -20.0])
@@ -216,6 +217,7 @@ def test_the_map_moves_with_the_poses():
     np.testing.assert_allclose(there.length.sum(), here.length.sum(), rtol=0.02)
 
 
+@pytest.mark.slow
 def test_standard_deviations_of_lines_agree_with_their_errors():
     """Deviations of rho over many runs, normalised by the stated standard deviation."""
     normalised = []
