@@ -141,7 +141,7 @@ def _slope(
         scale = max(scale, SETTINGS.min_noise)
     along, across = (one - np.average(one, weights=weight) for one in (along, across))
     variance = (weight * along**2).sum()
-    bearing_sd = half_cone / np.sqrt(3)  # equally likely anywhere in the cone
+    bearing_sd = half_cone / np.sqrt(6)  # triangular distribution: a target must stay in the cone during the track
     slope = float(value[1]) / (1 - bearing_sd**2 / 2)
     if abs(slope - 1) > SETTINGS.max_error:
         return None

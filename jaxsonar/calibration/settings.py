@@ -135,9 +135,9 @@ class SparseCalibrationSettings:
     """Prior standard deviation of the mean range offset, metres. Offsets of 68 mm occur."""
     jackknife: float = 2.0
     """Length of trajectory that is left out at a time for the standard errors, metres."""
-    max_scale_sd: float = 0.015
-    """A scale with a larger standard deviation is held, unless it differs from the nominal one significantly. The speed
-    of sound of air at an unknown temperature is known as well as that."""
+    max_scale_sd: float = 0.02
+    """A scale with a larger standard deviation is held, unless it differs from the nominal one significantly: 2 % are
+    40 mm at 2 m, more than the noise."""
     significant: float = 3.0
     """That many standard deviations are significant."""
     max_offset: float = 0.15

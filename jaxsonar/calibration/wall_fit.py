@@ -1,4 +1,4 @@
-"""Range offsets of a ring from echoes at walls, at a given scale: robust least squares with jackknife errors.
+"""Range offsets of a ring from echoes at walls, at a given scale: robust least squares with errors from a jackknife.
 
 A wall takes up what is common to the sensors that see it. What remains are the differences between these sensors. The
 mean range offset is not determined: walls that are farther away give the same ranges.
@@ -61,43 +61,46 @@ def fit_offsets(echoes: WallEchoes, *, log_speed: float, free: bool, sigma: floa
         free: whether offsets are estimated; otherwise only the walls are.
         sigma: scale of the residuals, metres; None: estimated.
     """
-    system = _WallSystem(echoes, log_speed)
-    count = echoes.ring.count
+    system, count = _WallSystem(echoes, log_speed), echoes.ring.count
     prior = _prior(count, free=free, mean_sd=_HELD)
-    scale = SETTINGS.first_noise if sigma is None else sigma
-    offset = np.zeros(count)
-    for _ in range(SETTINGS.iterations):
-        # 1. Eliminate the walls, solve for the offsets, and substitute back.
-        found = system.eliminate(offset, scale)
-        step = np.linalg.solve(found.information[:-1, :-1] + prior, found.gradient[:-1] - prior @ offset)
-        system.move(found, np.append(step, 0.0))
-        offset = offset + step
-        # 2. The scale of the residuals (expectation maximization of the t distribution).
-        if sigma is None:
-            residual = system.residual(offset)
-            scale = max(float(np.sqrt(np.mean(_weight(residual / scale) * residual**2))), SETTINGS.min_noise)
+    # 1. Least squares, and the overdispersion of the offsets by a jackknife over stretches of the trajectory.
+    offset, scale = system.solve(np.zeros(count), prior, 1.0, sigma)
+    dispersion = _dispersion(system, offset, scale, prior) if free else 1.0
+    # 2. Least squares with the errors that the jackknife shows: offsets that rest on single walls stay near the prior.
+    offset, scale = system.solve(offset, prior, dispersion, sigma)
     found = system.eliminate(offset, scale)
-    information = found.information[:-1, :-1] + prior
-    covariance = np.linalg.inv(information)
-    # 3. Standard errors: the larger ones of the least squares and of the jackknife over stretches of the trajectory.
-    stretch = np.floor(echoes.travelled / SETTINGS.jackknife).astype(int)
-    others = []
-    for one in np.unique(stretch).tolist():
-        rest = system.eliminate(offset, scale, stretch != one)
-        others.append(np.linalg.solve(rest.information[:-1, :-1] + prior, rest.gradient[:-1] - prior @ offset))
-    jackknife = np.sqrt(np.var(others, axis=0) * (len(others) - 1))
-    larger = np.maximum(jackknife / np.sqrt(np.diag(covariance)), 1)
-    free_mean = found.information[:-1, :-1] + _prior(count, free=free, mean_sd=SETTINGS.mean_offset_sd)
+    information = found.information / dispersion
+    covariance = np.linalg.inv(information[:-1, :-1] + prior)
+    free_mean = information[:-1, :-1] + _prior(count, free=free, mean_sd=SETTINGS.mean_offset_sd)
     return OffsetFit(
         offset,
-        covariance * np.outer(larger, larger),
-        -covariance @ found.information[:-1, -1],
+        covariance,
+        -covariance @ information[:-1, -1],
         float(np.sqrt(np.linalg.inv(free_mean).mean())),
         system.plane,
         system.residual(offset),
         system.distance,
         scale,
     )
+
+
+def _dispersion(
+    system: "_WallSystem",
+    offset: Float[np.ndarray, " sensors"],
+    scale: float,
+    prior: Float[np.ndarray, "sensors sensors"],
+) -> float:
+    """Variance of the estimated offsets between stretches of the trajectory, divided by that of independent errors."""
+    stretch = np.floor(system.echoes.travelled / SETTINGS.jackknife).astype(int)
+    others = []
+    for one in np.unique(stretch).tolist():
+        rest = system.eliminate(offset, scale, stretch != one)
+        others.append(np.linalg.solve(rest.information[:-1, :-1] + prior, rest.gradient[:-1] - prior @ offset))
+    data = system.eliminate(offset, scale).information[:-1, :-1]
+    covariance = np.linalg.inv(data + prior)
+    expected = float(np.trace(covariance @ data @ covariance))
+    found = float(np.var(others, axis=0).sum() * (len(others) - 1))
+    return max(found / max(expected, 1e-12), 1.0)
 
 
 class _WallSystem:
@@ -116,6 +119,35 @@ class _WallSystem:
         self.nominal_offset = self.sensors @ np.asarray(echoes.ring.range_offset)
         self.factor = REFERENCE_SPEED_OF_SOUND / float(echoes.ring.speed_of_sound) * np.exp(-log_speed)
         self.plane = np.zeros((len(echoes.center), 2))
+
+    def solve(
+        self,
+        offset: Float[np.ndarray, " sensors"],
+        prior: Float[np.ndarray, "sensors sensors"],
+        dispersion: float,
+        sigma: float | None,
+    ) -> tuple[Float[np.ndarray, " sensors"], float]:
+        """Robust least squares over offsets and walls. Returns the offsets and the scale of the residuals.
+
+        Args:
+            offset: offsets at the beginning, metres.
+            prior: prior information of the offsets.
+            dispersion: factor of the variance that the echoes give the offsets.
+            sigma: scale of the residuals, metres; None: estimated.
+        """
+        scale = SETTINGS.first_noise if sigma is None else sigma
+        for _ in range(SETTINGS.iterations):
+            # 1. Eliminate the walls, solve for the offsets, and substitute back.
+            found = self.eliminate(offset, scale)
+            information = found.information[:-1, :-1] / dispersion + prior
+            step = np.linalg.solve(information, found.gradient[:-1] / dispersion - prior @ offset)
+            self._move(found, np.append(step, 0.0))
+            offset = offset + step
+            # 2. The scale of the residuals (expectation maximization of the t distribution).
+            if sigma is None:
+                residual = self.residual(offset)
+                scale = max(float(np.sqrt(np.mean(_weight(residual / scale) * residual**2))), SETTINGS.min_noise)
+        return offset, scale
 
     @property
     def distance(self) -> Float[np.ndarray, " echoes"]:
@@ -156,7 +188,7 @@ class _WallSystem:
             pull,
         )
 
-    def move(self, found: _Elimination, step: Float[np.ndarray, " parameters"]) -> None:
+    def _move(self, found: _Elimination, step: Float[np.ndarray, " parameters"]) -> None:
         """Change the walls after a step of the ring."""
         self.plane = self.plane + (found.inverse @ (found.pull - found.coupling @ step)[..., None])[..., 0]
 

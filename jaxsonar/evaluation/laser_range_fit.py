@@ -4,13 +4,16 @@ The walls that the laser sees along the trajectory give the true range of every 
 perpendicular on a wall. Measured ranges are a linear function of the true ones, with heavy-tailed errors.
 """
 
+import os
 from dataclasses import dataclass, replace
 
 import numpy as np
+import tomli_w
 from jaxtyping import Float, Int
 
 from jaxsonar.evaluation.laser_reference_map import reference_map
 from jaxsonar.evaluation.settings import SETTINGS as EVALUATION
+from jaxsonar.fileio.atomic_files import open_output
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.laser_datasets import LaserRecording
@@ -20,6 +23,7 @@ from jaxsonar.scans.firing_poses import poses_at, reading_poses
 from jaxsonar.scans.measured_paths import path_rows
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
+from jaxsonar.sensors.ring_toml import ring_toml
 
 SETTINGS = EVALUATION.ranges
 
@@ -88,6 +92,34 @@ class LaserRangeFit:
             f"m/s ± {self.scale_sd / self.scale * float(self.ring.speed_of_sound):.2f}",
             f"mean range offset {1e3 * self.offset:.1f} mm ± {1e3 * self.offset_sd:.1f}",
         )
+
+
+def save_laser_fit(fit: LaserRangeFit, filename: str | os.PathLike[str]) -> None:
+    """Write the fitted ring and a table ``[calibration]`` atomically.
+
+    Args:
+        fit: the result to write.
+        filename: the file; ``-`` is standard output.
+
+    Raises:
+        SonarError: the file cannot be written.
+    """
+    table = {
+        "estimated": ["offset", "speed"],
+        "reference": "laser",
+        "echoes": len(fit.ranges.true),
+        "walls": len(np.unique(fit.ranges.wall)),
+        "scale": round(fit.scale, 6),
+        "scale_sd": round(fit.scale_sd, 6),
+        "mean_offset": round(fit.offset, 6),
+        "mean_offset_sd": round(fit.offset_sd, 6),
+        "sensor_echoes": fit.sensor_echoes.tolist(),
+        "robust_sigma_before": round(fit.ranges.robust_sigma(fit.nominal), 6),
+        "robust_sigma_after": round(fit.ranges.robust_sigma(fit.ring), 6),
+    }
+    text = ring_toml(fit.ring, each=True) + "\n" + tomli_w.dumps({"calibration": table})
+    with open_output(filename) as file:
+        file.write(text)
 
 
 def laser_ranges(ring: Ring, log: Log, laser: LaserRecording) -> LaserRanges:
