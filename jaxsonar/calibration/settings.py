@@ -144,7 +144,7 @@ class SparseCalibrationSettings:
     """Largest change of a range offset, metres."""
     max_log_speed: float = 0.12
     """Largest change of the logarithm of the speed of sound."""
-    min_explained: float = 0.10
+    min_explained: float = 0.05
     """Smallest fraction of the fresh echoes that the walls must explain. Most echoes of sparse rings come from posts,
     door frames and furniture."""
 
