@@ -82,7 +82,6 @@ def calibrate(
     if temperature is not None:
         prior_ring, speed_sd = replace(ring, speed_of_sound=speed_of_sound(temperature)), PRIOR.measured_speed_sd
     if set(free) <= set(DEFAULT_PARAMETERS) and is_sparse(prior_ring, logs):
-        check_calibration_poses(logs)
         return calibrate_sparse_ring(
             ring,
             prior_ring,

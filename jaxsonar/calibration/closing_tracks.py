@@ -61,8 +61,10 @@ def estimate_scale(ring: Ring, logs: Sequence[Log]) -> ScaleEstimate:
     value, sd = np.array([one.log_scale for one in tracks]), np.array([one.sd for one in tracks])
     mean, spread, model_sd = robust_mean(value, sd)
     # Errors of poses and targets are common to tracks of one place: leave out one stretch at a time.
-    start = np.array([one.start for one in tracks]) / [1, SETTINGS.stretch]
-    _, stretch = np.unique(np.floor(start), axis=0, return_inverse=True)
+    start = np.array([one.start for one in tracks])
+    total = sum(float(distance_travelled(log).max(initial=0.0)) for log in logs)
+    length = max(SETTINGS.stretch, total / SETTINGS.most_stretches)
+    _, stretch = np.unique(np.floor(start / [1, length]), axis=0, return_inverse=True)
     stretch = stretch.ravel()
     count = int(stretch.max()) + 1
     if count < SETTINGS.min_stretches:

@@ -84,6 +84,8 @@ class ClosingTrackSettings:
     part moves by centimetres along a track of a metre."""
     stretch: float = 2.0
     """Length of trajectory whose tracks are left out at a time for the standard error, metres."""
+    most_stretches: int = 60
+    """Stretches are longer if there would be more of them."""
     min_tracks: int = 6
     """Tracks that an estimate needs, ..."""
     min_stretches: int = 4
@@ -106,6 +108,8 @@ class SparseCalibrationSettings:
     """A ring is sparse if a long wall is received by fewer paths than this in one scan, as in ``slam``."""
     window: float = 1.5
     """Length of the windows of its maps, metres, unless one is given."""
+    min_scans: int = 20
+    """Scans with a pose that a log needs."""
     gate: float = 0.12
     """Largest difference between measured and expected range of an echo that is assigned to a wall, metres. The map was
     made from the same echoes."""
@@ -135,6 +139,8 @@ class SparseCalibrationSettings:
     """Prior standard deviation of the mean range offset, metres. Offsets of 68 mm occur."""
     jackknife: float = 2.0
     """Length of trajectory that is left out at a time for the standard errors, metres."""
+    most_stretches: int = 60
+    """These stretches are longer if there would be more of them."""
     max_scale_sd: float = 0.02
     """A scale with a larger standard deviation is held, unless it differs from the nominal one significantly: 2 % are
     40 mm at 2 m, more than the noise."""

@@ -75,8 +75,9 @@ def calibrate_sparse_ring(
         progress: called with a description of each step.
 
     Raises:
-        SonarError: walls explain too few echoes, or a result outside the plausible range.
+        SonarError: too few scans with a pose, walls explain too few echoes, or a result outside the plausible range.
     """
+    _check_poses(logs)
     window = SETTINGS.window if window is None else window
     fresh = [fresh_readings(ring, log) for log in logs]
     # 1. The scale, from sensors that approach static targets.
@@ -118,6 +119,17 @@ def calibrate_sparse_ring(
         echo_model=model,
         run=_run_residuals(prior_ring, echoes, fit, estimate),
     )
+
+
+def _check_poses(logs: Sequence[Log]) -> None:
+    """Raise a SonarError for logs without poses and without odometry."""
+    for log in logs:
+        count = int(np.isfinite(log.pose).all(axis=1).sum())
+        if count < SETTINGS.min_scans:
+            raise SonarError(
+                f"calibration: {count} of {len(log)} scans have a pose; allowed are {SETTINGS.min_scans} or more in "
+                "every log, poses or odometry, for a ring whose single scans carry no line"
+            )
 
 
 def _posterior(estimate: ScaleEstimate, free: Sequence[str], measured_speed_sd: float | None) -> _Scale:

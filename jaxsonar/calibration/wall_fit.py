@@ -91,7 +91,9 @@ def _dispersion(
     prior: Float[np.ndarray, "sensors sensors"],
 ) -> float:
     """Variance of the estimated offsets between stretches of the trajectory, divided by that of independent errors."""
-    stretch = np.floor(system.echoes.travelled / SETTINGS.jackknife).astype(int)
+    travelled = system.echoes.travelled
+    length = max(SETTINGS.jackknife, float(np.ptp(travelled)) / SETTINGS.most_stretches)
+    stretch = np.floor(travelled / length).astype(int)
     others = []
     for one in np.unique(stretch).tolist():
         rest = system.eliminate(offset, scale, stretch != one)
