@@ -67,6 +67,8 @@ def calibration_figure(calibration: Calibration) -> Figure:
             run = calibration.run
             _draw_over_range(panels["range"], run.distance, run.before, run.after)
             _draw_over_angle(panels["angle"], run.off_axis, run.before, run.after)
+            for name in ("range", "angle"):
+                panels[name].set_title(f"Residuals over the {name}, against the walls of the calibrated map")
         if calibration.echo_model is not None:
             _draw_detection(panels["detection"], calibration.echo_model)
         _draw_map(panels["before"], calibration.maps_before[0], "Map, nominal ring", calibration)
@@ -133,7 +135,8 @@ def _draw_binned(
     limit = 1e3 * max(limit, float(np.abs(np.median(before))) + limit / 2) if len(before) else 10.0
     axes.axhline(0, color=WALL_COLOR, lw=0.8)
     for values, color, name in ((before, CROSS_COLOR, "nominal ring"), (after, DIRECT_COLOR, "calibrated ring")):
-        axes.plot(x, np.clip(1e3 * values, -limit, limit), ".", color=color, alpha=0.35, ms=4, mew=0)
+        shown = np.clip(1e3 * values, -limit, limit)
+        axes.plot(x, shown, ".", color=color, alpha=0.35, ms=4, mew=0, rasterized=True)
         bins = np.digitize(x, edges) - 1
         full = [k for k in range(len(edges) - 1) if (bins == k).sum() >= _MIN_IN_BIN]
         center = [float(np.median(x[bins == k])) for k in full]
