@@ -95,7 +95,7 @@ def find_tracks(ring: Ring, log: Log, number: int = 0) -> list[Track]:
         position = transform_points(pose[row], np.asarray(ring.position)[sensor : sensor + 1])
         heading = pose[row, 2] + float(ring.heading[sensor])
         half_cone = float(ring.beam[sensor]) / 2
-        for part in _parts(log.echo_scan[row], corrected[row], position, heading):
+        for part in _parts(corrected[row], position, heading):
             slope = fit_slope(corrected[row[part]], position[part], heading[part], half_cone)
             if slope is not None:
                 found.append(Track(*slope, np.array([number, travelled[log.echo_scan[row[part[0]]]]])))
@@ -153,7 +153,6 @@ def _slope(
 
 
 def _parts(
-    scan: Int[np.ndarray, " echoes"],
     measured: Float[np.ndarray, " echoes"],
     position: Float[np.ndarray, "echoes 2"],
     heading: Float[np.ndarray, " echoes"],
@@ -162,9 +161,9 @@ def _parts(
     step = np.diff(position, axis=0)
     expected, distance = -(step * unit(heading[:-1])).sum(axis=-1), np.hypot(*step.T)
     jump = np.abs(np.diff(measured) - expected) > SETTINGS.max_jump + SETTINGS.max_jump_share * distance
-    ends = jump | (np.diff(scan) > SETTINGS.max_gap)
+    ends = jump | (distance > SETTINGS.max_gap)
     found = []
-    for part in np.split(np.arange(len(scan)), np.flatnonzero(ends) + 1):
+    for part in np.split(np.arange(len(measured)), np.flatnonzero(ends) + 1):
         turned = np.abs(wrap_angle(heading[part] - heading[part[len(part) // 2]]))
         part = part[turned < SETTINGS.max_turn]
         if len(part) >= SETTINGS.min_echoes:

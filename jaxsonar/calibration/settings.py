@@ -55,8 +55,8 @@ class ClosingTrackSettings:
     Chosen by hand on the recorded run corridor8 and confirmed on simulated rooms and on the run slip8.
     """
 
-    max_gap: int = 4
-    """Largest difference between the numbers of consecutive scans of a track: slow sensors are read several times."""
+    max_gap: float = 0.3
+    """Largest motion of the sensor between consecutive echoes of a track, metres."""
     max_jump: float = 0.08
     """Largest difference between measured and expected change of the range, metres: several standard deviations, ..."""
     max_jump_share: float = 0.1
