@@ -12,6 +12,7 @@ from jaxsonar.calibration.autofocus import autofocus_ring
 from jaxsonar.calibration.beam_headings import estimate_headings
 from jaxsonar.calibration.calibration_result import Calibration
 from jaxsonar.calibration.settings import SETTINGS
+from jaxsonar.calibration.sparse_ring import calibrate_sparse_ring, is_sparse
 from jaxsonar.detection.extract import check_sigma, local_models
 from jaxsonar.estimation.estimation_log import estimation_log
 from jaxsonar.estimation.explained_share import ExplainedShare
@@ -49,6 +50,9 @@ def calibrate(
 ) -> Calibration:
     """Estimate the parameters of a ring from the ranges of its echoes; walls and corners are estimated as well.
 
+    A ring whose single scans carry no line is calibrated from the run (``sparse_ring``), as far as only "offset" and
+    "speed" are free: it needs poses or odometry.
+
     Args:
         ring: the nominal ring.
         log: 17 or more scans from different poses. Each of several logs has a map of its own. Firings that are scans of
@@ -58,7 +62,8 @@ def calibrate(
         odometry: standard deviation of odometry, as a fraction of the displacement and rotation between scans.
         temperature: measured temperature of the air, deg C: prior mean of the speed of sound.
         sigma: standard deviation of the range noise, metres; estimated from the residuals if left out.
-        window: length of trajectory gathered into one local model, metres, as in ``build_map``; for sparse rings.
+        window: length of trajectory gathered into one local model, metres, as in ``build_map``; for sparse rings, which
+            have one by default.
         on_step: called with a description of each step.
 
     Raises:
@@ -76,6 +81,19 @@ def calibrate(
     prior_ring, speed_sd = ring, PRIOR.speed_sd
     if temperature is not None:
         prior_ring, speed_sd = replace(ring, speed_of_sound=speed_of_sound(temperature)), PRIOR.measured_speed_sd
+    if set(free) <= set(DEFAULT_PARAMETERS) and is_sparse(prior_ring, logs):
+        return calibrate_sparse_ring(
+            ring,
+            prior_ring,
+            logs,
+            free=free,
+            held=_not_asked_for(free),
+            poses_exact=not poses_free,
+            measured_speed_sd=None if temperature is None else speed_sd,
+            sigma=sigma,
+            window=window,
+            progress=progress,
+        )
     basis = parameter_basis(prior_ring, free, poses_free=poses_free, speed_sd=speed_sd)
     if not poses_free:
         check_calibration_poses(logs)
@@ -136,9 +154,7 @@ def _reasons_held(
     covariance: Float[np.ndarray, "parameters parameters"],
 ) -> dict[str, str]:
     """Parameters that were not estimated, and why."""
-    held = {name: "not asked for" for name in PARAMETERS if name not in free}
-    if "heading" in held:
-        held["heading"] = "not asked for; ranges do not depend on it"
+    held = _not_asked_for(free)
     if mean_held:
         held["mean_offset"] = mean_held
     if "speed" in free:
@@ -147,6 +163,14 @@ def _reasons_held(
         source = "the measured temperature" if temperature is not None else "the prior for air"
         if sd > SETTINGS.unobserved_sd * speed_sd:
             held["speed"] = f"these scans do not determine it; it stays at {source}, {100 * speed_sd:.2g} % (one sigma)"
+    return held
+
+
+def _not_asked_for(free: Sequence[str]) -> dict[str, str]:
+    """Parameters that are held because nobody asked for them."""
+    held = {name: "not asked for" for name in PARAMETERS if name not in free}
+    if "heading" in held:
+        held["heading"] = "not asked for; ranges do not depend on it"
     return held
 
 

@@ -6,10 +6,29 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar import kernels
+from jaxsonar.calibration.closing_tracks import ScaleEstimate
+from jaxsonar.calibration.echo_model import EchoModel
 from jaxsonar.estimation.explained_share import ExplainedShare
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.sensors.ring import Ring
+
+
+@dataclass(frozen=True, eq=False)
+class RunResiduals:
+    """Echoes at walls in the calibration of a ring with few sensors, and where the scale of the ranges comes from."""
+
+    distance: Float[np.ndarray, " echoes"]
+    """Distance of the wall in the calibrated map, metres."""
+    off_axis: Float[np.ndarray, " echoes"]
+    """Angle from the axis of the path to the normal of the wall, radians."""
+    before: Float[np.ndarray, " echoes"]
+    """Range as reported minus that which the nominal ring reports at this distance, metres."""
+    after: Float[np.ndarray, " echoes"]
+    """Range as reported minus that which the calibrated ring reports, metres."""
+    scale: ScaleEstimate
+    """Scale of the ranges from sensors that approach static targets, relative to the nominal ring (at the measured
+    temperature, if any)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +68,16 @@ class Calibration:
     """Map of every world with the calibrated ring."""
     maps_before: tuple[GlobalMap, ...]
     """Map of every world with the nominal ring."""
-    problem: kernels.LeastSquaresProblem
+    problem: kernels.LeastSquaresProblem | None = None
     """The least-squares problem in double precision: echoes, landmarks, priors. ``kernels.residuals`` and
-    ``kernels.cost`` take it together with ``unknowns``, for example to add further terms."""
-    unknowns: kernels.Unknowns
+    ``kernels.cost`` take it together with ``unknowns``, for example to add further terms. None for rings with few
+    sensors."""
+    unknowns: kernels.Unknowns | None = None
     """Solution of ``problem``."""
+    echo_model: EchoModel | None = None
+    """Noise and detection probability; for rings with few sensors only."""
+    run: RunResiduals | None = None
+    """Residuals over range and angle, and the source of the scale; for rings with few sensors only."""
 
     @property
     def range_offset_sd(self) -> Float[np.ndarray, " sensors"]:
@@ -148,6 +172,15 @@ class Calibration:
         if "radius" in self.free:
             radius, sd = self.radius
             lines.append(f"radius {1e3 * radius:.1f} mm ± {1e3 * sd:.1f}")
+        if self.run is not None:
+            scale = self.run.scale
+            if np.isfinite(scale.sd):
+                lines.append(
+                    f"range scale {np.exp(scale.log_scale):.4f} ± {scale.sd:.4f} from {scale.tracks} tracks of sensors "
+                    f"that approach something, in {scale.stretches} stretches of the trajectory"
+                )
+        if self.echo_model is not None:
+            lines += self.echo_model.describe()
         unexpected = ((name.replace("_", " "), why) for name, why in self.held.items() if "not asked" not in why)
         lines += [f"held: {name}: {why}" for name, why in unexpected]
         return tuple(lines)

@@ -7,7 +7,8 @@ import numpy as np
 import tomli_w
 from jaxtyping import Float
 
-from jaxsonar.calibration.calibration_result import Calibration
+from jaxsonar.calibration.calibration_result import Calibration, RunResiduals
+from jaxsonar.calibration.echo_model import EchoModel
 from jaxsonar.fileio.atomic_files import open_output
 from jaxsonar.sensors.ring_toml import ring_toml
 
@@ -58,11 +59,41 @@ def as_table(calibration: Calibration) -> dict[str, Any]:
         table["effective_correction"], table["effective_correction_sd"] = _list(correction), _list(sd)
     if "heading" in calibration.free:
         table["heading_sd_deg"] = _list(np.degrees(calibration.heading_sd))
+    if calibration.run is not None:
+        table["run"] = _run_table(calibration.run)
+    if calibration.echo_model is not None:
+        table["echo_model"] = _echo_model_table(calibration.echo_model)
     table["held"] = dict(calibration.held)
     table["correlations"] = [
         {"between": [a, b], "value": round(value, 3)} for a, b, value in calibration.correlations()
     ]
     return table
+
+
+def _run_table(run: RunResiduals) -> dict[str, Any]:
+    """Where the scale of the ranges comes from, and the robust spread of the residuals (metres)."""
+    table: dict[str, Any] = {"tracks": run.scale.tracks, "stretches": run.scale.stretches}
+    if np.isfinite(run.scale.sd):
+        table["scale"] = _short(np.exp(run.scale.log_scale))
+        table["scale_sd"] = _short(run.scale.sd)
+    for name, residual in (("robust_sigma_before", run.before), ("robust_sigma_after", run.after)):
+        table[name] = _short(1.4826 * float(np.median(np.abs(residual - np.median(residual)))))
+    return table
+
+
+def _echo_model_table(model: EchoModel) -> dict[str, Any]:
+    """Noise (metres, shares) and detections over the angle off axis (degrees)."""
+    return {
+        "core_sd": _short(model.core_sd),
+        "tail_share": round(model.tail_share, 4),
+        "tail_scale": _short(model.tail_scale),
+        "too_short": round(model.too_short, 4),
+        "too_long": round(model.too_long, 4),
+        "echoes": model.echoes,
+        "off_axis_deg": _list(np.degrees(model.off_axis)),
+        "expected": model.expected.tolist(),
+        "heard": model.heard.tolist(),
+    }
 
 
 def _short(value: float) -> float:

@@ -1,12 +1,19 @@
 """``jaxsonar calibrate``: estimate the parameters of a ring from ordinary scans."""
 
 import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxsonar.scans.scan_log import Log
+    from jaxsonar.sensors.ring import Ring
 
 from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, finite, noise
-from jaxsonar.cli.console import ascii_name, errors_in, print_status, step_status, write_figure
+from jaxsonar.cli.console import ascii_name, errors_in, laser_files, print_status, step_status, write_figure
 from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_all_inputs, nothing_used
 from jaxsonar.hardware.errors import SonarError
 
+DEFAULT_FREE = ("offset", "speed")
+"""Parameters that are estimated unless others are chosen."""
 SUMMARY = "Calibrate a ring from ordinary scans of an unknown room."
 
 
@@ -26,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--free",
         type=lambda text: tuple(name.strip() for name in text.split(",")),
-        default=("offset", "speed"),
+        default=DEFAULT_FREE,
         metavar="LIST",
         help="estimated parameters: offset, speed, position, radius, heading, with commas (default: offset,speed)",
     )
@@ -45,7 +52,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--window",
         type=finite(0.01, 100),
         metavar="METRES",
-        help="combine the echoes of this distance driven, for rings with few sensors",
+        help="combine the echoes of this distance driven, for rings with few sensors (default for them: 1.5)",
+    )
+    parser.add_argument(
+        "--laser",
+        type=filename,
+        metavar="RECORDING",
+        help="fit offsets and speed of sound to the laser of a corridor8 recording of the same run",
     )
     parser.add_argument("--figure", type=figure_filename, metavar="FIG", help="draw the results, .svg, .png or .pdf")
 
@@ -56,12 +69,17 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.calibration.calibration_toml import save_calibration
     from jaxsonar.fileio.atomic_files import check_outputs
 
-    check_outputs({"-o": options.output, "--figure": options.figure}, [*options.logs, options.ring])
+    inputs = [*options.logs, options.ring, *laser_files(options.laser)]
+    check_outputs({"-o": options.output, "--figure": options.figure}, inputs)
+    if options.laser is not None:
+        _check_laser_options(options)
     messages = InputMessages(strict=options.strict)
     ring, logs = load_all_inputs(options, options.logs, messages=messages)
     unused = [nothing_used(ring, log, name) for log, name in zip(logs, options.logs, strict=True)]
     if all(unused):
         return 1
+    if options.laser is not None:
+        return _fit_to_laser(options, ring, logs[0])
     choices = {key: getattr(options, key) for key in ("free", "poses", "odometry", "temperature", "sigma", "window")}
     with errors_in(", ".join(ascii_name(log) for log in options.logs)), step_status() as step:
         try:
@@ -76,6 +94,37 @@ def run(options: argparse.Namespace) -> int:
     save_calibration(calibration, options.output)
     write_figure(figure, options.figure)
     for line in calibration.summary():
+        print_status(line)
+    return 0
+
+
+def _check_laser_options(options: argparse.Namespace) -> None:
+    """Raise a SonarError for options that contradict ``--laser``."""
+    if len(options.logs) > 1:
+        raise SonarError(f"--laser came with {len(options.logs)} logs; allowed is one, of the same run as the laser")
+    unused = [name for name in ("temperature", "sigma", "window") if getattr(options, name) is not None]
+    if unused or tuple(options.free) != DEFAULT_FREE:
+        name = unused[0] if unused else "free"
+        raise SonarError(
+            f"--laser came with --{name}; allowed is --laser without it: it fits offset and speed of sound"
+        )
+
+
+def _fit_to_laser(options: argparse.Namespace, ring: "Ring", log: "Log") -> int:
+    """Fit the ring to a laser, write it, and draw the residuals."""
+    from jaxsonar.evaluation.laser_range_fit import fit_ranges_to_laser, save_laser_fit
+    from jaxsonar.hardware.laser_datasets import read_corridor8_laser
+
+    with errors_in(f"--laser {options.laser}"):
+        fit = fit_ranges_to_laser(ring, log, read_corridor8_laser(options.laser))
+    figure = None
+    if options.figure:
+        from jaxsonar.reports.plot_calibration import laser_fit_figure
+
+        figure = laser_fit_figure(fit)
+    save_laser_fit(fit, options.output)
+    write_figure(figure, options.figure)
+    for line in fit.summary():
         print_status(line)
     return 0
 

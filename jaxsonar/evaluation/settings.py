@@ -54,6 +54,30 @@ class LaserSettings:
 
 
 @dataclass(frozen=True)
+class LaserRangeSettings:
+    """Ranges of sonars against the walls of a laser."""
+
+    gate: float = 0.3
+    """Largest difference between the range of an echo and that of the wall, metres."""
+    freedom: float = 3.0
+    """Degrees of freedom of Student's t distribution of the residuals."""
+    first_noise: float = 0.08
+    """Scale of the residuals at the beginning, metres: an offset of that size occurs."""
+    min_noise: float = 0.003
+    """Least scale of the residuals, metres: ranges in steps of 10 mm."""
+    iterations: int = 60
+    """Iterations of the reweighted least squares."""
+    sensor_offset_sd: float = 0.015
+    """Prior standard deviation of the range offset of a sensor relative to the mean, metres: one or two wavelengths."""
+    min_echoes: int = 30
+    """Echoes that a fit needs, ..."""
+    min_walls: int = 4
+    """... and walls."""
+    max_clock_difference: float = 5.0
+    """Largest difference between the lengths of two recordings of one run with different clocks, seconds."""
+
+
+@dataclass(frozen=True)
 class EvaluationSettings:
     """All settings of the evaluation."""
 
@@ -63,6 +87,8 @@ class EvaluationSettings:
     """Matching of maps."""
     laser: LaserSettings = field(default_factory=LaserSettings)
     """Walls from laser scans."""
+    ranges: LaserRangeSettings = field(default_factory=LaserRangeSettings)
+    """Ranges against these walls."""
 
 
 SETTINGS = EvaluationSettings()

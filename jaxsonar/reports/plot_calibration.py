@@ -1,6 +1,7 @@
-"""The figure of a calibration: offsets, residuals before and after, and the map before and after."""
+"""Figures of a calibration: offsets, residuals before and after (over range and angle), the map before and after."""
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -8,6 +9,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from jaxsonar.calibration.calibration_result import Calibration
+from jaxsonar.calibration.echo_model import EchoModel
+from jaxsonar.evaluation.laser_range_fit import LaserRangeFit
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.reports.plot_style import (
     CROSS_COLOR,
@@ -24,6 +27,12 @@ _HISTOGRAM_EDGES = 61
 """Number of edges of the bins of a histogram of residuals. Chosen by hand."""
 _HISTOGRAM_SIGMAS = 6.0
 """Half width of the histogram, robust standard deviations. Chosen by hand."""
+_RANGE_BIN, _ANGLE_BIN = 0.25, 5.0
+"""Width of a bin of the range (metres) and of the angle (degrees). Chosen by hand."""
+_MIN_IN_BIN = 5
+"""Echoes that a bin needs for a median. Chosen by hand."""
+_SCATTER_SIGMAS = 4.0
+"""Residuals beyond this many robust standard deviations are drawn at the border. Chosen by hand."""
 
 
 def calibration_figure(calibration: Calibration) -> Figure:
@@ -32,9 +41,13 @@ def calibration_figure(calibration: Calibration) -> Figure:
     Args:
         calibration: the result of a calibration.
     """
+    rows, heights, size = "offsets residuals;before after", [1.0, 1.35], 8.2
+    if calibration.run is not None:
+        rows, heights, size = "offsets detection;range angle;before after", [1.0, 1.1, 1.35], 11.2
+    mosaic = [[*row.split()] for row in rows.split(";")]
     with figure_style():
-        figure = Figure(figsize=(10.5, 8.2), layout="constrained")
-        panels = figure.subplot_mosaic([["offsets", "residuals"], ["before", "after"]], height_ratios=[1, 1.35])
+        figure = Figure(figsize=(10.5, size), layout="constrained")
+        panels = figure.subplot_mosaic(mosaic, height_ratios=heights)  # pyright: ignore[reportArgumentType, reportCallIssue]
         ring = calibration.ring
         speed = f"{float(ring.speed_of_sound):.2f} m/s"
         if "speed" in calibration.free:
@@ -48,11 +61,103 @@ def calibration_figure(calibration: Calibration) -> Figure:
             parse_math=False,
         )
         _draw_offsets(panels["offsets"], calibration)
-        _draw_residuals(panels["residuals"], calibration)
+        if calibration.run is None:
+            _draw_residuals(panels["residuals"], calibration)
+        else:
+            run = calibration.run
+            _draw_over_range(panels["range"], run.distance, run.before, run.after)
+            _draw_over_angle(panels["angle"], run.off_axis, run.before, run.after)
+            for name in ("range", "angle"):
+                panels[name].set_title(f"Residuals over the {name}, against the walls of the calibrated map")
+        if calibration.echo_model is not None:
+            _draw_detection(panels["detection"], calibration.echo_model)
         _draw_map(panels["before"], calibration.maps_before[0], "Map, nominal ring", calibration)
         _draw_map(panels["after"], calibration.maps[0], "Map, calibrated ring", calibration)
         _set_equal_limits(panels["before"], panels["after"], calibration)
     return figure
+
+
+def laser_fit_figure(fit: LaserRangeFit) -> Figure:
+    """Draw the residuals against the walls of a laser, over range and angle, before and after the fit.
+
+    Args:
+        fit: offset and scale of a ring against a laser.
+    """
+    before, after = fit.ranges.residual(fit.nominal), fit.ranges.residual(fit.ring)
+    with figure_style():
+        figure = Figure(figsize=(10.5, 4.2), layout="constrained")
+        panels = figure.subplot_mosaic([["range", "angle"]])
+        figure.suptitle(
+            f"{fit.ring.name} against the laser: {len(before)} echoes; scale {fit.scale:.4f} ± {fit.scale_sd:.4f}, "
+            f"mean offset {1e3 * fit.offset:.0f} ± {1e3 * fit.offset_sd:.0f} mm",
+            x=0.01,
+            ha="left",
+            fontsize=11,
+            parse_math=False,
+        )
+        _draw_over_range(panels["range"], fit.ranges.true, before, after)
+        _draw_over_angle(panels["angle"], fit.ranges.off_axis, before, after)
+    return figure
+
+
+def _draw_over_range(
+    axes: Axes,
+    distance: Float[np.ndarray, " echoes"],
+    before: Float[np.ndarray, " echoes"],
+    after: Float[np.ndarray, " echoes"],
+) -> None:
+    edges = np.arange(0.0, distance.max(initial=1.0) + _RANGE_BIN, _RANGE_BIN)
+    _draw_binned(axes, distance, before, after, edges)
+    axes.set(title="Residuals over the range", xlabel="distance of the wall (m)", xlim=(0, edges[-1]))
+
+
+def _draw_over_angle(
+    axes: Axes,
+    off_axis: Float[np.ndarray, " echoes"],
+    before: Float[np.ndarray, " echoes"],
+    after: Float[np.ndarray, " echoes"],
+) -> None:
+    widest = np.ceil(np.degrees(np.abs(off_axis)).max(initial=5.0) / _ANGLE_BIN) * _ANGLE_BIN
+    edges = np.arange(-widest, widest + _ANGLE_BIN / 2, _ANGLE_BIN)
+    _draw_binned(axes, np.degrees(off_axis), before, after, edges)
+    axes.set(title="Residuals over the angle", xlabel="wall off the axis of the sensor (deg)", xlim=(-widest, widest))
+
+
+def _draw_binned(
+    axes: Axes,
+    x: Float[np.ndarray, " echoes"],
+    before: Float[np.ndarray, " echoes"],
+    after: Float[np.ndarray, " echoes"],
+    edges: Float[np.ndarray, " edges"],
+) -> None:
+    """Residuals and their medians in bins, before and after."""
+    limit = _SCATTER_SIGMAS * 1.4826 * float(np.median(np.abs(before - np.median(before)))) if len(before) else 0.01
+    limit = 1e3 * max(limit, float(np.abs(np.median(before))) + limit / 2) if len(before) else 10.0
+    axes.axhline(0, color=WALL_COLOR, lw=0.8)
+    for values, color, name in ((before, CROSS_COLOR, "nominal ring"), (after, DIRECT_COLOR, "calibrated ring")):
+        shown = np.clip(1e3 * values, -limit, limit)
+        axes.plot(x, shown, ".", color=color, alpha=0.35, ms=4, mew=0, rasterized=True)
+        bins = np.digitize(x, edges) - 1
+        full = [k for k in range(len(edges) - 1) if (bins == k).sum() >= _MIN_IN_BIN]
+        center = [float(np.median(x[bins == k])) for k in full]
+        middle = [1e3 * float(np.median(values[bins == k])) for k in full]
+        spread = 1.4826e3 * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
+        label = f"{name}: medians; robust sigma {spread:.1f} mm"
+        axes.plot(center, middle, "o-", color=color, ms=4, lw=1.4, label=label)
+    axes.set(ylabel="reported − expected (mm)", ylim=(-limit, 1.35 * limit))
+    axes.legend(loc="upper left", fontsize=8)
+
+
+def _draw_detection(axes: Axes, model: EchoModel) -> None:
+    """Share of walls that are heard over the angle, with the number of measurements."""
+    edges, share = np.degrees(model.off_axis), model.detection
+    axes.bar(
+        edges[:-1], np.nan_to_num(share), np.diff(edges), align="edge", color=(DIRECT_COLOR, 0.35), ec=DIRECT_COLOR
+    )
+    for low, high, value, count in zip(edges, edges[1:], np.nan_to_num(share), model.expected, strict=False):
+        axes.text((low + high) / 2, value + 0.02, str(count), ha="center", va="bottom", fontsize=8)
+    title = f"Walls heard; noise: core {1e3 * model.core_sd:.1f} mm, tails {model.tail_share:.0%}"
+    axes.set(title=title, xlabel="wall off the axis (deg); number of measurements", ylabel="share", ylim=(0, 1.15))
 
 
 def _draw_offsets(axes: Axes, calibration: Calibration) -> None:

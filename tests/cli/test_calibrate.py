@@ -7,6 +7,7 @@ import tomllib
 import numpy as np
 import pytest
 from support.commands import HEADER, OFFICE, PATH, RING, call, contents
+from support.recordings import recorded
 
 from jaxsonar import load_ring
 
@@ -107,6 +108,14 @@ MISTAKES = {
         {"bad.csv": "some\ntext\n"},
         ["bad.csv", "this is a text"],
     ),
+    "laser that is not there": ("calibrate log.csv --ring faw -o out.toml --laser no", {}, ["--laser no", "no"]),
+    "laser of two logs": ("calibrate log.csv log.csv --ring faw -o out.toml --laser no", {}, ["--laser", "2 logs"]),
+    "laser with a window": (
+        "calibrate log.csv --ring faw -o out.toml --laser no --window 2",
+        {},
+        ["--laser", "--window", "allowed"],
+    ),
+    "laser with other parameters": (f"{OUT} --laser no", {}, ["--laser", "--free", "allowed"]),
     "figure of unknown suffix": (f"{OUT} --figure a.gif", {}, ["--figure", "a.gif", ".svg"]),
     "figure into a missing folder": (f"{OUT} --figure no/a.svg", {}, ["no/a.svg", "folder"]),
     "ring into a missing folder": (f"{CALIBRATE} -o no/out.toml", {}, ["no/out.toml", "folder"]),
@@ -130,3 +139,23 @@ def test_an_invalid_call_is_answered_in_one_line_and_writes_nothing(here, capsys
     for word in words:
         assert word in line
     assert contents(here) == before
+
+
+@pytest.mark.slow
+def test_a_recorded_run_is_calibrated_alone_and_with_its_laser(tmp_path, capsys, monkeypatch):
+    folder = recorded("corridor8")
+    monkeypatch.chdir(tmp_path)
+    assert call("convert", folder, "log.csv", "--from", "corridor8") == 0
+    common = ["calibrate", "log.csv", "--ring", "corridor8"]
+    assert call(*common, "--poses", "estimate", "-o", "alone.toml", "--figure", "alone.svg") == 0
+    came = capsys.readouterr().err
+    for words in ("range scale", "held: mean offset: not determined", "walls heard, off axis"):
+        assert words in came
+    assert call(*common, "--laser", folder, "-o", "laser.toml", "--figure", "laser.svg") == 0
+    assert "mean range offset" in capsys.readouterr().err
+    alone, laser = (load_ring(tmp_path / name) for name in ("alone.toml", "laser.toml"))
+    assert float(alone.speed_of_sound) == pytest.approx(float(laser.speed_of_sound), rel=0.01)
+    assert np.mean(alone.range_offset) == pytest.approx(0, abs=1e-6)
+    assert np.mean(laser.range_offset) > 0.02
+    for name in ("alone.svg", "laser.svg"):
+        assert (tmp_path / name).read_text().startswith("<?xml")
