@@ -204,6 +204,20 @@ class InputMessages:
         for found in implausible_stamps(log):
             self.warn(str(found))
 
+    def warn_of_scale(self, ring: "Ring", log: "Log") -> None:
+        """Warn of ranges that do not go with the motion of the robot, for a ring with few sensors.
+
+        Raises:
+            SonarError: they do not, and the command is strict.
+        """
+        from jaxsonar.calibration.implausible_scale import implausible_scale
+        from jaxsonar.scans.sliding_windows import automatic_window
+
+        if automatic_window(ring, log) is not None:
+            for found in implausible_scale(ring, log):
+                self.warn(str(found))
+            self.check()
+
     def check(self) -> None:
         """Check that there was no warning, if there must be none.
 

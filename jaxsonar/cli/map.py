@@ -33,7 +33,7 @@ from jaxsonar.cli.console import (
     with_progress,
     write_figure,
 )
-from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs, nothing_used
+from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Build a map of walls, from a log of scans with poses."
@@ -106,7 +106,8 @@ def run(options: argparse.Namespace) -> int:
         load_ezdxf(options.dxf)
     check_window(options.window)
     check_sigma_is_used(options.sigma, options.method)
-    ring, log = load_inputs(options)
+    messages = InputMessages(strict=options.strict)
+    ring, log = load_inputs(options, messages=messages)
     given = None if options.settings is None else load_settings(options.settings)
     window = options.window
     settings = hough_settings(ring, given, window=window)
@@ -116,6 +117,7 @@ def run(options: argparse.Namespace) -> int:
         check_poses(log)
     if nothing_used(ring, log, options.log, with_poses=True):
         return 1
+    messages.warn_of_scale(ring, log)
     if window is None and (window := automatic_window(ring, log)) is not None:
         print_status(f"single scans of {ring.name!r} do not determine lines: --window {window:g} is used")
         settings = hough_settings(ring, None, window=window) if given is None else widened(ring, given, window=window)

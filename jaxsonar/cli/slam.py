@@ -12,7 +12,7 @@ from jaxsonar.cli.console import (
     write_figure,
     write_json,
 )
-from jaxsonar.cli.inputs import LOG_HELP, add_log_arguments, load_inputs, nothing_used
+from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 
 SUMMARY = "Trajectory and map, from echoes and odometry, or from echoes alone."
@@ -73,9 +73,11 @@ def run(options: argparse.Namespace) -> int:
         {"-o": options.output, "--trajectory": options.trajectory, "--figure": options.figure, "--json": options.json},
         [options.log, options.ring, options.truth],
     )
-    ring, log = load_inputs(options)
+    messages = InputMessages(strict=options.strict)
+    ring, log = load_inputs(options, messages=messages)
     if nothing_used(ring, log, options.log):
         return 1
+    messages.warn_of_scale(ring, log)
     truth = None if options.truth is None else load_trajectory(options.truth)
     if truth is not None:
         check_truth(truth, log, truth_name=str(options.truth), log_name=options.log)
