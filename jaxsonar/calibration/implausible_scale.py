@@ -39,7 +39,7 @@ def implausible_scale(ring: Ring, log: Log) -> Iterator[Implausibility]:
     size = "long" if error > 0 else "short"
     changes = f"by {100 * error:+.1f} +- {100 * found.sd:.1f} % more than the robot moves ({found.tracks} tracks)"
     what = f"while sensors approach something, their ranges change {changes}"
-    cause = f"the ranges are too {size}: another speed of sound or clock than the ring's, or wrong distances of the odometry"
+    cause = f"the ranges are too {size}: another speed of sound or clock than the ring's, or the odometry is wrong"
     speed = float(ring.speed_of_sound) * float(np.exp(-found.log_scale))
     remedy = f"calibrate the ring, or set its speed_of_sound to {speed:.1f} m/s"
     yield Implausibility("range scale", what, cause, remedy)
