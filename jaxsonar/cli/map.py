@@ -119,7 +119,6 @@ def run(options: argparse.Namespace) -> int:
         return 1
     messages.warn_of_scale(ring, log)
     if window is None and (window := automatic_window(ring, log)) is not None:
-        print_status(f"single scans of {ring.name!r} do not determine lines: --window {window:g} is used")
         settings = hough_settings(ring, None, window=window) if given is None else widened(ring, given, window=window)
     points = None if options.laser is None else _laser_points(options.laser)
     left_out: list[int] = []
@@ -161,6 +160,8 @@ def run(options: argparse.Namespace) -> int:
     write_figure(figure, options.figure)
     if left_out:
         print_left_out(ring.name, left_out[0])
+    if window is not None and options.window is None:
+        print_status(f"single scans of {ring.name!r} do not determine lines: --window {window:g} is used")
     without_pose = int((~has_pose).sum())
     remark = f"; {plural(without_pose, 'scan')} without a pose left out" if without_pose else ""
     if not len(world):
