@@ -91,7 +91,7 @@ def calibrate_sparse_ring(
     _check_explained(echoes, fresh)
     # 3. The offsets of sensors relative to each other, at this scale.
     progress("range offsets")
-    fit = fit_offsets(echoes, log_speed=scale.log_speed, free="offset" in free, sigma=sigma)
+    fit = fit_offsets(echoes, log_speed=scale.log_speed, log_speed_sd=scale.sd, free="offset" in free, sigma=sigma)
     without = fit_offsets(echoes, log_speed=0.0, free=False, sigma=sigma)
     calibrated = replace(scaled, range_offset=np.asarray(prior_ring.range_offset) + fit.offset)
     _check_result(prior_ring, calibrated)
@@ -226,9 +226,8 @@ def _covariance(
     covariance = np.zeros((3 * count + 1, 3 * count + 1))
     relative = np.eye(count) - 1 / count
     if "offset" in free:
-        slope = relative @ fit.d_offset_d_log_speed
-        covariance[:count, :count] = relative @ fit.covariance @ relative + scale.sd**2 * np.outer(slope, slope)
-        covariance[:count, count] = covariance[count, :count] = scale.sd**2 * slope
+        covariance[:count, :count] = relative @ fit.covariance[:count, :count] @ relative
+        covariance[:count, count] = covariance[count, :count] = relative @ fit.covariance[:count, count]
     covariance[count, count] = scale.sd**2
     return covariance
 

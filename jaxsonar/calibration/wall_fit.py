@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxsonar.calibration.settings import SPARSE_SETTINGS as SETTINGS
 from jaxsonar.calibration.wall_echoes import WallEchoes
@@ -17,7 +17,7 @@ from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.sensors.range_models import plane_range
 
 _HELD = 1e-7
-"""Standard deviation of a parameter that is held, metres."""
+"""Standard deviation of a parameter that is held, metres or relative."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +26,8 @@ class OffsetFit:
 
     offset: Float[np.ndarray, " sensors"]
     """Change of the range offset of every sensor, metres; their mean is 0."""
-    covariance: Float[np.ndarray, "sensors sensors"]
-    """Its covariance at the given scale, square metres."""
-    d_offset_d_log_speed: Float[np.ndarray, " sensors"]
-    """Change of the estimates with the logarithm of the speed of sound, metres."""
+    covariance: Float[np.ndarray, "parameters parameters"]
+    """Covariance of the offsets (metres) and of the logarithm of the speed of sound, as far as it is uncertain."""
     mean_offset_sd: float
     """Standard deviation of the mean range offset if it were estimated, metres."""
     plane: Float[np.ndarray, "walls 2"]
@@ -52,33 +50,36 @@ class _Elimination(NamedTuple):
     pull: Float[np.ndarray, "walls 2"]
 
 
-def fit_offsets(echoes: WallEchoes, *, log_speed: float, free: bool, sigma: float | None) -> OffsetFit:
-    """Range offsets at a given scale.
+def fit_offsets(
+    echoes: WallEchoes, *, log_speed: float, log_speed_sd: float = 0.0, free: bool, sigma: float | None
+) -> OffsetFit:
+    """Range offsets at a given scale, whose error is taken into account.
 
     Args:
         echoes: echoes at walls.
         log_speed: logarithm of the speed of sound relative to the nominal ring.
+        log_speed_sd: its standard deviation. Otherwise offsets would take up the error of the scale.
         free: whether offsets are estimated; otherwise only the walls are.
         sigma: scale of the residuals, metres; None: estimated.
     """
     system, count = _WallSystem(echoes, log_speed), echoes.ring.count
-    prior = _prior(count, free=free, mean_sd=_HELD)
+    prior = _prior(count, free=free, mean_sd=_HELD, log_speed_sd=log_speed_sd)
     # 1. Least squares, and the overdispersion of the offsets by a jackknife over stretches of the trajectory.
-    offset, scale = system.solve(np.zeros(count), prior, 1.0, sigma)
-    dispersion = _dispersion(system, offset, scale, prior) if free else 1.0
+    value, scale = system.solve(np.zeros(count + 1), prior, 1.0, sigma)
+    dispersion = _dispersion(system, value, scale, prior) if free else 1.0
     # 2. Least squares with the errors that the jackknife shows: offsets that rest on single walls stay near the prior.
-    offset, scale = system.solve(offset, prior, dispersion, sigma)
-    found = system.eliminate(offset, scale)
-    information = found.information / dispersion
-    covariance = np.linalg.inv(information[:-1, :-1] + prior)
-    free_mean = information[:-1, :-1] + _prior(count, free=free, mean_sd=SETTINGS.mean_offset_sd)
+    value, scale = system.solve(value, prior, dispersion, sigma)
+    information = system.eliminate(value, scale).information / dispersion
+    free_mean = _prior(count, free=free, mean_sd=SETTINGS.mean_offset_sd, log_speed_sd=log_speed_sd)
+    # 3. The walls that go with these offsets and the given scale.
+    value[-1] = 0
+    scale = system.settle(value, sigma)
     return OffsetFit(
-        offset,
-        covariance,
-        -covariance @ information[:-1, -1],
-        float(np.sqrt(np.linalg.inv(free_mean).mean())),
+        value[:-1],
+        np.linalg.inv(information + prior),
+        float(np.sqrt(np.linalg.inv(information + free_mean)[:-1, :-1].mean())),
         system.plane,
-        system.residual(offset),
+        system.residual(value),
         system.distance,
         scale,
     )
@@ -86,9 +87,9 @@ def fit_offsets(echoes: WallEchoes, *, log_speed: float, free: bool, sigma: floa
 
 def _dispersion(
     system: "_WallSystem",
-    offset: Float[np.ndarray, " sensors"],
+    value: Float[np.ndarray, " parameters"],
     scale: float,
-    prior: Float[np.ndarray, "sensors sensors"],
+    prior: Float[np.ndarray, "parameters parameters"],
 ) -> float:
     """Variance of the estimated offsets between stretches of the trajectory, divided by that of independent errors."""
     travelled = system.echoes.travelled
@@ -96,11 +97,11 @@ def _dispersion(
     stretch = np.floor(travelled / length).astype(int)
     others = []
     for one in np.unique(stretch).tolist():
-        rest = system.eliminate(offset, scale, stretch != one)
-        others.append(np.linalg.solve(rest.information[:-1, :-1] + prior, rest.gradient[:-1] - prior @ offset))
-    data = system.eliminate(offset, scale).information[:-1, :-1]
+        rest = system.eliminate(value, scale, stretch != one)
+        others.append(np.linalg.solve(rest.information + prior, rest.gradient - prior @ value)[:-1])
+    data = system.eliminate(value, scale).information
     covariance = np.linalg.inv(data + prior)
-    expected = float(np.trace(covariance @ data @ covariance))
+    expected = float(np.trace((covariance @ data @ covariance)[:-1, :-1]))
     found = float(np.var(others, axis=0).sum() * (len(others) - 1))
     return max(found / max(expected, 1e-12), 1.0)
 
@@ -124,53 +125,64 @@ class _WallSystem:
 
     def solve(
         self,
-        offset: Float[np.ndarray, " sensors"],
-        prior: Float[np.ndarray, "sensors sensors"],
+        value: Float[np.ndarray, " parameters"],
+        prior: Float[np.ndarray, "parameters parameters"],
         dispersion: float,
         sigma: float | None,
-    ) -> tuple[Float[np.ndarray, " sensors"], float]:
-        """Robust least squares over offsets and walls. Returns the offsets and the scale of the residuals.
+    ) -> tuple[Float[np.ndarray, " parameters"], float]:
+        """Robust least squares over ring and walls. Returns the parameters of the ring and the scale of the residuals.
 
         Args:
-            offset: offsets at the beginning, metres.
-            prior: prior information of the offsets.
-            dispersion: factor of the variance that the echoes give the offsets.
+            value: parameters at the beginning: offsets (metres), and change of the log speed of sound.
+            prior: their prior information.
+            dispersion: factor of the variance that the echoes give them.
             sigma: scale of the residuals, metres; None: estimated.
         """
         scale = SETTINGS.first_noise if sigma is None else sigma
         for _ in range(SETTINGS.iterations):
-            # 1. Eliminate the walls, solve for the offsets, and substitute back.
-            found = self.eliminate(offset, scale)
-            information = found.information[:-1, :-1] / dispersion + prior
-            step = np.linalg.solve(information, found.gradient[:-1] / dispersion - prior @ offset)
-            self._move(found, np.append(step, 0.0))
-            offset = offset + step
-            # 2. The scale of the residuals (expectation maximization of the t distribution).
-            if sigma is None:
-                residual = self.residual(offset)
-                scale = max(float(np.sqrt(np.mean(_weight(residual / scale) * residual**2))), SETTINGS.min_noise)
-        return offset, scale
+            # Eliminate the walls, solve for the ring, and substitute back.
+            found = self.eliminate(value, scale)
+            gradient = found.gradient / dispersion - prior @ value
+            step = np.linalg.solve(found.information / dispersion + prior, gradient)
+            self._move(found, step)
+            value = value + step
+            scale = self._scale(value, scale) if sigma is None else sigma
+        return value, scale
+
+    def settle(self, value: Float[np.ndarray, " parameters"], sigma: float | None) -> float:
+        """Robust least squares over the walls for a given ring. Returns the scale of the residuals, metres."""
+        scale = SETTINGS.first_noise if sigma is None else sigma
+        for _ in range(SETTINGS.iterations):
+            self._move(self.eliminate(value, scale), np.zeros_like(value))
+            scale = self._scale(value, scale) if sigma is None else sigma
+        return scale
 
     @property
     def distance(self) -> Float[np.ndarray, " echoes"]:
         """Half path lengths to the walls, metres."""
         return self._predict()[0]
 
-    def residual(self, offset: Float[np.ndarray, " sensors"]) -> Float[np.ndarray, " echoes"]:
+    def residual(self, value: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " echoes"]:
         """Reported minus predicted ranges, metres."""
-        return self._residual(offset, self._predict()[0])
+        return self._residual(value, self._predict()[0])
 
     def eliminate(
-        self, offset: Float[np.ndarray, " sensors"], sigma: float, kept: np.ndarray | None = None
+        self, value: Float[np.ndarray, " parameters"], sigma: float, kept: Bool[np.ndarray, " echoes"] | None = None
     ) -> _Elimination:
-        """Normal equations of the ring; the walls are eliminated (Schur complement)."""
+        """Normal equations of the ring; the walls are eliminated (Schur complement).
+
+        Args:
+            value: parameters of the ring.
+            sigma: scale of the residuals, metres.
+            kept: the echoes that count; all if omitted.
+        """
         distance, d_plane = self._predict()
-        residual, wall = self._residual(offset, distance), self.echoes.wall
+        residual, wall, factor = self._residual(value, distance), self.echoes.wall, self.factor * np.exp(-value[-1])
         weight = _weight(residual / sigma) / sigma**2
         if kept is not None:
             weight = weight * kept
-        ring = np.concatenate([self.sensors, -self.factor * distance[:, None]], axis=1)
-        plane, walls = self.factor * d_plane, len(self.plane)
+        ring = np.concatenate([self.sensors, -factor * distance[:, None]], axis=1)
+        plane, walls = factor * d_plane, len(self.plane)
         of_plane = np.zeros((walls, 2, 2))
         np.add.at(of_plane, wall, weight[:, None, None] * plane[:, :, None] * plane[:, None, :])
         coupling = np.zeros((walls, 2, ring.shape[1]))
@@ -194,6 +206,11 @@ class _WallSystem:
         """Change the walls after a step of the ring."""
         self.plane = self.plane + (found.inverse @ (found.pull - found.coupling @ step)[..., None])[..., 0]
 
+    def _scale(self, value: Float[np.ndarray, " parameters"], scale: float) -> float:
+        """The next scale of the residuals, metres (expectation maximization of the t distribution)."""
+        residual = self.residual(value)
+        return max(float(np.sqrt(np.mean(_weight(residual / scale) * residual**2))), SETTINGS.min_noise)
+
     def _predict(self) -> tuple[Float[np.ndarray, " echoes"], Float[np.ndarray, "echoes 2"]]:
         """Half path lengths, and their derivatives by shift and rotation of the walls."""
         plane = self.plane + np.stack([np.zeros(len(self.plane)), self.echoes.theta], axis=-1)
@@ -201,9 +218,10 @@ class _WallSystem:
         return predicted.range, predicted.d_range_d_landmark
 
     def _residual(
-        self, offset: Float[np.ndarray, " sensors"], distance: Float[np.ndarray, " echoes"]
+        self, value: Float[np.ndarray, " parameters"], distance: Float[np.ndarray, " echoes"]
     ) -> Float[np.ndarray, " echoes"]:
-        return self.echoes.reported - self.nominal_offset - self.sensors @ offset - self.factor * distance
+        expected = self.nominal_offset + self.sensors @ value[:-1] + self.factor * np.exp(-value[-1]) * distance
+        return self.echoes.reported - expected
 
 
 def _weight(residual: Float[np.ndarray, " echoes"]) -> Float[np.ndarray, " echoes"]:
@@ -211,11 +229,16 @@ def _weight(residual: Float[np.ndarray, " echoes"]) -> Float[np.ndarray, " echoe
     return (SETTINGS.freedom + 1) / (SETTINGS.freedom + residual**2)
 
 
-def _prior(sensors: int, *, free: bool, mean_sd: float) -> Float[np.ndarray, "sensors sensors"]:
-    """Prior information of the offsets: of their deviations from the mean, and of the mean."""
+def _prior(
+    sensors: int, *, free: bool, mean_sd: float, log_speed_sd: float
+) -> Float[np.ndarray, "parameters parameters"]:
+    """Prior information: of the deviations of the offsets from their mean, of the mean, and of the log speed."""
     mean = np.full((sensors, sensors), 1 / sensors)
     relative = SETTINGS.relative_offset_sd if free else _HELD
-    return (np.eye(sensors) - mean) / relative**2 + mean / (sensors * mean_sd**2)
+    information = np.zeros((sensors + 1, sensors + 1))
+    information[:-1, :-1] = (np.eye(sensors) - mean) / relative**2 + mean / (sensors * mean_sd**2)
+    information[-1, -1] = max(log_speed_sd, _HELD) ** -2
+    return information
 
 
 def shared_wall_sensors(echoes: WallEchoes) -> Int[np.ndarray, " sensors"]:

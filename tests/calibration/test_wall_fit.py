@@ -64,7 +64,7 @@ def echoes(ring) -> WallEchoes:
 
 def test_the_relative_offsets_are_found(echoes):
     found = fit_offsets(echoes, log_speed=0.0, free=True, sigma=None)
-    sd = np.sqrt(np.diag(found.covariance))
+    sd = np.sqrt(np.diag(found.covariance))[:-1]
     assert np.abs((found.offset - relative(OFFSET)) / sd).max() < 4
     assert sd.max() < 0.004
     assert found.offset.sum() == pytest.approx(0, abs=1e-9)
@@ -119,18 +119,30 @@ def test_sensors_without_shared_walls_stay_at_the_prior(echoes):
     found = fit_offsets(alone, log_speed=0.0, free=True, sigma=None)
     np.testing.assert_allclose(found.offset, 0, atol=1e-4)
     expected = SETTINGS.relative_offset_sd * np.sqrt(1 - 1 / COUNT)
-    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), expected, rtol=0.02)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance))[:-1], expected, rtol=0.02)
     assert not shared_wall_sensors(alone).any()
     assert shared_wall_sensors(echoes).all()
 
 
-def test_the_offsets_follow_the_scale_as_stated(echoes):
-    step = 1e-3
+def test_an_uncertain_scale_makes_the_offsets_uncertain(echoes):
+    """The covariance of two Gaussian parameters: the error of the scale times the slope of the offsets."""
+    step, sd = 1e-3, 1e-3
     low, high = (fit_offsets(echoes, log_speed=value, free=True, sigma=0.004).offset for value in (-step, step))
-    stated = fit_offsets(echoes, log_speed=0.0, free=True, sigma=0.004).d_offset_d_log_speed
-    np.testing.assert_allclose(
-        relative((high - low) / (2 * step)), relative(stated), atol=0.05
-    )  # the weights change, too
+    slope = relative((high - low) / (2 * step))
+    known = fit_offsets(echoes, log_speed=0.0, free=True, sigma=0.004).covariance
+    unsure = fit_offsets(echoes, log_speed=0.0, log_speed_sd=sd, free=True, sigma=0.004).covariance
+    assert 0 < unsure[-1, -1] <= sd**2
+    assert known[-1, -1] < 1e-12
+    # The weights change as well, which the linear model leaves out.
+    np.testing.assert_allclose(relative(unsure[:-1, -1]) / unsure[-1, -1], slope, atol=0.06)
+    assert (np.diag(unsure)[:-1] > 0.9 * np.diag(known)[:-1]).all()
+
+
+def test_walls_do_not_change_the_scale(echoes):
+    """An uncertain scale is a nuisance parameter of the offsets: residuals and walls are those of the given scale."""
+    found = fit_offsets(echoes, log_speed=0.02, log_speed_sd=0.02, free=True, sigma=None)
+    predicted = found.offset[echoes.path] + np.exp(-0.02) * found.distance
+    np.testing.assert_allclose(echoes.reported - predicted, found.residual, atol=1e-9)
 
 
 def test_the_two_faces_of_a_wall_are_two_walls(ring):
