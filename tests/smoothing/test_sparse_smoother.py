@@ -12,7 +12,7 @@ from jaxsonar.simulation.wheel_odometry import simulate_odometry
 from jaxsonar.smoothing.smooth_log import smooth
 from jaxsonar.smoothing.sparse_smoother import SPARSE_SETTINGS
 
-TRUE = trajectory(260)
+TRUE = trajectory(200)
 SPARSE = replace(RING, beam=np.full(RING.count, np.radians(24.0)))
 
 
@@ -37,7 +37,7 @@ def rms(poses):
 @pytest.fixture(scope="module")
 def results():
     found = []
-    for seed in range(3):
+    for seed in range(2):
         odometry = drifting(seed)
         reported = uneven(ranges(TRUE, sigma=0.01, seed=seed, ring=SPARSE), np.random.default_rng(seed))
         found.append((odometry, smooth(SPARSE, log_of(reported, odometry), odometry, odometry=odometry, window=1.5)))
