@@ -68,7 +68,8 @@ def map_with_tentative_points(
         settings: constants of the map.
     """
     if window is not None:
-        return build_map(ring, log, window=window)
+        # An adjustment needs lines that local models determine, rather than long ones.
+        return build_map(ring, log, window=window, grow=False)
     evidence = gather_evidence(ring, log, local_models(ring, log) if models is None else models)
     map_ = assemble_map(evidence)
     found, _ = cluster_points(merge_cells(evidence.points))

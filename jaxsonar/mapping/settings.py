@@ -219,6 +219,12 @@ class SupportSettings:
     """An echo fits a wall if it deviates by at most this, standard deviations."""
     detection: float = 0.92
     """Probability of an echo from a wall that a sensor faces exactly. Measured: 0.87 to 0.97 within 5 degrees."""
+    detection_weight: float = 20.0
+    """Number of measurements as which this value counts when it is estimated from the walls of a log, ..."""
+    min_detection: float = 0.6
+    """... the lower limit of the estimate, ..."""
+    max_detection: float = 0.97
+    """... and the upper one."""
     beam_factor: float = 1.6
     """Angle at which this probability has fallen to 1/e, in halves of the nominal beam. Measured with beams of 30
     degrees: 0.65 to 0.75 at 10 to 15 degrees."""
@@ -251,8 +257,8 @@ class GrowthSettings:
     """Log-likelihood that each metre beyond the known wall costs, nats. A single echo bridges 0.6 to 0.8 m."""
     max_gain: float = 3.5
     """Largest log-likelihood ratio of a single echo, nats."""
-    switch: float = 2.0
-    """Log-likelihood that each end of a wall costs, nats."""
+    switch: float = 2.5
+    """Log-likelihood that each end of a wall costs, nats: an opening needs two or three independent observations."""
     driven_cost: float = 10.0
     """Log-likelihood that a cell costs in which the robot was, nats."""
     reach: float = 3.0

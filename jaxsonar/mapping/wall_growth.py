@@ -19,10 +19,10 @@ from jaxsonar.mapping.observations import unique_pairs
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_segments import WallSegments
 from jaxsonar.mapping.wall_support import (
+    EchoModel,
     MeasurementIndex,
     RangeMeasurements,
     independent_weights,
-    largest_log_ratio,
     line_evidence,
 )
 
@@ -65,18 +65,19 @@ def grow_walls(
         driven: where the robot was.
         sigma: standard deviation of the ranges, metres; ``SupportSettings.sigma`` if omitted.
     """
-    sigma = SETTINGS.support.sigma if sigma is None else sigma
     index, none = MeasurementIndex(measurements), np.zeros(0, dtype=np.int64)
     lines = [WallLine(k, walls.center[k], float(walls.theta[k]), walls.extent[k], none) for k in range(len(walls))]
+    model = EchoModel(SETTINGS.support.sigma if sigma is None else sigma)
+    model = replace(model, detection=_detection_probability(lines, index, model))
     for _ in range(SETTINGS.growth.iterations):
         # Strongest first: each echo supports one wall, and a wall hides what is behind it.
         unassigned, grown = np.ones(len(measurements), dtype=bool), []
-        alone = [_supported_parts(line, walls, index, driven, unassigned, [], sigma) for line in lines]
+        alone = [_supported_parts(line, walls, index, driven, unassigned, [], model) for line in lines]
         strength = np.array([sum(part.score for part in parts) for parts in alone])
         for k in np.argsort(-strength, kind="stable"):
-            for part in _supported_parts(lines[k], walls, index, driven, unassigned, grown, sigma):
+            for part in _supported_parts(lines[k], walls, index, driven, unassigned, grown, model):
                 unassigned[part.echoes] = False
-                grown.append(_fitted(part, measurements, sigma))
+                grown.append(_fitted(part, measurements, model.sigma))
         lines = grown
     return _as_segments(lines, walls, measurements)
 
@@ -88,7 +89,7 @@ def _supported_parts(
     driven: DrivenSpace,
     unassigned: Bool[np.ndarray, " measurements"],
     stronger: list[WallLine],
-    sigma: float,
+    model: EchoModel,
 ) -> list[WallLine]:
     """The parts of a line that are walls and that contain a part of the known wall.
 
@@ -99,12 +100,12 @@ def _supported_parts(
         driven: where the robot was.
         unassigned: measurements that support no stronger wall.
         stronger: walls with more evidence, which hide what is behind them.
-        sigma: standard deviation of the ranges, metres.
+        model: properties of the echoes.
     """
     settings = SETTINGS.growth
     rows = index.near(line.endpoints, settings.reach)
     measurements = index.measurements.take(rows)
-    evidence = line_evidence(measurements, line.center, line.theta, sigma=sigma)
+    evidence = line_evidence(measurements, line.center, line.theta, model)
     tangent = tangent_of(line.theta)
     low, high = line.extent[0] - settings.reach, line.extent[1] + settings.reach
     used = (evidence.log_ratio != 0) & (evidence.foot > low) & (evidence.foot < high)
@@ -122,7 +123,7 @@ def _supported_parts(
     was_crossed = crossed_at > walls.last_seen[line.seed] - SETTINGS.artifacts.door_time
     score -= np.where(was_crossed, settings.driven_cost, 0.0)
     # The most likely parts. Short ones need echoes of high evidence, and hardly any against them.
-    largest = min(largest_log_ratio(measurements.max_range, sigma), settings.max_gain)
+    largest = min(model.largest_log_ratio(measurements.max_range), settings.max_gain)
     least_mean = settings.short_share * largest
     fitting, parts = np.flatnonzero(used & evidence.fits), []
     for first, last in _best_intervals(score, settings.switch):
@@ -135,7 +136,27 @@ def _supported_parts(
         is_weak = total < least_mean * len(np.unique(measurements.section[own]))
         if extent[1] - extent[0] >= (settings.short if is_weak else settings.min_length):
             parts.append(replace(line, extent=extent, echoes=rows[own], score=total))
-    return [part for part in parts if not _is_corner_line(part, index.measurements.take(part.echoes), stronger, sigma)]
+    echoes = [index.measurements.take(part.echoes) for part in parts]
+    is_artifact = [_is_corner_line(*one, stronger, model.sigma) for one in zip(parts, echoes, strict=True)]
+    return [part for part, dropped in zip(parts, is_artifact, strict=True) if not dropped]
+
+
+def _detection_probability(lines: list[WallLine], index: MeasurementIndex, model: EchoModel) -> float:
+    """Probability of an echo from a wall that a sensor faces, from the measurements of known walls.
+
+    The nominal value counts as ``detection_weight`` measurements. The known walls contain some that are none, which
+    lowers the result; therefore it has limits.
+    """
+    settings = SETTINGS.support
+    fitting, all_ = settings.detection * settings.detection_weight, settings.detection_weight
+    for line in lines:
+        measurements = index.measurements.take(index.near(line.endpoints, 0.0))
+        found = line_evidence(measurements, line.center, line.theta, model)
+        inside = found.near_axis & (found.foot >= line.extent[0]) & (found.foot <= line.extent[1])
+        fits, missed = np.count_nonzero(inside & found.fits), np.count_nonzero(inside & found.missed)
+        if fits > missed:
+            fitting, all_ = fitting + fits, all_ + fits + missed
+    return min(max(fitting / all_, settings.min_detection), settings.max_detection)
 
 
 def _best_intervals(score: Float[np.ndarray, " cells"], switch: float) -> list[tuple[int, int]]:

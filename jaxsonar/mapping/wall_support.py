@@ -156,10 +156,34 @@ class LineEvidence:
     """Logarithm of the likelihood ratio of a wall at the foot to none, nats; 0 if the measurement says nothing."""
     fits: Bool[np.ndarray, " rows"]
     """Echoes that the wall probably caused."""
+    missed: Bool[np.ndarray, " rows"]
+    """Measurements in which the wall caused no echo, although nothing was in front of it."""
+    near_axis: Bool[np.ndarray, " rows"]
+    """Measurements of sensors that almost face the line."""
+
+
+@dataclass(frozen=True)
+class EchoModel:
+    """Properties of the echoes of a log."""
+
+    sigma: float
+    """Standard deviation of the ranges about a wall, metres."""
+    detection: float = SETTINGS.support.detection
+    """Probability of an echo from a wall that a sensor faces exactly."""
+
+    def largest_log_ratio(self, max_range: float) -> float:
+        """Log-likelihood ratio of an echo that fits exactly, from a wall that the sensor faces exactly, nats.
+
+        Args:
+            max_range: largest distance of an echo, metres.
+        """
+        settings = SETTINGS.support
+        core = (1 - settings.too_short) / (np.sqrt(2 * np.pi) * self.sigma)
+        return float(np.log(1 - self.detection + self.detection * core * max_range / settings.heard))
 
 
 def line_evidence(
-    measurements: RangeMeasurements, center: Float[np.ndarray, "2"], theta: float, *, sigma: float
+    measurements: RangeMeasurements, center: Float[np.ndarray, "2"], theta: float, model: EchoModel
 ) -> LineEvidence:
     """The evidence of each measurement for a wall on a line.
 
@@ -172,7 +196,7 @@ def line_evidence(
         measurements: echoes and silences.
         center: a point on the line, metres.
         theta: direction of the normal, away from the robot, radians.
-        sigma: standard deviation of the ranges, metres.
+        model: properties of the echoes.
     """
     settings = SETTINGS.support
     offset = measurements.origin - center
@@ -180,7 +204,7 @@ def line_evidence(
     predicted, _ = measurements.predicted(center, theta)
     angle = np.abs(wrap_angle(theta - measurements.axis))
     width = np.maximum(measurements.half_width, 1e-6)
-    detected = settings.detection * np.exp(-((angle / (settings.beam_factor * width)) ** 2))
+    detected = model.detection * np.exp(-((angle / (settings.beam_factor * width)) ** 2))
     in_view = (ahead > settings.min_distance) & (measurements.half_width > 0)
     in_view &= angle <= measurements.half_width + settings.beam_margin
     in_view &= predicted < settings.certain * measurements.max_range
@@ -188,8 +212,8 @@ def line_evidence(
     silent = np.isinf(measurements.distance)
     residual = measurements.distance - predicted
     background = settings.heard / measurements.max_range
-    deviation = np.where(silent, np.inf, residual) / sigma
-    core = np.exp(-0.5 * deviation**2) / (np.sqrt(2 * np.pi) * sigma)
+    deviation = np.where(silent, np.inf, residual) / model.sigma
+    core = np.exp(-0.5 * deviation**2) / (np.sqrt(2 * np.pi) * model.sigma)
     too_short = (residual < 0) / np.maximum(predicted, settings.min_distance)
     wall = (1 - settings.too_short) * core + settings.too_short * too_short
     ratio = 1 - detected + np.where(silent, 0.0, detected * wall / background)
@@ -197,16 +221,6 @@ def line_evidence(
     fits = in_view & (np.abs(deviation) <= settings.gate)
     # Of several echoes of one measurement only the first one proves that there is nothing in front of it.
     log_ratio[~measurements.is_first & ~fits] = 0.0
-    return LineEvidence(foot, np.where(silent, np.inf, residual), log_ratio, fits)
-
-
-def largest_log_ratio(max_range: float, sigma: float) -> float:
-    """Log-likelihood ratio of an echo that fits exactly, from a wall that the sensor faces exactly, nats.
-
-    Args:
-        max_range: largest distance of an echo, metres.
-        sigma: standard deviation of the ranges, metres.
-    """
-    settings = SETTINGS.support
-    core = (1 - settings.too_short) / (np.sqrt(2 * np.pi) * sigma)
-    return float(np.log(1 - settings.detection + settings.detection * core * max_range / settings.heard))
+    missed = in_view & measurements.is_first & (deviation > settings.gate)
+    near_axis = angle <= measurements.half_width / 2
+    return LineEvidence(foot, np.where(silent, np.inf, residual), log_ratio, fits, missed, near_axis)

@@ -10,10 +10,10 @@ from jaxsonar import Log, Ring, Room, simulate
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_support import (
+    EchoModel,
     MeasurementIndex,
     RangeMeasurements,
     independent_weights,
-    largest_log_ratio,
     line_evidence,
 )
 
@@ -41,7 +41,7 @@ def measured(distance, *, origin=(0.0, 0.0), axis=math.pi / 2, is_first=True):
 
 
 def log_ratio(*args, **kwargs):
-    return line_evidence(measured(*args, **kwargs), CENTER, NORMAL, sigma=SIGMA).log_ratio
+    return line_evidence(measured(*args, **kwargs), CENTER, NORMAL, EchoModel(SIGMA)).log_ratio
 
 
 def test_an_echo_of_the_wall_is_evidence_for_it_and_an_echo_from_behind_against_it():
@@ -76,11 +76,11 @@ def test_only_the_first_echo_of_a_measurement_shows_that_nothing_is_in_front():
 
 @pytest.mark.parametrize("sigma", [0.003, 0.02, 0.05])
 def test_no_echo_has_more_evidence_than_one_that_fits_exactly(rng, sigma):
-    most = largest_log_ratio(3.0, sigma)
+    most = EchoModel(sigma).largest_log_ratio(3.0)
     for degrees in (-10, 0, 5):
         many = measured(rng.uniform(0.1, 2.9, 500), axis=math.pi / 2 + math.radians(degrees))
-        assert line_evidence(many, CENTER, NORMAL, sigma=sigma).log_ratio.max() <= most + 0.05
-    assert line_evidence(measured(1.5), CENTER, NORMAL, sigma=sigma).log_ratio == pytest.approx(most)
+        assert line_evidence(many, CENTER, NORMAL, EchoModel(sigma)).log_ratio.max() <= most + 0.05
+    assert line_evidence(measured(1.5), CENTER, NORMAL, EchoModel(sigma)).log_ratio == pytest.approx(most)
 
 
 @pytest.mark.parametrize("degrees", [0, 10, 20])
@@ -104,7 +104,7 @@ def test_predicted_ranges_are_those_of_the_simulator():
     assert np.any(heard.half_baseline)
     predicted, _ = heard.predicted(np.array([3.0, 1.4]), math.pi / 2)
     np.testing.assert_allclose(predicted, heard.distance, atol=1e-5)
-    evidence = line_evidence(heard, np.array([3.0, 1.4]), math.pi / 2, sigma=SIGMA)
+    evidence = line_evidence(heard, np.array([3.0, 1.4]), math.pi / 2, EchoModel(SIGMA))
     assert evidence.fits.all()
     # Every path that does not hear the wall is silent: what was measured is complete.
     assert len(came) == len(ring.paths)
