@@ -44,7 +44,7 @@ def is_sparse(ring: Ring, logs: Sequence[Log]) -> bool:
         measured = measured_paths(ring, log)
         whole = measured[:1] if measured.all() else measured
         counts.append(float(np.median([width[paths].sum() for paths in whole]) / (2 * np.pi)) if len(whole) else np.inf)
-    return float(np.median(counts)) < SETTINGS.sparse_echoes
+    return float(np.median(counts)) < SETTINGS.sparse_echoes - 1e-6  # evenly spaced cones add up exactly
 
 
 def calibrate_sparse_ring(
