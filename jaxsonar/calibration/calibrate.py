@@ -81,7 +81,10 @@ def calibrate(
     prior_ring, speed_sd = ring, PRIOR.speed_sd
     if temperature is not None:
         prior_ring, speed_sd = replace(ring, speed_of_sound=speed_of_sound(temperature)), PRIOR.measured_speed_sd
-    if set(free) <= set(DEFAULT_PARAMETERS) and is_sparse(prior_ring, logs):
+    if not poses_free:
+        check_calibration_poses(logs)
+    has_poses = all(np.isfinite(one.pose).any() for one in logs)
+    if set(free) <= set(DEFAULT_PARAMETERS) and has_poses and is_sparse(prior_ring, logs):
         return calibrate_sparse_ring(
             ring,
             prior_ring,
@@ -95,8 +98,6 @@ def calibrate(
             progress=progress,
         )
     basis = parameter_basis(prior_ring, free, poses_free=poses_free, speed_sd=speed_sd)
-    if not poses_free:
-        check_calibration_poses(logs)
     problem = CalibrationProblem(prior_ring, basis, poses_free, odometry, sigma, window, progress)
     # 2. Autofocus: bring a ring with large errors close enough for echoes to be associated with walls.
     start = prior_ring

@@ -108,7 +108,7 @@ class SparseCalibrationSettings:
     """A ring is sparse if a long wall is received by fewer paths than this in one scan, as in ``slam``."""
     window: float = 1.5
     """Length of the windows of its maps, metres, unless one is given."""
-    min_scans: int = 20
+    min_scans: int = 3
     """Scans with a pose that a log needs."""
     gate: float = 0.12
     """Largest difference between measured and expected range of an echo that is assigned to a wall, metres. The map was

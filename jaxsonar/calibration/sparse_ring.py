@@ -38,13 +38,15 @@ class _Scale:
 
 def is_sparse(ring: Ring, logs: Sequence[Log]) -> bool:
     """Whether a long wall is received by too few paths of a scan for a line, in the usual log."""
-    width = np.asarray(ring.exact_paths.width)
-    counts = []
+    width, counts = np.asarray(ring.exact_paths.width), [np.zeros(0)]
     for log in logs:
         measured = measured_paths(ring, log)
         whole = measured[:1] if measured.all() else measured
-        counts.append(float(np.median([width[paths].sum() for paths in whole]) / (2 * np.pi)) if len(whole) else np.inf)
-    return float(np.median(counts)) < SETTINGS.sparse_echoes
+        counts.append(whole[whole.any(axis=1)] @ width / (2 * np.pi))
+    usual = np.concatenate(counts)
+    if not len(usual):
+        return False
+    return float(np.median(usual)) < SETTINGS.sparse_echoes - 1e-6  # evenly spaced cones add up exactly
 
 
 def calibrate_sparse_ring(

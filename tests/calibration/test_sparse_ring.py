@@ -144,6 +144,9 @@ def test_sparse_and_dense_rings(nominal, log):
     assert is_sparse(nominal, [log])
     dense = simulate(office.ring, office.room, office.poses).as_log(office.ring, office.poses)
     assert not is_sparse(office.ring, [dense])
+    # 24 cones of 60 deg receive a long wall exactly four times.
+    direct = replace(office.ring, neighbors=0)
+    assert not is_sparse(direct, [simulate(direct, office.room, office.poses).as_log(direct, office.poses)])
 
 
 def test_logs_without_walls_or_poses_are_refused(nominal, log):
@@ -151,9 +154,10 @@ def test_logs_without_walls_or_poses_are_refused(nominal, log):
     noise = replace(log, range=rng.uniform(0.3, 2.9, len(log.range)))
     with pytest.raises(SonarError, match="calibration"):
         calibrate(nominal, noise)
+    few = np.where(np.arange(len(log))[:, None] < 2, log.pose, np.nan)
     for poses in ("trust", "estimate"):
         with pytest.raises(SonarError, match="have a pose"):
-            calibrate(nominal, replace(log, pose=np.full_like(log.pose, np.nan)), poses=poses)
+            calibrate(nominal, replace(log, pose=few), poses=poses)
 
 
 # Recorded runs: the laser that rides along is the reference
