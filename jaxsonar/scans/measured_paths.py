@@ -38,11 +38,17 @@ def measured_paths(ring: Ring, log: Log) -> Bool[np.ndarray, "scans paths"]:
 
 
 def echoes_of_long_wall(ring: Ring, log: Log) -> float:
-    """Number of paths that receive a long wall, of those that a scan measures (median)."""
+    """Number of paths that receive a long wall, of those that a scan measures (median).
+
+    In a log that does not list its measurements, paths of the same kind as a heard one (direct, or between sensors with
+    the same distance in the ring) count as measured: most of them hear nothing in a large room.
+    """
     if not len(log):
         return 0.0
     width, measured = np.asarray(ring.exact_paths.width), measured_paths(ring, log)
-    rows = measured[:1] if measured.all() else measured
+    kind = (ring.paths[:, 1] - ring.paths[:, 0]) % ring.count
+    of_heard_kind = np.isin(kind, (log.asked[:, 1] - log.asked[:, 0]) % ring.count)
+    rows = of_heard_kind[None] if len(log.asked) else measured
     return round(float(np.median([width[paths].sum() for paths in rows]) / (2 * np.pi)), 6)
 
 
