@@ -120,6 +120,9 @@ def run(options: argparse.Namespace) -> int:
     messages.warn_of_scale(ring, log)
     if window is None and (window := automatic_window(ring, log)) is not None:
         settings = hough_settings(ring, None, window=window) if given is None else widened(ring, given, window=window)
+        if given is not None and settings.rho_cells > given.rho_cells:
+            cells = f"{given.rho_cells} rho_cells are too few for windows of {window:g} m"
+            print_status(f"--settings {options.settings}: {cells}; {settings.rho_cells} are used")
     points = None if options.laser is None else _laser_points(options.laser)
     left_out: list[int] = []
     models, evidence, world = _build(ring, log, settings, options, window, left_out.append)

@@ -172,9 +172,10 @@ def summary_lines(result: Slam, errors: Errors | None) -> list[str]:
         lines.append(line)
         if smoothed.keeps_odometry:
             gain, least = (100 * (share or 0) for share in (smoothed.heading_gain, SPARSE_SETTINGS.least_heading_gain))
+            odometry = "odometry with its slips repaired" if result.slips else "odometry"
             lines.append(
-                f"the poses are those of the odometry: long walls would remove {gain:.0f} % of the variance of its "
-                f"headings; {least:.0f} % is the least to move poses"
+                f"the poses are those of the {odometry}: long walls would "
+                f"remove {gain:.0f} % of the variance of its headings; {least:.0f} % is the least to move poses"
             )
     covariance = result.trajectory.covariance
     if covariance is not None and len(covariance) > 1:  # the first pose is exact by definition

@@ -43,7 +43,7 @@ class HeavyTailSettings:
     iterations: int = 6
     """Reweighted least-squares adjustments, with a new association each."""
     min_sigma: float = 1e-5
-    """Least standard deviation of the ranges, metres."""
+    """Least standard deviation of the ranges, metres; it is at least that of their rounding."""
 
 
 SETTINGS = HeavyTailSettings()
@@ -82,13 +82,15 @@ def heavy_tailed_adjust(
         settings: constants of the algorithm.
     """
     stretch = _stretches(data, settings)
+    least = max(settings.min_sigma, _resolution(data.reported) / np.sqrt(12))
     information, relief, result = data.odometry_information, settings.relief, None
     for _ in range(settings.iterations):
         job = RobustAdjustment(ring, data, basis, poses_free=True, settings=GNC_SETTINGS)
         # 1. The wall of each echo, and the weight of the echo.
         used, candidate, reflection = job.associate(state, gate=settings.gate, ambiguity=0.0)
-        wall = np.asarray(reflection.first)
-        found = _weights(job.residual(state, reflection), used, wall, data.path, stretch, sigma, relief, settings)
+        residual = job.residual(state, reflection)
+        group = stretch[:, None], np.asarray(reflection.first), data.path
+        found = _weights(residual, used, group, sigma, least, relief, settings)
         relief = found.relief
         # 2. Least squares.
         state, problem, solution = job.adjust(state, reflection, found.weight)
@@ -106,10 +108,9 @@ def heavy_tailed_adjust(
 def _weights(
     residual: Float[np.ndarray, "scans echoes"],
     used: Bool[np.ndarray, "scans echoes"],
-    wall: Int[np.ndarray, "scans echoes"],
-    path: Int[np.ndarray, "scans echoes"],
-    stretch: Int[np.ndarray, " scans"],
+    group: tuple[Int[np.ndarray, "scans #echoes"], ...],
     sigma: float | None,
+    least: float,
     relief: float,
     settings: HeavyTailSettings,
 ) -> _Weights:
@@ -118,15 +119,15 @@ def _weights(
     ``count`` echoes of one path, wall and stretch have the variance sigma^2 / count + relief^2 together. They have the
     error of the wall and of the poses in common, so that their differences show the noise of the ranges.
     """
-    group = np.stack([np.broadcast_to(stretch[:, None], used.shape)[used], wall[used], path[used]])
-    _, same, count = np.unique(group, axis=1, return_inverse=True, return_counts=True)
+    key = np.stack([np.broadcast_to(one, used.shape)[used] for one in group])
+    _, same, count = np.unique(key, axis=1, return_inverse=True, return_counts=True)
     same, off = same.ravel(), residual[used]
     order = np.argsort(same, kind="stable")  # the echoes of a group in the order of the scans
     change = np.diff(off[order])[np.diff(same[order]) == 0]
     noise, pairs = sigma, 0
     if noise is None:
         spread = GNC_SETTINGS.mad_to_sigma * float(np.median(np.abs(change))) / np.sqrt(2) if len(change) else 0.0
-        noise, pairs = max(float(spread), settings.min_sigma), len(change)
+        noise, pairs = max(float(spread), least), len(change)
     tail = _student_weight(off**2 / (noise**2 + relief**2), settings.range_dof)
     mean = np.bincount(same, tail * off) / np.maximum(np.bincount(same, tail), 1e-12)
     relief = _relief(mean, relief, settings)
@@ -143,6 +144,12 @@ def _relief(mean: Float[np.ndarray, " groups"], start: float, settings: HeavyTai
         squares = settings.relief_groups * (settings.relief / settings.relief_factor) ** 2 + (weight * mean**2).sum()
         spread = float(np.sqrt(squares / (settings.relief_groups + len(mean))))
     return settings.relief_factor * spread
+
+
+def _resolution(reported: Float[np.ndarray, "scans echoes"]) -> float:
+    """Step to which ranges are rounded, metres: the smallest difference of two of them, as far as floats show it."""
+    steps = np.diff(np.unique(np.round(reported[np.isfinite(reported)], 6)))
+    return float(steps.min(initial=np.inf)) if len(steps) else 0.0
 
 
 def _student_weight(squared: Float[np.ndarray, "*any"], dof: float) -> Float[np.ndarray, "*any"]:

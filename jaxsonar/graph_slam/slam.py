@@ -117,8 +117,10 @@ def slam(
         ring: the sensors, calibrated.
         log: scans; their poses are odometry, and may be missing.
         sigma: standard deviation of the ranges, metres; estimated if left out.
-        window: metres of trajectory gathered into one local model; if left out, ``automatic_window``.
-        odometry_noise: noise model of the odometry.
+        window: metres of trajectory gathered into one local model; if left out, ``automatic_window``. With a window,
+            any log is treated like that of a sparse ring.
+        odometry_noise: noise model of the odometry; default ``OdometryNoise()``, or ``SPARSE_ODOMETRY_NOISE`` with a
+            window.
         smooth: whether to smooth. If left out: logs of up to ``SlamSettings.max_smoothed`` scans, except logs that are
             registered by ranges, unless ``speed`` is set.
         speed: whether smoothing estimates the speed of sound.

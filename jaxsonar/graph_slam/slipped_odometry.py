@@ -61,7 +61,7 @@ def repair_heading_slips(ring: Ring, log: Log) -> tuple[Log, tuple[HeadingSlip, 
         pose, samples = log.pose.copy(), log.odometry
         if samples is not None:
             samples = samples.copy()
-            later = samples[:, 0] > log.stamp[slip.row]  # False for NaN
+            later = samples[:, 0] > np.nanmax(log.stamp[: slip.row + 1], initial=-np.inf)
             samples[later, 1:] = compose(moved, samples[later, 1:])
         pose[slip.row + 1 :] = compose(moved, pose[slip.row + 1 :])
         log = replace(log, pose=pose, odometry=samples)

@@ -181,11 +181,12 @@ def _is_hidden(
     origin: Float[np.ndarray, "rows 2"], foot: Float[np.ndarray, "rows 2"], walls: list[WallLine]
 ) -> Bool[np.ndarray, " rows"]:
     """Which lines of sight a wall blocks clearly before their end."""
-    if not walls or not len(origin):
-        return np.zeros(len(origin), dtype=bool)
-    sight, wall = crossings(np.stack([origin, foot], axis=1), np.array([one.endpoints for one in walls]))
-    before = (1 - sight) * np.linalg.norm(foot - origin, axis=1)[:, None]
-    return ((sight > 0) & (before > SETTINGS.growth.hidden_depth) & (wall >= 0) & (wall <= 1)).any(axis=1)
+    hidden, length = np.zeros(len(origin), dtype=bool), np.linalg.norm(foot - origin, axis=1)
+    for one in walls:
+        sight, wall = (part[:, 0] for part in crossings(np.stack([origin, foot], axis=1), one.endpoints[None]))
+        before = (1 - sight) * length
+        hidden |= (sight > 0) & (before > SETTINGS.growth.hidden_depth) & (wall >= 0) & (wall <= 1)
+    return hidden
 
 
 def _is_corner_line(line: WallLine, echoes: RangeMeasurements, walls: list[WallLine], sigma: float) -> bool:

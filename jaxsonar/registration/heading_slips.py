@@ -196,7 +196,12 @@ class _PlacedEchoes:
         used &= (ranges > SETTINGS.min_range) & (ranges < ring.max_range)  # False for silent readings
         path, ranges, scan = path[used], ranges[used], of_row[log.echo_scan[used]]
         robot = reading_poses(log)[used]
-        _, same, count = np.unique(place[scan] * len(ring.paths) + path, return_inverse=True, return_counts=True)
+        # Of the echoes of one path at one place, those with about the same range are one. Together all are worth one.
+        key = np.stack([place[scan], path, np.round(ranges / SETTINGS.range_cell).astype(np.int64)])
+        kept, row, repeated = np.unique(key, axis=1, return_index=True, return_counts=True)
+        _, same = np.unique(kept[:2], axis=1, return_inverse=True)
+        weight = repeated / np.bincount(same.ravel(), repeated)[same.ravel()]
+        path, ranges, scan, robot = path[row], ranges[row], scan[row], robot[row]
         # Their votes.
         paths = ring.exact_paths
         width = np.asarray(paths.width)[path]
@@ -215,7 +220,7 @@ class _PlacedEchoes:
             rho=rho,
             inside=steps <= width[:, None],
             place=place[scan],
-            weight=1 / count[same],
+            weight=weight,
             scan=scan,
             length=length,
             rotation=rotation,

@@ -122,7 +122,9 @@ def smooth(
         )
         found = sparse.fit(_with_predicted_poses(start, measured))
         report("covariances")
-        return replace(_result(sparse, found.fit, found.world), heading_gain=found.heading_gain)
+        result = replace(_result(sparse, found.fit, found.world), heading_gain=found.heading_gain)
+        # What was estimated with poses that are not used is no result.
+        return replace(result, speed_of_sound_sd=0.0, scale_sd=(0.0, 0.0)) if result.keeps_odometry else result
     if models is None:
         report("local models")
         models = list(local_models(ring, log, sigma=sigma))

@@ -91,7 +91,7 @@ class SparseSmoother:
         state = AdjustmentState(
             np.zeros(self.basis.columns.shape[1]), data.poses, landmark_map_of([], tie_corners=False)
         )
-        start, found, walls, gain = state, None, None, 0.0
+        start, found, walls, long = state, None, None, np.zeros(0, np.int64)
         for _ in range(SPARSE_SETTINGS.maps):
             self.progress("building the map")
             world = self._map_at(state, data)
@@ -104,12 +104,12 @@ class SparseSmoother:
             self.progress("least squares")
             with jax.enable_x64(True):
                 found = heavy_tailed_adjust(self.ring, data, self.basis, state, sigma=self.sigma)
-            gain = self._heading_gain(found, data) if len(long) else 0.0
             state = found.state
         assert found is not None
         assert walls is not None
+        gain = self._heading_gain(found, data) if len(long) else 0.0
         if gain < SPARSE_SETTINGS.least_heading_gain:
-            found = _without_echoes(found, start)
+            found = _without_echoes(found, start, data)
         # The share of explained echoes is that of the whole map, also of its short walls.
         adjusted = data.logs_with_poses([self.log], found.state.poses)[0].pose
         world = self._map_at(found.state, data)
@@ -153,16 +153,17 @@ class SparseSmoother:
         with jax.enable_x64(True):
             after, before = (
                 marginal_covariances(one.problem, one.solution.unknowns, poses_free=True).poses[rows, 2, 2].sum()
-                for one in (found, _without_echoes(found, found.state))
+                for one in (found, _without_echoes(found, found.state, data))
             )
         return float(1 - after / max(before, 1e-12))
 
 
-def _without_echoes(found: AdjustmentResult, state: AdjustmentState) -> AdjustmentResult:
+def _without_echoes(found: AdjustmentResult, state: AdjustmentState, data: BatchData) -> AdjustmentResult:
     """An adjustment to odometry and priors only, whose result is a state (with the landmarks of the adjustment)."""
     state = state._replace(landmark_map=found.state.landmark_map)
     factors = replace(found.problem.factors, weight=jnp.zeros_like(found.problem.factors.weight))
-    problem = replace(found.problem, factors=factors)
+    odometry_information = jnp.asarray(data.odometry_information)  # without the weights of the adjustment
+    problem = replace(found.problem, factors=factors, odometry_information=odometry_information)
     with jax.enable_x64(True):
         solution = found.solution._replace(unknowns=state.unknowns())
     return found._replace(state=state, problem=problem, solution=solution)

@@ -603,7 +603,7 @@ def test_windows_of_a_map_have_several_lengths_within_the_limits(length):
 @pytest.mark.parametrize("seed", range(3))
 def test_independent_measurements_are_those_of_windows(seed):
     """A window of the whole trajectory holds each of them once."""
-    log = replace(a_log(seed, missing=0.0, strangers=False))
+    log = a_log(seed, missing=0.0, strangers=False)
     found = independent_measurements(FOUR, log)
     windows, left_out = gather_windows(FOUR, log, length=90.0)
     assert found.left_out == left_out

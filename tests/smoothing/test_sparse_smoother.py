@@ -57,12 +57,12 @@ def test_the_covariance_is_consistent(results):
         off[:, 2] = wrap_angle(off[:, 2])
         rows = np.arange(20, len(TRUE), 10)
         nees.append(np.mean([off[k] @ np.linalg.solve(found.pose_cov[k], off[k]) for k in rows]) / 3)
-    assert 0.1 < np.mean(nees) < 2
+    assert 0.25 < np.mean(nees) < 2
 
 
 def test_odometry_that_walls_cannot_improve_is_kept():
     """The poses are exactly those of the odometry, and the result says so."""
-    good = OdometryNoise(position_per_meter=1e-3, heading_per_meter=1e-4, heading_per_radian=1e-4)
+    good = OdometryNoise(position_per_meter=1e-3, heading_per_meter=3e-5, heading_per_radian=3e-5)
     reported = uneven(ranges(TRUE, sigma=0.02, ring=SPARSE), np.random.default_rng(1))
     found = smooth(SPARSE, log_of(reported, TRUE), TRUE, odometry=TRUE, window=1.5, odometry_noise=good)
     assert found.heading_gain is not None
