@@ -44,6 +44,8 @@ class SlamSettings:
     """Scans; longer logs are smoothed only on request. Smoothing takes about a minute for a thousand scans."""
     min_explained: float = 0.1
     """Least fraction of the echoes that poses and map must explain. Recordings of old narrow sonars reach it."""
+    min_explained_sparse: float = 0.05
+    """The same with windows: the few sensors of such a ring often face no wall, or people. Recordings reach 0.09."""
     unadjusted_gate: float = 0.04
     """Metres; without smoothing, echoes nearer to the range of a wall, corner or edge are explained by it."""
     judged_scans: int = 500
@@ -154,6 +156,7 @@ def slam(
         report("heading slips", 0, 0)
         log, slips = repair_heading_slips(ring, log)
         step_noise = SlippedOdometryNoise(step_noise, slips)
+    required = SETTINGS.min_explained if window is None else SETTINGS.min_explained_sparse
     # 1. Detect: the local model of every scan, unless maps of windows or the tracker do so.
     scan_by_scan = live and has_odometry.any()
     models = None if window is not None or scan_by_scan else detect(ring, log, sigma=sigma, progress=report)
@@ -178,7 +181,7 @@ def slam(
                 progress=lambda task: report(task, 0, 0),
             )
         except NothingExplained as reason:
-            raise SonarError(f"{reason}; walls {ExplainedShare(0.0, SETTINGS.min_explained).shortfall}") from None
+            raise SonarError(f"{reason}; walls {ExplainedShare(0.0, required).shortfall}") from None
     # 4. Map: that of the smoothed landmarks, or one from the initial poses.
     if smoothed is not None:
         poses, covariance, world = smoothed.poses, smoothed.pose_cov, smoothed.world
@@ -188,7 +191,7 @@ def slam(
         poses, covariance = initial.poses, initial.covariance
         world = _map_at(ring, replace(log, pose=poses), initial.models, window)
         share = _explained_share(ring, replace(log, pose=poses), world)
-    explained = ExplainedShare(share, SETTINGS.min_explained)
+    explained = ExplainedShare(share, required)
     if not explained.suffices:
         raise SonarError(
             f"slam: poses and map {explained.shortfall}: is it the right ring, are ranges and odometry in metres and "

@@ -62,7 +62,7 @@ def test_the_covariance_is_consistent(results):
 
 def test_odometry_that_walls_cannot_improve_is_kept():
     """The poses are exactly those of the odometry, and the result says so."""
-    good = OdometryNoise(position_per_meter=1e-3, heading_per_meter=3e-5, heading_per_radian=3e-5)
+    good = OdometryNoise(1e-3, heading_per_meter=3e-5, heading_per_radian=3e-5, minimum=(1e-5, 1e-5))
     reported = uneven(ranges(TRUE, sigma=0.02, ring=SPARSE), np.random.default_rng(1))
     found = smooth(SPARSE, log_of(reported, TRUE), TRUE, odometry=TRUE, window=1.5, odometry_noise=good)
     assert found.heading_gain is not None
