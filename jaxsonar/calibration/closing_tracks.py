@@ -75,7 +75,7 @@ def estimate_scale(ring: Ring, logs: Sequence[Log]) -> ScaleEstimate:
 
 
 def find_tracks(ring: Ring, log: Log, number: int = 0) -> list[Track]:
-    """The closing tracks of a log.
+    """The closing tracks of a log, from the nearest echo of each measurement.
 
     Echoes beyond the maximum range of the ring count, too: a track shows by itself whether its echoes are sound.
 
@@ -87,9 +87,9 @@ def find_tracks(ring: Ring, log: Log, number: int = 0) -> list[Track]:
     pose, corrected = reading_poses(log), np.asarray(ring.corrected(log.range, log.tx, log.rx))
     travelled = distance_travelled(log)
     usable = (log.tx == log.rx) & (corrected > 0) & np.isfinite(pose).all(axis=1)
-    found = []
+    nearest, found = _nearest_echoes(log, corrected, np.flatnonzero(usable)), []
     for sensor in range(ring.count):
-        row = np.flatnonzero(usable & (log.tx == sensor))
+        row = nearest[log.tx[nearest] == sensor]
         if not len(row):
             continue
         position = transform_points(pose[row], np.asarray(ring.position)[sensor : sensor + 1])
@@ -100,6 +100,15 @@ def find_tracks(ring: Ring, log: Log, number: int = 0) -> list[Track]:
             if slope is not None:
                 found.append(Track(*slope, np.array([number, travelled[log.echo_scan[row[part[0]]]]])))
     return found
+
+
+def _nearest_echoes(
+    log: Log, corrected: Float[np.ndarray, " echoes"], rows: Int[np.ndarray, " rows"]
+) -> Int[np.ndarray, "_"]:
+    """Of some direct echoes of a log, the row of the nearest one of each scan and sensor, ascending by scan."""
+    order = rows[np.lexsort((corrected[rows], log.tx[rows], log.echo_scan[rows]))]
+    same = (np.diff(log.echo_scan[order]) == 0) & (np.diff(log.tx[order]) == 0)
+    return order[np.append(True, ~same)[: len(order)]]
 
 
 def fit_slope(
