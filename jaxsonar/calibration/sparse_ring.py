@@ -32,8 +32,10 @@ class _Scale:
 
     log_speed: float
     sd: float
-    held: str
+    held: str = ""
     """Why it stays at the prior; empty if it was estimated."""
+    contradiction: str = ""
+    """Why the measured temperature is no prior; empty if it is one, or if none was measured."""
 
 
 def is_sparse(ring: Ring, logs: Sequence[Log]) -> bool:
@@ -135,21 +137,35 @@ def _check_poses(logs: Sequence[Log]) -> None:
 
 
 def _posterior(estimate: ScaleEstimate, free: Sequence[str], measured_speed_sd: float | None) -> _Scale:
-    """The estimate together with the prior, or the prior if the estimate says too little."""
+    """The estimate together with the prior, or the prior if the estimate says too little.
+
+    A temperature that the estimate contradicts is no prior: the clock of the driver changes the scale, too.
+    """
     if "speed" not in free:
-        return _Scale(0.0, 0.0, "")
-    value, sd = -estimate.log_scale, estimate.sd
+        return _Scale(0.0, 0.0)
+    value, sd, contradiction = -estimate.log_scale, estimate.sd, ""
     prior = SETTINGS.scale_sd if measured_speed_sd is None else measured_speed_sd
-    if sd > SETTINGS.max_scale_sd and not abs(value) > SETTINGS.significant * sd:
-        found = (
-            f"{estimate.tracks} tracks of sensors that approach something do not suffice"
-            if np.isinf(sd)
-            else f"{estimate.tracks} tracks of sensors that approach something give {np.exp(value) - 1:+.1%} ± {sd:.1%}"
+    if measured_speed_sd is not None and abs(value) > SETTINGS.significant * np.hypot(sd, measured_speed_sd):
+        prior = SETTINGS.scale_sd
+        contradiction = (
+            f"not used, because {_found(estimate)} against the speed of sound at this temperature: the clock of the "
+            "driver, the odometry or the temperature is wrong"
         )
+    if sd > SETTINGS.max_scale_sd and not abs(value) > SETTINGS.significant * sd:
+        found = f"{_tracks(estimate)} do not suffice" if np.isinf(sd) else _found(estimate)
         why = f"{found}; needed are {SETTINGS.max_scale_sd:.1%} (one sigma): drive towards walls, or give more logs"
-        return _Scale(0.0, min(sd, prior), why)
+        return _Scale(0.0, min(sd, prior), held=why)
     variance = 1 / (sd**-2 + prior**-2)
-    return _Scale(value * variance / sd**2, float(np.sqrt(variance)), "")
+    return _Scale(value * variance / sd**2, float(np.sqrt(variance)), contradiction=contradiction)
+
+
+def _tracks(estimate: ScaleEstimate) -> str:
+    return f"{estimate.tracks} tracks of sensors that approach something"
+
+
+def _found(estimate: ScaleEstimate) -> str:
+    """The change of the speed of sound that tracks give, in words."""
+    return f"{_tracks(estimate)} give {np.expm1(-estimate.log_scale):+.1%} ± {estimate.sd:.1%}"
 
 
 def _echoes_of_maps(
@@ -207,6 +223,8 @@ def _reasons_held(
     held = {}
     if scale.held:
         held["speed"] = scale.held
+    if scale.contradiction:
+        held["temperature"] = scale.contradiction
     if "offset" in free:
         held["mean_offset"] = (
             f"not determined (± {1e3 * fit.mean_offset_sd:.0f} mm, its prior): a ring with a larger one and walls "

@@ -139,6 +139,19 @@ def test_a_thermometer_is_the_prior_of_the_scale(nominal):
     assert found.speed_of_sound_sd < 0.5
 
 
+@pytest.mark.slow
+def test_a_thermometer_that_the_tracks_contradict_is_reported_and_not_used(nominal, log, found):
+    """The clock of the driver is wrong by 4 %; air of 45 deg C would have the same effect, air of 20 deg C has not."""
+    cool, hot = (calibrate(nominal, log, temperature=temperature) for temperature in (20.0, 45.0))
+    assert "the clock" in cool.held["temperature"]
+    assert any(line.startswith("held: temperature: not used") for line in cool.summary())
+    assert abs(np.log(float(cool.ring.speed_of_sound) / 343.2 * SCALE)) < Z * cool.speed_of_sound_sd / 343.2
+    assert cool.speed_of_sound_sd == pytest.approx(found.speed_of_sound_sd, rel=0.1)
+    for one in (hot, found):
+        assert "temperature" not in one.held
+    assert hot.speed_of_sound_sd < 0.4
+
+
 def test_sparse_and_dense_rings(nominal, log):
     office = load_office()
     assert is_sparse(nominal, [log])
