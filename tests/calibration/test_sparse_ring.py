@@ -13,7 +13,10 @@ from jaxsonar.calibration.settings import SPARSE_SETTINGS as SETTINGS
 from jaxsonar.calibration.sparse_ring import is_sparse
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.hardware.laser_datasets import read_corridor8_laser
+from jaxsonar.mapping.build_map import build_map
 from jaxsonar.reports.plot_calibration import calibration_figure
+from jaxsonar.scans.sliding_windows import SETTINGS as WINDOWS
+from jaxsonar.scans.sliding_windows import automatic_window
 from jaxsonar.simulation.office import load_office
 
 SCALE, COMMON = 0.96, 0.06
@@ -160,6 +163,23 @@ def test_sparse_and_dense_rings(nominal, log):
     # 24 cones of 60 deg receive a long wall exactly four times.
     direct = replace(office.ring, neighbors=0)
     assert not is_sparse(direct, [simulate(direct, office.room, office.poses).as_log(direct, office.poses)])
+
+
+def test_the_windows_of_maps_are_those_of_slam_and_odometry_is_refused(nominal, log, found):
+    length = automatic_window(nominal, log)
+    assert length == WINDOWS.sparse_length
+    expected = build_map(found.ring, log, window=length)
+    np.testing.assert_array_equal(found.maps[0].segments, expected.segments)
+    with pytest.raises(SonarError, match=r"odometry 0\.1 .*allowed is none"):
+        calibrate(nominal, log, odometry=0.1)
+
+
+@pytest.mark.slow
+def test_a_given_noise_is_that_of_the_maps_and_of_the_fit(nominal, log):
+    found = calibrate(nominal, log, sigma=0.01, window=2.0)
+    assert found.sigma == 0.01
+    expected = build_map(found.ring, log, window=2.0, sigma=0.01)
+    np.testing.assert_array_equal(found.maps[0].segments, expected.segments)
 
 
 def test_logs_without_walls_or_poses_are_refused(nominal, log):
