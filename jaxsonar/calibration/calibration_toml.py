@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxsonar.calibration.calibration_result import Calibration, RunResiduals
 from jaxsonar.calibration.echo_model import EchoModel
+from jaxsonar.calibration.robust_statistics import robust_deviation
 from jaxsonar.fileio.atomic_files import open_output
 from jaxsonar.sensors.ring_toml import ring_toml
 
@@ -77,7 +78,7 @@ def _run_table(run: RunResiduals) -> dict[str, Any]:
         table["scale"] = _short(np.exp(run.scale.log_scale))
         table["scale_sd"] = _short(run.scale.sd)
     for name, residual in (("robust_sigma_before", run.before), ("robust_sigma_after", run.after)):
-        table[name] = _short(1.4826 * float(np.median(np.abs(residual - np.median(residual)))))
+        table[name] = _short(robust_deviation(residual))
     return table
 
 

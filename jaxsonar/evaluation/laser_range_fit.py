@@ -11,6 +11,7 @@ import numpy as np
 import tomli_w
 from jaxtyping import Float, Int
 
+from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
 from jaxsonar.evaluation.laser_reference_map import reference_map
 from jaxsonar.evaluation.settings import SETTINGS as EVALUATION
 from jaxsonar.fileio.atomic_files import open_output
@@ -26,8 +27,6 @@ from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_toml import ring_toml
 
 SETTINGS = EVALUATION.ranges
-_MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution divided by its median absolute deviation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +58,7 @@ class LaserRanges:
         """
         residual = self.residual(ring)
         deviation = np.abs(residual - np.median(residual)) if len(residual) else np.array([np.nan])
-        return _MAD_TO_SIGMA * float(np.median(deviation))
+        return GNC_SETTINGS.mad_to_sigma * float(np.median(deviation))
 
 
 @dataclass(frozen=True, eq=False)
