@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from jaxsonar.calibration.calibration_result import Calibration
-from jaxsonar.calibration.echo_model import EchoModel
+from jaxsonar.calibration.echo_model import EchoStatistics
 from jaxsonar.calibration.robust_statistics import robust_deviation
 from jaxsonar.evaluation.laser_range_fit import LaserRangeFit
 from jaxsonar.mapping.global_map import GlobalMap
@@ -149,7 +149,7 @@ def _draw_binned(
     axes.legend(loc="upper left", fontsize=8)
 
 
-def _draw_detection(axes: Axes, model: EchoModel) -> None:
+def _draw_detection(axes: Axes, model: EchoStatistics) -> None:
     """Share of walls that are heard over the angle, with the number of measurements."""
     edges, share = np.degrees(model.off_axis), model.detection
     axes.bar(
