@@ -42,7 +42,7 @@ def calibrate(
     *,
     free: Sequence[str] = DEFAULT_PARAMETERS,
     poses: str = "trust",
-    odometry: float = SETTINGS.odometry_error,
+    odometry: float | None = None,
     temperature: float | None = None,
     sigma: float | None = None,
     window: float | None = None,
@@ -59,7 +59,8 @@ def calibrate(
             their own are merged first (``estimation_log``).
         free: estimated parameter groups, of "offset", "speed", "position", "radius", "heading"; the others are held.
         poses: "trust" takes the poses of the log as exact; "estimate" takes them as odometry, if there are any.
-        odometry: standard deviation of odometry, as a fraction of the displacement and rotation between scans.
+        odometry: standard deviation of odometry, as a fraction of the displacement and rotation between scans; 0.02 if
+            omitted. A ring that is calibrated from the run needs none: the standard errors come from the run itself.
         temperature: measured temperature of the air, deg C: prior mean of the speed of sound.
         sigma: standard deviation of the range noise, metres; estimated from the residuals if left out.
         window: length of trajectory gathered into one local model, metres, as in ``build_map``; for sparse rings, which
@@ -85,6 +86,11 @@ def calibrate(
         check_calibration_poses(logs)
     has_poses = all(np.isfinite(one.pose).any() for one in logs)
     if set(free) <= set(DEFAULT_PARAMETERS) and has_poses and is_sparse(prior_ring, logs):
+        if odometry is not None:
+            raise SonarError(
+                f"calibration: odometry {odometry:g} came for a ring whose single scans carry no line; allowed is "
+                "none, because the standard errors come from the run itself"
+            )
         return calibrate_sparse_ring(
             ring,
             prior_ring,
@@ -98,7 +104,8 @@ def calibrate(
             progress=progress,
         )
     basis = parameter_basis(prior_ring, free, poses_free=poses_free, speed_sd=speed_sd)
-    problem = CalibrationProblem(prior_ring, basis, poses_free, odometry, sigma, window, progress)
+    error = SETTINGS.odometry_error if odometry is None else odometry
+    problem = CalibrationProblem(prior_ring, basis, poses_free, error, sigma, window, progress)
     # 2. Autofocus: bring a ring with large errors close enough for echoes to be associated with walls.
     start = prior_ring
     if "offset" in free and window is None:
@@ -180,7 +187,7 @@ def _check_arguments(
     logs: Sequence[Log],
     free: Sequence[str],
     poses: str,
-    odometry: float,
+    odometry: float | None,
     temperature: float | None,
     sigma: float | None,
     window: float | None,
@@ -192,7 +199,7 @@ def _check_arguments(
         raise SonarError(f"poses {poses!r}; allowed is {' or '.join(POSES)}")
     if not logs:
         raise SonarError("calibration: no log came; allowed is one or more")
-    if not 1e-4 <= odometry <= 1:  # False for NaN
+    if odometry is not None and not 1e-4 <= odometry <= 1:  # False for NaN
         raise SonarError(f"odometry {odometry:g}; allowed is 0.0001 to 1, its error as a fraction of the distance")
     if temperature is not None and not -60 <= temperature <= 85:
         raise SonarError(f"temperature {temperature:g} deg C; allowed is -60 to 85")

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxsonar import kernels
 from jaxsonar.calibration.closing_tracks import ScaleEstimate
-from jaxsonar.calibration.echo_model import EchoModel
+from jaxsonar.calibration.echo_model import EchoStatistics
 from jaxsonar.estimation.explained_share import ExplainedShare
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.mapping.global_map import GlobalMap
@@ -74,7 +74,7 @@ class Calibration:
     sensors."""
     unknowns: kernels.Unknowns | None = None
     """Solution of ``problem``."""
-    echo_model: EchoModel | None = None
+    echo_model: EchoStatistics | None = None
     """Noise and detection probability; for rings with few sensors only."""
     run: RunResiduals | None = None
     """Residuals over range and angle, and the source of the scale; for rings with few sensors only."""

@@ -8,7 +8,8 @@ import tomli_w
 from jaxtyping import Float
 
 from jaxsonar.calibration.calibration_result import Calibration, RunResiduals
-from jaxsonar.calibration.echo_model import EchoModel
+from jaxsonar.calibration.echo_model import EchoStatistics
+from jaxsonar.calibration.robust_statistics import robust_deviation
 from jaxsonar.fileio.atomic_files import open_output
 from jaxsonar.sensors.ring_toml import ring_toml
 
@@ -77,11 +78,11 @@ def _run_table(run: RunResiduals) -> dict[str, Any]:
         table["scale"] = _short(np.exp(run.scale.log_scale))
         table["scale_sd"] = _short(run.scale.sd)
     for name, residual in (("robust_sigma_before", run.before), ("robust_sigma_after", run.after)):
-        table[name] = _short(1.4826 * float(np.median(np.abs(residual - np.median(residual)))))
+        table[name] = _short(robust_deviation(residual))
     return table
 
 
-def _echo_model_table(model: EchoModel) -> dict[str, Any]:
+def _echo_model_table(model: EchoStatistics) -> dict[str, Any]:
     """Noise (metres, shares) and detections over the angle off axis (degrees)."""
     return {
         "core_sd": _short(model.core_sd),

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxsonar.calibration.robust_statistics import student_weights
 from jaxsonar.calibration.settings import TRACK_SETTINGS as SETTINGS
 from jaxsonar.geometry.se2 import transform_points, unit, wrap_angle
 from jaxsonar.registration.wall_readings import distance_travelled
@@ -75,7 +76,7 @@ def estimate_scale(ring: Ring, logs: Sequence[Log]) -> ScaleEstimate:
 
 
 def find_tracks(ring: Ring, log: Log, number: int = 0) -> list[Track]:
-    """The closing tracks of a log.
+    """The closing tracks of a log, from the nearest echo of each measurement.
 
     Echoes beyond the maximum range of the ring count, too: a track shows by itself whether its echoes are sound.
 
@@ -87,9 +88,9 @@ def find_tracks(ring: Ring, log: Log, number: int = 0) -> list[Track]:
     pose, corrected = reading_poses(log), np.asarray(ring.corrected(log.range, log.tx, log.rx))
     travelled = distance_travelled(log)
     usable = (log.tx == log.rx) & (corrected > 0) & np.isfinite(pose).all(axis=1)
-    found = []
+    nearest, found = _nearest_echoes(log, corrected, np.flatnonzero(usable)), []
     for sensor in range(ring.count):
-        row = np.flatnonzero(usable & (log.tx == sensor))
+        row = nearest[log.tx[nearest] == sensor]
         if not len(row):
             continue
         position = transform_points(pose[row], np.asarray(ring.position)[sensor : sensor + 1])
@@ -100,6 +101,15 @@ def find_tracks(ring: Ring, log: Log, number: int = 0) -> list[Track]:
             if slope is not None:
                 found.append(Track(*slope, np.array([number, travelled[log.echo_scan[row[part[0]]]]])))
     return found
+
+
+def _nearest_echoes(
+    log: Log, corrected: Float[np.ndarray, " echoes"], rows: Int[np.ndarray, " rows"]
+) -> Int[np.ndarray, "_"]:
+    """Of some direct echoes of a log, the row of the nearest one of each scan and sensor, ascending by scan."""
+    order = rows[np.lexsort((corrected[rows], log.tx[rows], log.echo_scan[rows]))]
+    same = (np.diff(log.echo_scan[order]) == 0) & (np.diff(log.tx[order]) == 0)
+    return order[np.append(True, ~same)[: len(order)]]
 
 
 def fit_slope(
@@ -138,7 +148,7 @@ def _slope(
     for _ in range(SETTINGS.iterations):
         value = np.linalg.lstsq(design * np.sqrt(weight)[:, None], measured * np.sqrt(weight), rcond=None)[0]
         residual = measured - design @ value
-        weight = (SETTINGS.freedom + 1) / (SETTINGS.freedom + (residual / scale) ** 2)
+        weight = student_weights(residual / scale, SETTINGS.freedom)
         scale = float(np.sqrt((weight * residual**2).sum() / (len(along) - 2)))
         scale = max(scale, SETTINGS.min_noise)
     along, across = (one - np.average(one, weights=weight) for one in (along, across))
@@ -185,7 +195,7 @@ def robust_mean(value: Float[np.ndarray, " tracks"], sd: Float[np.ndarray, " tra
     for spread in SETTINGS.spreads:
         scale, mean, weight = np.hypot(sd, spread), float(np.median(value)), np.ones(len(value))
         for _ in range(SETTINGS.iterations):
-            weight = (SETTINGS.freedom + 1) / (SETTINGS.freedom + ((value - mean) / scale) ** 2) / scale**2
+            weight = student_weights((value - mean) / scale, SETTINGS.freedom) / scale**2
             mean = float(np.average(value, weights=weight))
         tails = np.log1p(((value - mean) / scale) ** 2 / SETTINGS.freedom)
         now = float((-np.log(scale) - (SETTINGS.freedom + 1) / 2 * tails).sum())

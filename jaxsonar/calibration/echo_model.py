@@ -16,7 +16,7 @@ from jaxsonar.sensors.ring import Ring
 
 
 @dataclass(frozen=True, eq=False)
-class EchoModel:
+class EchoStatistics:
     """How echoes scatter about the walls of a map, and how often walls are heard.
 
     The walls were found from the same echoes. Walls that are never heard are therefore not counted.
@@ -62,7 +62,7 @@ class EchoModel:
         )
 
 
-def measure_echo_model(ring: Ring, logs: Sequence[Log], walls: Sequence[Float[np.ndarray, "_ 2 2"]]) -> EchoModel:
+def measure_echo_model(ring: Ring, logs: Sequence[Log], walls: Sequence[Float[np.ndarray, "_ 2 2"]]) -> EchoStatistics:
     """Noise and detection probability of a calibrated ring.
 
     Args:
@@ -77,7 +77,7 @@ def measure_echo_model(ring: Ring, logs: Sequence[Log], walls: Sequence[Float[np
     for log, segments in zip(logs, walls, strict=True):
         counts = _detections(ring, log, segments)
         expected, heard = expected + counts[0], heard + counts[1]
-    return EchoModel(
+    return EchoStatistics(
         core_sd=core,
         tail_share=share,
         tail_scale=scale,

@@ -36,8 +36,8 @@ def implausible_scale(ring: Ring, log: Log) -> Iterator[Implausibility]:
     error = float(np.expm1(found.log_scale))
     if abs(found.log_scale) < max(SETTINGS.least, SETTINGS.sigmas * found.sd):
         return
-    size = "long" if error > 0 else "short"
-    changes = f"by {100 * error:+.1f} +- {100 * found.sd:.1f} % more than the robot moves ({found.tracks} tracks)"
+    size, more = ("long", "more") if error > 0 else ("short", "less")
+    changes = f"by {100 * abs(error):.1f} +- {100 * found.sd:.1f} % {more} than the robot moves ({found.tracks} tracks)"
     what = f"while sensors approach something, their ranges change {changes}"
     cause = f"the ranges are too {size}: another speed of sound or clock than the ring's, or the odometry is wrong"
     speed = float(ring.speed_of_sound) * float(np.exp(-found.log_scale))

@@ -104,10 +104,6 @@ class SparseCalibrationSettings:
     otherwise.
     """
 
-    sparse_echoes: float = 4.0
-    """A ring is sparse if a long wall is received by fewer paths than this in one scan, as in ``slam``."""
-    window: float = 1.5
-    """Length of the windows of its maps, metres, unless one is given."""
     min_scans: int = 3
     """Scans with a pose that a log needs."""
     gate: float = 0.12

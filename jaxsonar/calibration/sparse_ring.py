@@ -20,9 +20,12 @@ from jaxsonar.estimation.explained_share import ExplainedShare
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.mapping.build_map import build_map
+from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.registration.wall_readings import distance_travelled, fresh_readings
-from jaxsonar.scans.measured_paths import measured_paths
+from jaxsonar.scans.measured_paths import echoes_of_long_wall
 from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.sliding_windows import SETTINGS as WINDOWS
+from jaxsonar.scans.sliding_windows import automatic_window
 from jaxsonar.sensors.ring import Ring
 
 
@@ -32,21 +35,17 @@ class _Scale:
 
     log_speed: float
     sd: float
-    held: str
+    held: str = ""
     """Why it stays at the prior; empty if it was estimated."""
+    contradiction: str = ""
+    """Why the measured temperature is no prior; empty if it is one, or if none was measured."""
 
 
 def is_sparse(ring: Ring, logs: Sequence[Log]) -> bool:
-    """Whether a long wall is received by too few paths of a scan for a line, in the usual log."""
-    width, counts = np.asarray(ring.exact_paths.width), [np.zeros(0)]
-    for log in logs:
-        measured = measured_paths(ring, log)
-        whole = measured[:1] if measured.all() else measured
-        counts.append(whole[whole.any(axis=1)] @ width / (2 * np.pi))
-    usual = np.concatenate(counts)
-    if not len(usual):
-        return False
-    return float(np.median(usual)) < SETTINGS.sparse_echoes - 1e-6  # evenly spaced cones add up exactly
+    """Whether a long wall is received by too few paths of a scan for a line, in the log of the usual scan."""
+    received = [np.full(len(log), echoes_of_long_wall(ring, log)) for log in logs]
+    usual = np.concatenate([np.zeros(0), *received])
+    return len(usual) > 0 and float(np.median(usual)) < WINDOWS.sparse_echoes
 
 
 def calibrate_sparse_ring(
@@ -72,16 +71,22 @@ def calibrate_sparse_ring(
         held: parameters that were not asked for, and why.
         poses_exact: whether the poses of a log are exact everywhere; otherwise only over short stretches.
         measured_speed_sd: standard deviation of the speed of sound of ``prior_ring``, relative, if it was measured.
-        sigma: scale of the range noise, metres; None: estimated.
-        window: length of the windows of the maps, metres; None: ``SETTINGS.window``.
+        sigma: scale of the range noise, metres, in the fits and in the maps; None: estimated, and the default of maps.
+        window: length of the windows of the maps, metres; None: chosen for each log (``automatic_window``).
         progress: called with a description of each step.
 
     Raises:
         SonarError: too few scans with a pose, walls explain too few echoes, or a result outside the plausible range.
     """
     _check_poses(logs)
-    window = SETTINGS.window if window is None else window
     fresh = [fresh_readings(ring, log) for log in logs]
+
+    def maps_with(some: Ring) -> tuple[GlobalMap, ...]:
+        lengths = [window or automatic_window(ring, log) or WINDOWS.sparse_length for log in logs]
+        return tuple(
+            build_map(some, log, window=length, sigma=sigma) for log, length in zip(logs, lengths, strict=True)
+        )
+
     # 1. The scale, from sensors that approach static targets.
     progress("closing tracks")
     estimate = estimate_scale(prior_ring, fresh)
@@ -89,7 +94,7 @@ def calibrate_sparse_ring(
     scaled = replace(prior_ring, speed_of_sound=float(prior_ring.speed_of_sound * np.exp(scale.log_speed)))
     # 2. Maps with this scale, and the echoes that their walls explain.
     progress("walls")
-    echoes = _echoes_of_maps(prior_ring, scaled, logs, fresh, window, np.inf if poses_exact else SETTINGS.stretch)
+    echoes = _echoes_of_maps(prior_ring, scaled, fresh, maps_with(scaled), np.inf if poses_exact else SETTINGS.stretch)
     _check_explained(echoes, fresh)
     # 3. The offsets of sensors relative to each other, at this scale.
     progress("range offsets")
@@ -99,7 +104,7 @@ def calibrate_sparse_ring(
     _check_result(prior_ring, calibrated)
     # 4. Maps before and after; noise and detection probability.
     progress("maps before and after")
-    maps = tuple(build_map(calibrated, log, window=window) for log in logs)
+    maps = maps_with(calibrated)
     model = measure_echo_model(calibrated, logs, [one.segments for one in maps])
     determined = shared_wall_sensors(echoes) >= SETTINGS.min_echoes
     return Calibration(
@@ -117,7 +122,7 @@ def calibrate_sparse_ring(
         scans=sum(len(log) for log in logs),
         poses=tuple(log.pose for log in logs),
         maps=maps,
-        maps_before=tuple(build_map(ring, log, window=window) for log in logs),
+        maps_before=maps_with(ring),
         echo_model=model,
         run=_run_residuals(prior_ring, echoes, fit, estimate),
     )
@@ -135,30 +140,44 @@ def _check_poses(logs: Sequence[Log]) -> None:
 
 
 def _posterior(estimate: ScaleEstimate, free: Sequence[str], measured_speed_sd: float | None) -> _Scale:
-    """The estimate together with the prior, or the prior if the estimate says too little."""
+    """The estimate together with the prior, or the prior if the estimate says too little.
+
+    A temperature that the estimate contradicts is no prior: the clock of the driver changes the scale, too.
+    """
     if "speed" not in free:
-        return _Scale(0.0, 0.0, "")
-    value, sd = -estimate.log_scale, estimate.sd
+        return _Scale(0.0, 0.0)
+    value, sd, contradiction = -estimate.log_scale, estimate.sd, ""
     prior = SETTINGS.scale_sd if measured_speed_sd is None else measured_speed_sd
-    if sd > SETTINGS.max_scale_sd and not abs(value) > SETTINGS.significant * sd:
-        found = (
-            f"{estimate.tracks} tracks of sensors that approach something do not suffice"
-            if np.isinf(sd)
-            else f"{estimate.tracks} tracks of sensors that approach something give {np.exp(value) - 1:+.1%} ± {sd:.1%}"
+    if measured_speed_sd is not None and abs(value) > SETTINGS.significant * np.hypot(sd, measured_speed_sd):
+        prior = SETTINGS.scale_sd
+        contradiction = (
+            f"not used, because {_found(estimate)} against the speed of sound at this temperature: the clock of the "
+            "driver, the odometry or the temperature is wrong"
         )
+    if sd > SETTINGS.max_scale_sd and not abs(value) > SETTINGS.significant * sd:
+        found = f"{_tracks(estimate)} do not suffice" if np.isinf(sd) else _found(estimate)
         why = f"{found}; needed are {SETTINGS.max_scale_sd:.1%} (one sigma): drive towards walls, or give more logs"
-        return _Scale(0.0, min(sd, prior), why)
+        return _Scale(0.0, min(sd, prior), held=why)
     variance = 1 / (sd**-2 + prior**-2)
-    return _Scale(value * variance / sd**2, float(np.sqrt(variance)), "")
+    return _Scale(value * variance / sd**2, float(np.sqrt(variance)), contradiction=contradiction)
+
+
+def _tracks(estimate: ScaleEstimate) -> str:
+    return f"{estimate.tracks} tracks of sensors that approach something"
+
+
+def _found(estimate: ScaleEstimate) -> str:
+    """The change of the speed of sound that tracks give, in words."""
+    return f"{_tracks(estimate)} give {np.expm1(-estimate.log_scale):+.1%} ± {estimate.sd:.1%}"
 
 
 def _echoes_of_maps(
-    ring: Ring, scaled: Ring, logs: Sequence[Log], fresh: Sequence[Log], window: float, stretch: float
+    ring: Ring, scaled: Ring, fresh: Sequence[Log], maps: Sequence[GlobalMap], stretch: float
 ) -> WallEchoes:
     """Echoes at the walls of the map of each log, in one table."""
     tables, walls, begin = [], 0, 0.0
-    for log, new in zip(logs, fresh, strict=True):
-        world, travelled = build_map(scaled, log, window=window), distance_travelled(log)
+    for new, world in zip(fresh, maps, strict=True):
+        travelled = distance_travelled(new)
         one = assign_echoes(ring, new, travelled, world.segments, scaled, stretch=stretch)
         tables.append(replace(one, wall=one.wall + walls, travelled=one.travelled + begin))
         walls += len(one.center)
@@ -207,6 +226,8 @@ def _reasons_held(
     held = {}
     if scale.held:
         held["speed"] = scale.held
+    if scale.contradiction:
+        held["temperature"] = scale.contradiction
     if "offset" in free:
         held["mean_offset"] = (
             f"not determined (± {1e3 * fit.mean_offset_sd:.0f} mm, its prior): a ring with a larger one and walls "

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxsonar.calibration.robust_statistics import student_weights
 from jaxsonar.calibration.settings import SPARSE_SETTINGS as SETTINGS
 from jaxsonar.calibration.wall_echoes import WallEchoes
 from jaxsonar.geometry.se2 import rotate, transform_points
@@ -178,7 +179,7 @@ class _WallSystem:
         """
         distance, d_plane = self._predict()
         residual, wall, factor = self._residual(value, distance), self.echoes.wall, self.factor * np.exp(-value[-1])
-        weight = _weight(residual / sigma) / sigma**2
+        weight = student_weights(residual / sigma, SETTINGS.freedom) / sigma**2
         if kept is not None:
             weight = weight * kept
         ring = np.concatenate([self.sensors, -factor * distance[:, None]], axis=1)
@@ -209,7 +210,8 @@ class _WallSystem:
     def _scale(self, value: Float[np.ndarray, " parameters"], scale: float) -> float:
         """The next scale of the residuals, metres (expectation maximization of the t distribution)."""
         residual = self.residual(value)
-        return max(float(np.sqrt(np.mean(_weight(residual / scale) * residual**2))), SETTINGS.min_noise)
+        weight = student_weights(residual / scale, SETTINGS.freedom)
+        return max(float(np.sqrt(np.mean(weight * residual**2))), SETTINGS.min_noise)
 
     def _predict(self) -> tuple[Float[np.ndarray, " echoes"], Float[np.ndarray, "echoes 2"]]:
         """Half path lengths, and their derivatives by shift and rotation of the walls."""
@@ -222,11 +224,6 @@ class _WallSystem:
     ) -> Float[np.ndarray, " echoes"]:
         expected = self.nominal_offset + self.sensors @ value[:-1] + self.factor * np.exp(-value[-1]) * distance
         return self.echoes.reported - expected
-
-
-def _weight(residual: Float[np.ndarray, " echoes"]) -> Float[np.ndarray, " echoes"]:
-    """Weights of residuals (in units of their scale) that follow Student's t distribution."""
-    return (SETTINGS.freedom + 1) / (SETTINGS.freedom + residual**2)
 
 
 def _prior(

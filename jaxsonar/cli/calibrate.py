@@ -40,9 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--odometry",
         type=finite(1e-4, 1),
-        default=0.02,
         metavar="SHARE",
-        help="relative error of the odometry (default: 0.02)",
+        help="relative error of the odometry (default: 0.02); not for rings with few sensors",
     )
     parser.add_argument("--temperature", type=finite(-60, 85), metavar="DEG_C", help="measured air temperature")
     parser.add_argument(
@@ -52,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--window",
         type=finite(0.01, 100),
         metavar="METRES",
-        help="combine the echoes of this distance driven, for rings with few sensors (default for them: 1.5)",
+        help="combine the echoes of this distance driven, for rings with few sensors (default for them: 1.5 or more)",
     )
     parser.add_argument(
         "--laser",
@@ -102,11 +101,14 @@ def _check_laser_options(options: argparse.Namespace) -> None:
     """Raise a SonarError for options that contradict ``--laser``."""
     if len(options.logs) > 1:
         raise SonarError(f"--laser came with {len(options.logs)} logs; allowed is one, of the same run as the laser")
-    unused = [name for name in ("temperature", "sigma", "window") if getattr(options, name) is not None]
-    if unused or tuple(options.free) != DEFAULT_FREE:
-        name = unused[0] if unused else "free"
+    names = ("temperature", "sigma", "window", "odometry")
+    unused = [f"--{name}" for name in names if getattr(options, name) is not None]
+    unused += ["--free"] if tuple(options.free) != DEFAULT_FREE else []
+    unused += ["--poses estimate"] if options.poses == "estimate" else []
+    if unused:
         raise SonarError(
-            f"--laser came with --{name}; allowed is --laser without it: it fits offset and speed of sound"
+            f"--laser came with {unused[0]}; allowed is --laser without it: it fits offset and speed of sound at the "
+            "poses of the log"
         )
 
 

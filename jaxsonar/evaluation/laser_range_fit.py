@@ -11,6 +11,7 @@ import numpy as np
 import tomli_w
 from jaxtyping import Float, Int
 
+from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
 from jaxsonar.evaluation.laser_reference_map import reference_map
 from jaxsonar.evaluation.settings import SETTINGS as EVALUATION
 from jaxsonar.fileio.atomic_files import open_output
@@ -50,13 +51,14 @@ class LaserRanges:
         return np.asarray(ring.corrected(self.reported, self.sensor, self.receiver)) - self.true
 
     def robust_sigma(self, ring: Ring) -> float:
-        """Robust standard deviation of the residuals within the gate about their median, metres.
+        """Robust standard deviation of the residuals about their median, metres; NaN without echoes.
 
-        It contains neither a common offset nor echoes of other things than the wall.
+        It contains no common offset, and echoes of other things than the wall hardly change it. The echoes are the same
+        for every ring.
         """
         residual = self.residual(ring)
-        residual = residual[np.abs(residual) < SETTINGS.gate]
-        return float(1.4826 * np.median(np.abs(residual - np.median(residual)))) if len(residual) else np.nan
+        deviation = np.abs(residual - np.median(residual)) if len(residual) else np.array([np.nan])
+        return GNC_SETTINGS.mad_to_sigma * float(np.median(deviation))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +137,17 @@ def laser_ranges(ring: Ring, log: Log, laser: LaserRecording) -> LaserRanges:
     """
     fresh = fresh_readings(ring, log)
     walls = reference_map(at_poses_of(laser, log))
+    if not len(walls):
+        raise SonarError(
+            "laser: it sees no wall along the trajectory; allowed are scans of a place with straight walls"
+        )
     path = path_rows(ring, fresh.tx, fresh.rx)
     pose = reading_poses(fresh)
     row = np.flatnonzero((path >= 0) & np.isfinite(fresh.range) & np.isfinite(pose).all(axis=1))
     faces = nearest_faces(ring, path[row], pose[row], walls)
-    near = (faces.wall >= 0) & (np.abs(fresh.range[row] - faces.distance) < SETTINGS.gate)
+    corrected = np.asarray(ring.corrected(fresh.range[row], fresh.tx[row], fresh.rx[row]))
+    gate = SETTINGS.gate + SETTINGS.gate_share * faces.distance
+    near = (faces.wall >= 0) & (np.abs(corrected - faces.distance) < gate)
     near &= faces.distance < ring.max_range
     row = row[near]
     return LaserRanges(
@@ -153,12 +161,19 @@ def at_poses_of(laser: LaserRecording, log: Log) -> LaserRecording:
     If the clocks of the two do not overlap, both begin at the same time.
 
     Raises:
-        SonarError: the log has no poses, or the two runs differ in length.
+        SonarError: the log has no poses or no stamps, the recording has no scans, or the two runs differ in length.
     """
     samples = log.pose_samples
     samples = samples[np.isfinite(samples).all(axis=1)]
-    if len(samples) < 2 or not len(laser.stamp):
-        raise SonarError("laser: a log without poses, or a recording without scans, came; allowed are both")
+    samples = samples[np.unique(samples[:, 0], return_index=True)[1]]
+    if not len(laser.stamp):
+        raise SonarError("laser: a recording without scans came; allowed is a recording of the run of the log")
+    if len(samples) < 2:
+        posed, stamped = np.isfinite(log.pose).all(axis=1).sum(), np.isfinite(log.stamp).sum()
+        raise SonarError(
+            f"laser: a log with {len(samples)} poses at different times came ({posed} of {len(log)} scans have a pose, "
+            f"{stamped} a stamp); needed are 2, poses and stamps"
+        )
     time = laser.stamp
     if time[0] > samples[-1, 0] or time[-1] < samples[0, 0]:
         time = time - time[0] + samples[0, 0]

@@ -7,11 +7,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.geometry.se2 import transform_points, unit, wrap_angle
-from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.measured_paths import path_rows
 from jaxsonar.scans.readings import is_repeated, without_readings
 from jaxsonar.scans.scan_log import Log
-from jaxsonar.scans.sliding_windows import has_moved, is_fresh_reading
+from jaxsonar.scans.sliding_windows import independent_measurements
 from jaxsonar.sensors.ring import Ring
 
 
@@ -40,12 +39,15 @@ class WallFaces(NamedTuple):
 
 
 def fresh_readings(ring: Ring, log: Log) -> Log:
-    """The log with new measurements only: without readings that a driver repeats, and without those at rest."""
-    flat, _ = FlatEchoes.from_log(ring, log)
-    kept = is_fresh_reading(flat) & has_moved(log.pose)[flat.scan]
+    """The log with new measurements only: without readings that a driver repeats, and without those at rest.
+
+    Which readings are new is known from their ages or from a list of all measurements, and guessed in other logs
+    (``independent_measurements``).
+    """
+    found = independent_measurements(ring, log)
     removed = np.ones(len(log.range), dtype=bool)
     rows = np.flatnonzero((path_rows(ring, log.tx, log.rx) >= 0) & np.isfinite(log.range) & ~is_repeated(log))
-    removed[rows[kept]] = False
+    removed[rows[found.used]] = False
     return without_readings(log, removed)
 
 

@@ -9,7 +9,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from jaxsonar.calibration.calibration_result import Calibration
-from jaxsonar.calibration.echo_model import EchoModel
+from jaxsonar.calibration.echo_model import EchoStatistics
+from jaxsonar.calibration.robust_statistics import robust_deviation
 from jaxsonar.evaluation.laser_range_fit import LaserRangeFit
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.reports.plot_style import (
@@ -131,7 +132,7 @@ def _draw_binned(
     edges: Float[np.ndarray, " edges"],
 ) -> None:
     """Residuals and their medians in bins, before and after."""
-    limit = _SCATTER_SIGMAS * 1.4826 * float(np.median(np.abs(before - np.median(before)))) if len(before) else 0.01
+    limit = _SCATTER_SIGMAS * robust_deviation(before) if len(before) else 0.01
     limit = 1e3 * max(limit, float(np.abs(np.median(before))) + limit / 2) if len(before) else 10.0
     axes.axhline(0, color=WALL_COLOR, lw=0.8)
     for values, color, name in ((before, CROSS_COLOR, "nominal ring"), (after, DIRECT_COLOR, "calibrated ring")):
@@ -141,14 +142,14 @@ def _draw_binned(
         full = [k for k in range(len(edges) - 1) if (bins == k).sum() >= _MIN_IN_BIN]
         center = [float(np.median(x[bins == k])) for k in full]
         middle = [1e3 * float(np.median(values[bins == k])) for k in full]
-        spread = 1.4826e3 * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
+        spread = 1e3 * robust_deviation(values)
         label = f"{name}: medians; robust sigma {spread:.1f} mm"
         axes.plot(center, middle, "o-", color=color, ms=4, lw=1.4, label=label)
     axes.set(ylabel="reported − expected (mm)", ylim=(-limit, 1.35 * limit))
     axes.legend(loc="upper left", fontsize=8)
 
 
-def _draw_detection(axes: Axes, model: EchoModel) -> None:
+def _draw_detection(axes: Axes, model: EchoStatistics) -> None:
     """Share of walls that are heard over the angle, with the number of measurements."""
     edges, share = np.degrees(model.off_axis), model.detection
     axes.bar(

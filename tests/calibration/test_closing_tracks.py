@@ -122,6 +122,19 @@ def test_the_robust_mean_is_weighted_and_equivariant(rng):
     assert abs(outlying[0] - mean) < error
 
 
+def test_second_echoes_do_not_change_the_tracks():
+    """Every measurement also hears something 0.4 m behind the target; the order of its echoes does not matter."""
+    ring, log = facing_ring(), approach(facing_ring(), 0.96, legs=1, noise=0.003)
+    echo, behind = np.repeat(np.arange(log.echo_count), 2), np.tile([0.4, 0.0], log.echo_count)
+    columns = (log.echo_scan[echo], log.tx[echo], log.rx[echo], log.range[echo] + behind)
+    both = Log.from_echoes(*columns, stamp=log.stamp, pose=log.pose)
+    expected = find_tracks(ring, log)
+    assert len(expected) == ring.count
+    for one, other in zip(expected, find_tracks(ring, both), strict=True):
+        assert one[:2] == other[:2]
+        np.testing.assert_array_equal(one.start, other.start)
+
+
 def test_cross_echoes_and_unposed_scans_are_left_out():
     ring = replace(facing_ring(), neighbors=1)
     log = approach(facing_ring(), 1.0)

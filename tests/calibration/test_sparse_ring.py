@@ -13,7 +13,10 @@ from jaxsonar.calibration.settings import SPARSE_SETTINGS as SETTINGS
 from jaxsonar.calibration.sparse_ring import is_sparse
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.hardware.laser_datasets import read_corridor8_laser
+from jaxsonar.mapping.build_map import build_map
 from jaxsonar.reports.plot_calibration import calibration_figure
+from jaxsonar.scans.sliding_windows import SETTINGS as WINDOWS
+from jaxsonar.scans.sliding_windows import automatic_window
 from jaxsonar.simulation.office import load_office
 
 SCALE, COMMON = 0.96, 0.06
@@ -139,6 +142,19 @@ def test_a_thermometer_is_the_prior_of_the_scale(nominal):
     assert found.speed_of_sound_sd < 0.5
 
 
+@pytest.mark.slow
+def test_a_thermometer_that_the_tracks_contradict_is_reported_and_not_used(nominal, log, found):
+    """The clock of the driver is wrong by 4 %; air of 45 deg C would have the same effect, air of 20 deg C has not."""
+    cool, hot = (calibrate(nominal, log, temperature=temperature) for temperature in (20.0, 45.0))
+    assert "the clock" in cool.held["temperature"]
+    assert any(line.startswith("held: temperature: not used") for line in cool.summary())
+    assert abs(np.log(float(cool.ring.speed_of_sound) / 343.2 * SCALE)) < Z * cool.speed_of_sound_sd / 343.2
+    assert cool.speed_of_sound_sd == pytest.approx(found.speed_of_sound_sd, rel=0.1)
+    for one in (hot, found):
+        assert "temperature" not in one.held
+    assert hot.speed_of_sound_sd < 0.4
+
+
 def test_sparse_and_dense_rings(nominal, log):
     office = load_office()
     assert is_sparse(nominal, [log])
@@ -147,6 +163,23 @@ def test_sparse_and_dense_rings(nominal, log):
     # 24 cones of 60 deg receive a long wall exactly four times.
     direct = replace(office.ring, neighbors=0)
     assert not is_sparse(direct, [simulate(direct, office.room, office.poses).as_log(direct, office.poses)])
+
+
+def test_the_windows_of_maps_are_those_of_slam_and_odometry_is_refused(nominal, log, found):
+    length = automatic_window(nominal, log)
+    assert length == WINDOWS.sparse_length
+    expected = build_map(found.ring, log, window=length)
+    np.testing.assert_array_equal(found.maps[0].segments, expected.segments)
+    with pytest.raises(SonarError, match=r"odometry 0\.1 .*allowed is none"):
+        calibrate(nominal, log, odometry=0.1)
+
+
+@pytest.mark.slow
+def test_a_given_noise_is_that_of_the_maps_and_of_the_fit(nominal, log):
+    found = calibrate(nominal, log, sigma=0.01, window=2.0)
+    assert found.sigma == 0.01
+    expected = build_map(found.ring, log, window=2.0, sigma=0.01)
+    np.testing.assert_array_equal(found.maps[0].segments, expected.segments)
 
 
 def test_logs_without_walls_or_poses_are_refused(nominal, log):

@@ -115,6 +115,24 @@ MISTAKES = {
         {},
         ["--laser", "--window", "allowed"],
     ),
+    "laser with odometry": (
+        "calibrate log.csv --ring faw -o out.toml --laser no --odometry 0.02",
+        {},
+        ["--laser", "--odometry", "allowed"],
+    ),
+    "laser with estimated poses": (
+        "calibrate log.csv --ring faw -o out.toml --laser no --poses estimate",
+        {},
+        ["--laser", "--poses estimate", "allowed"],
+    ),
+    "odometry of a ring with few sensors": (
+        "calibrate few.csv --ring corridor8 -o out.toml --poses estimate --odometry 0.05",
+        {
+            "few.csv": HEADER
+            + "".join(f"{k},{k},{0.05 * k},0,0,{s},{s},{1 + 0.1 * s}\n" for k in range(40) for s in (0, 7))
+        },
+        ["few.csv", "odometry 0.05", "allowed is none"],
+    ),
     "laser with other parameters": (f"{OUT} --laser no", {}, ["--laser", "--free", "allowed"]),
     "figure of unknown suffix": (f"{OUT} --figure a.gif", {}, ["--figure", "a.gif", ".svg"]),
     "figure into a missing folder": (f"{OUT} --figure no/a.svg", {}, ["no/a.svg", "folder"]),

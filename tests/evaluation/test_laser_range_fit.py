@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 from support.recordings import recorded
 
 from jaxsonar import Log, SonarError, load_log, load_ring
@@ -110,10 +111,39 @@ def test_recordings_of_other_runs_are_refused(run):
     ring, log, laser = run
     with pytest.raises(SonarError, match="one run"):
         laser_ranges(ring, log, replace(laser, stamp=1e5 + 3 * laser.stamp))
-    with pytest.raises(SonarError, match="without poses"):
+    with pytest.raises(SonarError, match="0 of 160 scans have a pose"):
         laser_ranges(ring, replace(log, pose=np.full_like(log.pose, np.nan)), laser)
+    with pytest.raises(SonarError, match="0 a stamp"):
+        laser_ranges(ring, replace(log, stamp=np.full(len(log), np.nan)), laser)
     with pytest.raises(SonarError, match="echoes at"):
         fit_ranges_to_laser(ring, replace(log, range=log.range + 1.0), laser)
+    with pytest.raises(SonarError, match="no wall"):
+        laser_ranges(ring, log, replace(laser, ranges=np.full_like(laser.ranges, np.nan)))
+
+
+def test_repeated_and_unsorted_samples_of_the_odometry_do_not_matter(run):
+    _, log, laser = run
+    samples = log.pose_samples
+    mixed = replace(log, odometry=samples[np.random.default_rng(0).permutation(np.repeat(np.arange(len(samples)), 2))])
+    np.testing.assert_allclose(at_poses_of(laser, mixed).pose, log.pose, atol=1e-9)
+
+
+def test_the_robust_sigma_is_about_the_median_of_all_echoes(fit):
+    residual = fit.ranges.residual(fit.nominal)
+    mad = stats.median_abs_deviation(residual, scale=float(stats.norm.ppf(0.75)))
+    assert fit.ranges.robust_sigma(fit.nominal) == pytest.approx(mad, rel=1e-4)
+    # A common offset, however large, does not change it.
+    shifted = replace(fit.nominal, range_offset=np.asarray(fit.nominal.range_offset) - 1.0)
+    assert fit.ranges.robust_sigma(shifted) == pytest.approx(mad, rel=1e-4)
+
+
+def test_echoes_of_a_ring_with_a_wrong_clock_are_gated_like_those_of_a_right_one(run, fit):
+    """Ranges that are longer by 9 % with a ring whose speed of sound says so: the same echoes, the same fit."""
+    ring, log, laser = run
+    longer = replace(log, range=1.09 * log.range)
+    known = fit_ranges_to_laser(replace(ring, speed_of_sound=float(ring.speed_of_sound) / 1.09), longer, laser)
+    np.testing.assert_array_equal(known.ranges.wall, fit.ranges.wall)
+    assert known.scale == pytest.approx(fit.scale, abs=1e-3)
 
 
 def test_the_file_is_a_ring(fit, tmp_path):

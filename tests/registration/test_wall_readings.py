@@ -89,3 +89,33 @@ def test_readings_at_rest_and_repeated_ones_are_left_out(ring):
     np.testing.assert_array_equal(fresh.range, [1.0, 1.1, 1.2, 1.3, 1.4])
     assert len(fresh) == count
     np.testing.assert_allclose(distance_travelled(log), np.minimum(0.05 * np.arange(count), 0.25))
+
+
+def test_every_renewed_reading_of_sensors_that_fire_in_turn_is_kept(ring):
+    """Two sensors are renewed alternately by a slow robot, which reaches a new place in every second scan at most."""
+    count = 20
+    number, pose = np.arange(count), np.zeros((count, 3))
+    pose[:, 0] = 0.006 * number
+    renewed = number[:, None] - (number[:, None] + [0, 1]) % 2  # scan in which each reading was measured
+    age, ranges = 0.1 * (number[:, None] - renewed), np.where([True, False], 1.0, 2.0 - 0.006 * renewed)
+    scan, sensor = np.repeat(number, 2), np.tile([0, 3], count)
+    kept = renewed.ravel() >= 0
+    columns = (column.ravel()[kept] for column in (scan, sensor, sensor, ranges))
+    options = {"age": age.ravel()[kept], "asked": np.zeros((0, 2), int)}
+    log = Log.from_echoes(*columns, **options, stamp=0.1 * number, pose=pose)
+    fresh = fresh_readings(replace(ring, neighbors=0), log)
+    new = log.age == 0
+    assert new.sum() == count
+    np.testing.assert_array_equal(fresh.tx, log.tx[new])
+    np.testing.assert_array_equal(fresh.echo_scan, log.echo_scan[new])
+
+
+def test_every_reading_of_an_explicit_log_is_kept(ring):
+    """A log with silent readings lists its measurements: equal ranges are measurements of their own."""
+    count = 10
+    pose = np.zeros((count, 3))
+    pose[:, 0] = 0.05 * np.arange(count)
+    scan, sensor = np.repeat(np.arange(count), 2), np.tile([0, 3], count)
+    ranges = np.where(sensor == 0, 1.0, np.nan)
+    log = Log.from_echoes(scan, sensor, sensor, ranges, stamp=0.1 * np.arange(count), pose=pose)
+    assert fresh_readings(replace(ring, neighbors=0), log).echo_count == count
