@@ -96,6 +96,13 @@ from .measurement_model import reported_range as reported_range
 from .ml_detection import Detections as Detections
 from .ml_detection import detect_ml as detect_ml
 from .ml_detection_settings import DetectionSettings as DetectionSettings
+from .occupancy_evidence import DIRECTIONS as DIRECTIONS
+from .occupancy_evidence import ArcCells as ArcCells
+from .occupancy_evidence import SeenThrough as SeenThrough
+from .occupancy_evidence import arcs_of_echoes as arcs_of_echoes
+from .occupancy_evidence import expected_echoes as expected_echoes
+from .occupancy_evidence import log_odds as log_odds
+from .occupancy_evidence import seen_through as seen_through
 from .planar_geometry import fold_line as fold_line
 from .planar_geometry import normal as normal
 from .planar_geometry import segment_endpoints as segment_endpoints

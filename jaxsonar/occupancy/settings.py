@@ -1,23 +1,30 @@
 """Numeric settings of occupancy grids. Unless a field says otherwise, its value was chosen by hand on simulations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 
 @dataclass(frozen=True)
-class OccupancySettings:
-    """Inverse sensor model, visibility of known walls, and the grid."""
+class BayesSettings:
+    """Parameters of one Bayesian grid; trained on random rooms by ``benchmarks.mapping.occupancy_grids --train``."""
 
-    range_margin: float = 0.04
-    """Cells closer to the echo than this are not counted as free, metres; covers errors of ranges and poses."""
-    certain: float = 2 / 3
-    """Fraction of the cone in which a missing echo counts as free space. Toward the border a sensor hears only large
-    walls: a cone ends where the one-way gain is 6 dB lower, 12 dB in both ways; over the inner two thirds the loss is
-    5 dB."""
-    shadow: float = float(np.radians(15.0))
-    """Angle on each side of the cone that an unexplained echo occludes as well, radians. It may come from something as
-    wide as a wall, which an oblique beam would not hear."""
+    occupied: float
+    """Log-odds, or number of explained echoes, from which a cell is occupied."""
+    missed: float
+    """Log-odds, or expected echoes, of a look that heard nothing nearer."""
+    prior: float = 0.05
+    """Log-odds: probability that a cell is occupied."""
+    detected: float = 0.9
+    """Log-odds: probability that a look at an occupied cell brings an echo."""
+    false: float = 0.05
+    """Log-odds: probability of an echo without a reflector."""
+
+
+@dataclass(frozen=True)
+class ReflectorSettings:
+    """Known reflectors: which echoes they explain, and which of their parts are drawn."""
+
     explained: float = 0.08
     """An echo within this distance of the range of a known wall, wall end or corner is attributed to it, metres."""
     beyond_end: float = 0.3
@@ -25,23 +32,91 @@ class OccupancySettings:
     footpoint (paper, section 5)."""
     beyond_cone: float = float(np.radians(5.0))
     """A wall is strong enough to be detected this far outside the cone, radians."""
-    max_extension: float = 1.0
-    """Length by which a wall may extend beyond its end, and occlude what is behind, where no sensor could hear it,
-    metres."""
-    touches: float = 0.05
+    drawn_sd: float = 2.0
+    """Walls and points are drawn this many standard deviations wide."""
+    max_drawn: float = 0.15
+    """... but at most this far to each side, metres."""
+    min_looks: int = 2
+    """Readings that must look through a part of a wall, or of its extension, to show that there is none."""
+    window: int = 2
+    """Cells on each side, along a wall, whose readings are taken together."""
+    max_extension: float = 3.0
+    """Length by which a wall may go on, unseen, beyond its ends, metres."""
+    touches: float = 0.1
     """A wall whose end is this close to another wall ends there, metres."""
-    no_wall: float = 0.2
-    """If a sensor should detect a wall and does not, there is none within this distance of its footpoint, metres."""
-    footprint_weight: int = 20
-    """Number of free beams that the robot's own footprint counts as: the robot stood there."""
+
+
+@dataclass(frozen=True)
+class FreeSpaceSettings:
+    """Which cells are free."""
+
+    certain: float = 2 / 3
+    """Fraction of the cone in which a missing echo counts as free space. Toward the border a sensor hears only large
+    walls: a cone ends where the one-way gain is 6 dB lower, 12 dB in both ways; over the inner two thirds the loss is
+    5 dB."""
+    reach: float = 0.95
+    """Fraction of the maximum range up to which silence clears cells."""
+    range_margin: float = 0.04
+    """Cells closer to the echo than this are not counted as free, metres; covers errors of ranges and poses."""
+    min_looks: int = 2
+    """Scans that must have looked through a cell in a direction to exclude walls of this direction."""
+    spread: int = 4
+    """Cells on each side, along a wall, whose looks exclude it: walls are longer than a cell."""
+    min_excluded: float = 0.4
+    """Share of the wall directions that must be excluded in a free cell; in a building of right angles, one of two."""
+    max_evidence: float = 0.5
+    """Evidence of an obstacle up to which a cell can be free, as a fraction of that of an occupied cell."""
+    uniform: float = 0.15
+    """Part of the distribution of wall directions that does not follow the known walls."""
+
+
+@dataclass(frozen=True)
+class OccupancySettings:
+    """Bayesian models, known reflectors, free space, and the grid."""
+
+    elfes: BayesSettings = BayesSettings(occupied=2.0, missed=0.1, prior=0.01)
+    """Log-odds of first direct echoes."""
+    wilkes: BayesSettings = BayesSettings(occupied=1.5, missed=0.02, prior=0.03)
+    """Log-odds of all direct echoes."""
+    logodds: BayesSettings = BayesSettings(occupied=2.0, missed=0.1, prior=0.1)
+    """Log-odds of all direct and cross echoes."""
+    em: BayesSettings = BayesSettings(occupied=0.15, missed=0.15)
+    """Expectation maximization."""
+    counts: BayesSettings = BayesSettings(occupied=1.0, missed=0.15)
+    """Expectation maximization of the echoes that no known reflector explains."""
+    rounds: int = 10
+    """Iterations of the expectation maximization."""
+    clutter: float = 0.02
+    """Expected number of echoes of an arc without a reflector."""
+    arc_share: float = 0.005
+    """Exposure by an echo from the cell's own distance, in looks."""
+    reflectors: ReflectorSettings = field(default_factory=ReflectorSettings)
+    """Known walls and points."""
+    free: FreeSpaceSettings = field(default_factory=FreeSpaceSettings)
+    """Free cells."""
+    min_weight: float = 0.1
+    """Least weight of a cell on an arc that counts as a viewpoint."""
+    free_threshold: float = 0.196
+    """Probability below which Nav2's map_server takes a cell as free; that of map_saver. With Nav2's older 0.25, the
+    grey of unknown cells would be read as free (navigation2, pull request 5278)."""
+    occupied_threshold: float = 0.65
+    """Probability above which it takes a cell as occupied."""
+    min_viewpoints: int = 2
+    """Number of viewpoints, 0.2 m apart, from which an obstacle must be observed."""
     viewpoint_cell: float = 0.2
     """Side of the cells that distinguish viewpoints, metres; they form a pattern of 4 x 4 that repeats."""
     max_wall_coordinate: float = 10_000.0
     """Largest coordinate of a known wall, metres."""
     max_range_cells: int = 400
     """Largest maximum range, in cells: 20 m at 0.05 m."""
-    max_cells: int = 50_000_000
-    """Largest grid, in cells: 350 m x 350 m at 0.05 m. More indicates a wrong pose or resolution."""
+    max_cells: int = 20_000_000
+    """Largest grid, in cells: 220 m x 220 m at 0.05 m. More indicates a wrong pose or resolution."""
+    arc_cell: tuple[float, float, float] = (0.1, float(np.radians(7.5)), 0.025)
+    """Echoes of a path that agree in position (m), direction (rad) and range (m) up to these cells are one arc."""
+    max_echoes: int = 2
+    """An arc counts as this many echoes at most: echoes from the same viewpoint are not independent."""
+    max_arcs: int = 200_000
+    """Largest number of arcs that are kept for the expectation maximization."""
 
 
 SETTINGS = OccupancySettings()

@@ -1,0 +1,299 @@
+"""Known walls and points: which echoes they explain, which of their parts later readings refute, and what they hide."""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxsonar.geometry.se2 import unit, wrap_angle
+from jaxsonar.geometry.segments import crossings, lengths, point_to_segments, sample_segments
+from jaxsonar.occupancy.settings import SETTINGS
+
+_WALLS = SETTINGS.reflectors
+
+
+class ReflectorMap(Protocol):
+    """What a grid uses of a map, such as ``GlobalMap``."""
+
+    @property
+    def segments(self) -> Float[np.ndarray, "walls 2 2"]:
+        """End points of the walls, world frame, metres."""
+        ...
+
+    @property
+    def theta(self) -> Float[np.ndarray, " walls"]:
+        """Directions of their normals, radians."""
+        ...
+
+    @property
+    def sigma_rho(self) -> Float[np.ndarray, " walls"]:
+        """Standard deviations of their distances from the origin, metres; NaN if unknown."""
+        ...
+
+    @property
+    def sigma_theta(self) -> Float[np.ndarray, " walls"]:
+        """Standard deviations of the directions, radians; NaN if unknown."""
+        ...
+
+    @property
+    def points(self) -> Float[np.ndarray, "points 2"]:
+        """Corners and edges, metres."""
+        ...
+
+    @property
+    def point_cov(self) -> Float[np.ndarray, "points 2 2"]:
+        """Their covariances, square metres; NaN if unknown."""
+        ...
+
+
+class KnownReflectors(NamedTuple):
+    """Walls and points of a map, with standard deviations."""
+
+    walls: Float[np.ndarray, "walls 2 2"]
+    """Start and end points, world frame, metres."""
+    wall_sd: Float[np.ndarray, "walls 2"]
+    """Standard deviation across the wall at its start and its end, metres."""
+    points: Float[np.ndarray, "points 2"]
+    """Corners and edges, metres."""
+    point_sd: Float[np.ndarray, " points"]
+    """Largest standard deviation of each point, metres."""
+
+    @classmethod
+    def of_walls(cls, walls: Float[np.ndarray, "walls 2 2"]) -> "KnownReflectors":
+        """Exact walls without points. Walls without length are left out."""
+        walls = walls[lengths(walls) > 0]
+        return cls(walls, np.zeros((len(walls), 2)), np.zeros((0, 2)), np.zeros(0))
+
+    @classmethod
+    def of_map(cls, world: ReflectorMap) -> "KnownReflectors":
+        """Walls and points of a map. Standard deviations that are unknown count as 0."""
+        keep = lengths(world.segments) > 0
+        walls, theta = world.segments[keep], world.theta[keep]
+        sd_rho, sd_theta = np.nan_to_num(world.sigma_rho[keep]), np.nan_to_num(world.sigma_theta[keep])
+        # rho belongs to the foot of the world's origin: its error contains that of the direction, by this lever arm.
+        tangent = np.stack([-np.sin(theta), np.cos(theta)], axis=-1)
+        lever = (walls.mean(axis=1) * tangent).sum(-1) * sd_theta
+        middle = np.sqrt(np.maximum(sd_rho**2 - lever**2, 0))
+        sd = np.hypot(middle, lengths(walls) / 2 * sd_theta)
+        covariance = np.nan_to_num(world.point_cov)
+        point_sd = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0)) if len(covariance) else np.zeros(0)
+        return cls(walls, np.stack([sd, sd], axis=-1), world.points, point_sd)
+
+    def near(self, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]) -> "KnownReflectors":
+        """The reflectors that may be in a box, metres."""
+        wall = ((self.walls.max(axis=1) >= low) & (self.walls.min(axis=1) <= high)).all(axis=1)
+        point = ((self.points >= low) & (self.points <= high)).all(axis=1)
+        return KnownReflectors(self.walls[wall], self.wall_sd[wall], self.points[point], self.point_sd[point])
+
+    def reflecting_points(self) -> Float[np.ndarray, "points 2"]:
+        """Points, wall ends, and crossings of walls that go on a little beyond their ends, metres."""
+        length = lengths(self.walls)
+        fraction, other = crossings(self.walls, self.walls)
+        spare = _WALLS.beyond_end / length[:, None]
+        meet = np.triu((np.abs(fraction - 0.5) <= 0.5 + spare) & (np.abs(other - 0.5) <= 0.5 + spare.T))
+        first, _ = np.nonzero(meet)
+        corners = self.walls[first, 0] + fraction[meet][:, None] * (self.walls[first, 1] - self.walls[first, 0])
+        return np.concatenate([self.points, self.walls.reshape(-1, 2), corners])
+
+    def cells(self, resolution: float) -> Int[np.ndarray, "cells 2"]:
+        """Cells (column, row) of the world that the reflectors cover, with their uncertainty, without repetition."""
+        length = lengths(self.walls)
+        # Samples a quarter of a cell apart miss at most a clipped corner of a cell.
+        samples = (4 * length / resolution).astype(int) + 2
+        points, row = sample_segments(self.walls, samples)
+        fraction = np.concatenate([np.linspace(0, 1, n) for n in samples]) if len(samples) else np.zeros(0)
+        sd = self.wall_sd[row, 0] * (1 - fraction) + self.wall_sd[row, 1] * fraction
+        points, sd = np.concatenate([points, self.points]), np.concatenate([sd, self.point_sd])
+        radius = np.minimum(_WALLS.drawn_sd * sd, _WALLS.max_drawn) / resolution
+        center = np.floor(points / resolution).astype(int)
+        found = [center]
+        reach = int(np.ceil(radius.max(initial=0)))
+        for column in range(-reach, reach + 1):
+            for line in range(-reach, reach + 1):
+                cell = center + [column, line]
+                inside = np.linalg.norm(cell + 0.5 - points / resolution, axis=-1) <= radius
+                found.append(cell[inside])
+        return np.unique(np.concatenate(found), axis=0)
+
+
+class WallProfile(NamedTuple):
+    """Which parts of walls and of their extensions exist, according to all readings."""
+
+    parts: KnownReflectors
+    """The walls without the parts that readings looked through, and all points."""
+    extensions: Float[np.ndarray, "extensions 2 2"]
+    """Segments along which a wall may go on unseen, metres."""
+
+
+def profile_walls(
+    known: KnownReflectors,
+    position: Float[np.ndarray, "readings 2"],
+    heading: Float[np.ndarray, " readings"],
+    certain: Float[np.ndarray, " readings"],
+    first_echo: Float[np.ndarray, " readings"],
+    driven: Float[np.ndarray, "poses 2"],
+    *,
+    max_range: float,
+    resolution: float,
+) -> WallProfile:
+    """Test every part of every wall, and of its extensions, with the readings that face it.
+
+    A reading faces the part of a wall that holds its footpoint. It confirms the part with an echo from there, and
+    refutes it with a later echo or none. An open door stays open for a robot that looks through it at a right angle,
+    or drives through it.
+
+    Args:
+        known: the map.
+        position: of the sensors, world frame, metres.
+        heading: of the sensors, radians.
+        certain: half of the part of each cone in which a wall is heard for sure, radians.
+        first_echo: range up to which each sensor heard nothing, metres.
+        driven: positions of the robot, metres.
+        max_range: metres.
+        resolution: side of a cell, metres.
+    """
+    walls, length = known.walls, lengths(known.walls)
+    if not len(walls):
+        return WallProfile(known, np.zeros((0, 2, 2)))
+    beyond = int(np.ceil(_WALLS.max_extension / resolution))
+    bins = np.ceil(length / resolution).astype(int) + 2 * beyond
+    confirmed, refuted = (np.zeros((len(walls), bins.max()), np.int64) for _ in range(2))
+    tangent = (walls[:, 1] - walls[:, 0]) / length[:, None]
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
+    rows = max(1, 2_000_000 // len(walls))
+    for begin in range(0, len(position), rows):
+        here = slice(begin, begin + rows)
+        offset = position[here, None] - walls[:, 0]
+        height, along = (offset * normal).sum(-1), (offset * tangent).sum(-1)
+        toward = np.arctan2(-normal[:, 1], -normal[:, 0]) + np.where(height < 0, np.pi, 0)
+        off_axis = np.abs(wrap_angle(toward - heading[here, None]))
+        cell = np.floor(along / resolution).astype(int) + beyond
+        facing = (off_axis <= certain[here, None]) & (np.abs(height) < max_range) & (cell >= 0) & (cell < bins)
+        reading, wall = np.nonzero(facing & (first_echo[here, None] > np.abs(height) - _WALLS.explained))
+        if not len(reading):
+            continue
+        # Another wall in between hides the part.
+        start = position[here][reading]
+        foot = start - height[reading, wall][:, None] * normal[wall]
+        hidden = _is_hidden(start, foot, wall, walls)
+        reading, wall = reading[~hidden], wall[~hidden]
+        passed = first_echo[here][reading] > np.abs(height[reading, wall]) + _WALLS.explained
+        for counts, some in ((refuted, passed), (confirmed, ~passed)):
+            np.add.at(counts, (wall[some], cell[reading[some], wall[some]]), 1)
+    for wall in range(len(walls)):  # where the robot drove, there is no wall
+        offset = driven - walls[wall, 0]
+        near = np.abs(offset @ normal[wall]) <= resolution
+        cell = np.floor((offset[near] @ tangent[wall]) / resolution).astype(int) + beyond
+        cell = cell[(cell >= 0) & (cell < bins[wall])]
+        refuted[wall, cell] += 1_000
+    kernel = np.ones(2 * _WALLS.window + 1, np.int64)
+    refuted, confirmed = (np.apply_along_axis(np.convolve, 1, counts, kernel, "same") for counts in (refuted, confirmed))
+    open_ = (refuted >= _WALLS.min_looks) & (refuted > 2 * confirmed)
+    parts, sd, extensions = [], [], []
+    for wall in range(len(walls)):
+        inside = np.zeros(bins[wall], bool)
+        inside[beyond : bins[wall] - beyond] = True
+        kept = inside & ~open_[wall, : bins[wall]]
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], kept.astype(int), [0]])))
+        for first, last in edges.reshape(-1, 2):
+            ends = np.clip((np.array([first, last]) - beyond) * resolution, 0, length[wall])
+            if ends[1] > ends[0]:
+                parts.append(walls[wall, 0] + ends[:, None] * tangent[wall])
+                fraction = ends / length[wall]
+                sd.append(known.wall_sd[wall, 0] * (1 - fraction) + known.wall_sd[wall, 1] * fraction)
+        before = np.flatnonzero(open_[wall, :beyond])
+        after = np.flatnonzero(open_[wall, bins[wall] - beyond : bins[wall]])
+        reach = (
+            (beyond - 1 - before[-1]) * resolution if len(before) else _WALLS.max_extension,
+            after[0] * resolution if len(after) else _WALLS.max_extension,
+        )
+        for side, end in enumerate(reach):
+            outward = tangent[wall] if side else -tangent[wall]
+            extensions.append(np.stack([walls[wall, side], walls[wall, side] + end * outward]))
+    found = KnownReflectors(
+        np.array(parts).reshape(-1, 2, 2), np.array(sd).reshape(-1, 2), known.points, known.point_sd
+    )
+    return WallProfile(found, _shortened(np.array(extensions), walls))
+
+
+def explained_by_reflectors(
+    known: KnownReflectors,
+    position: Float[np.ndarray, "echoes 2 2"],
+    heading: Float[np.ndarray, "echoes 2"],
+    half_width: Float[np.ndarray, "echoes 2"],
+    distance: Float[np.ndarray, " echoes"],
+) -> Bool[np.ndarray, " echoes"]:
+    """Which echoes have the range of a known wall, wall end, corner or point within both cones.
+
+    Args:
+        known: the map around the echoes.
+        position: of transmitter and receiver of each echo, world frame, metres.
+        heading: of both, radians.
+        half_width: of their cones, radians.
+        distance: half path length, metres.
+    """
+    walls, points = known.walls, known.reflecting_points()
+    middle, half = position.mean(axis=1), (position[:, 1] - position[:, 0]) / 2
+    length = lengths(walls)
+    tangent = (walls[:, 1] - walls[:, 0]) / np.maximum(length, 1e-9)[:, None]
+    offset = middle[:, None] - walls[:, 0]
+    height = np.abs(offset[..., 0] * tangent[:, 1] - offset[..., 1] * tangent[:, 0])
+    along = (offset * tangent).sum(-1)
+    expected = np.hypot(height, half @ tangent.T)
+    foot = walls[:, 0] + along[..., None] * tangent
+    on_wall = np.abs(along - length / 2) <= length / 2 + _WALLS.beyond_end
+    to_point = np.linalg.norm(points - position[:, :, None], axis=-1).mean(axis=1)
+    match = np.concatenate([np.where(on_wall, expected, np.inf), to_point], axis=1)
+    match = np.abs(match - distance[:, None]) <= _WALLS.explained
+    target = np.concatenate([foot, np.broadcast_to(points, (len(foot), *points.shape))], axis=1)
+    seen = np.ones(match.shape, bool)
+    for end in (0, 1):
+        ray = target - position[:, None, end]
+        off_axis = np.abs(wrap_angle(np.arctan2(ray[..., 1], ray[..., 0]) - heading[:, end, None]))
+        seen &= off_axis <= half_width[:, end, None] + _WALLS.beyond_cone
+    return (match & seen).any(axis=1)
+
+
+def direction_of(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, " walls"]:
+    """Directions of the normals of walls, radians."""
+    along = walls[:, 1] - walls[:, 0]
+    return np.arctan2(along[:, 0], -along[:, 1])
+
+
+def _is_hidden(
+    start: Float[np.ndarray, "rays 2"],
+    end: Float[np.ndarray, "rays 2"],
+    wall: Int[np.ndarray, " rays"],
+    walls: Float[np.ndarray, "walls 2 2"],
+) -> Bool[np.ndarray, " rays"]:
+    """Whether a wall other than the ray's own lies between its start and its end."""
+    hidden = np.zeros(len(start), bool)
+    rows = max(1, 1_000_000 // max(len(walls), 1))
+    for begin in range(0, len(start), rows):
+        here = slice(begin, begin + rows)
+        rays = np.stack([start[here], end[here]], axis=1)
+        fraction, other = crossings(rays, walls)
+        blocks = (fraction > 0) & (fraction < 0.98) & (other >= 0) & (other <= 1)
+        blocks[np.arange(len(rays)), wall[here]] = False
+        hidden[here] = blocks.any(axis=1)
+    return hidden
+
+
+def _shortened(
+    extensions: Float[np.ndarray, "extensions 2 2"], walls: Float[np.ndarray, "walls 2 2"]
+) -> Float[np.ndarray, "extensions 2 2"]:
+    """Extensions up to the first wall that they meet, without those that have no length."""
+    length = lengths(extensions)
+    own = np.arange(len(extensions)) // 2
+    gap = point_to_segments(extensions[:, 0], walls)
+    gap[np.arange(len(own)), own] = np.inf
+    length = np.where(gap.min(axis=1, initial=np.inf) <= _WALLS.touches, 0, length)
+    direction = unit(np.arctan2(*(extensions[:, 1] - extensions[:, 0]).T[::-1]))
+    long = np.stack([extensions[:, 0], extensions[:, 0] + direction], axis=1)
+    fraction, other = crossings(long, walls)
+    spare = _WALLS.touches / np.maximum(lengths(walls), 1e-9)
+    meets = (fraction > 0) & (other >= -spare) & (other <= 1 + spare)
+    meets[np.arange(len(own)), own] = False
+    length = np.minimum(length, np.where(meets, fraction, np.inf).min(axis=1, initial=np.inf))
+    extensions = np.stack([extensions[:, 0], extensions[:, 0] + length[:, None] * direction], axis=1)
+    return extensions[length > 1e-6]
