@@ -14,7 +14,14 @@ from jaxsonar.kernels.shape_buckets import bucket_size, next_power_of_two, pad_r
 from jaxsonar.occupancy.direct_readings import DirectReadings, TransducerArrays
 from jaxsonar.occupancy.echo_arcs import arc_table
 from jaxsonar.occupancy.grid_evidence import METHODS, GridEvidence, GridMethod
-from jaxsonar.occupancy.known_reflectors import KnownReflectors, WallProfile, direction_of, profile_walls
+from jaxsonar.occupancy.known_reflectors import (
+    FacingReadings,
+    KnownReflectors,
+    WallProfile,
+    direction_of,
+    hidden_walls,
+    profile_walls,
+)
 from jaxsonar.occupancy.settings import SETTINGS, BayesSettings
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import group_firings
@@ -101,31 +108,29 @@ def occupancy(
     known = walls if isinstance(walls, KnownReflectors) else KnownReflectors.of_walls(_checked(walls))
     log = group_firings(log)
     evidence = GridEvidence(ring, resolution=resolution, method=method)
-    profile = reading_profile(ring, log, known, resolution=resolution)
+    readings = facing_readings(ring, log)
+    profile = profile_walls(known, readings, resolution=resolution)
     evidence.add(log, profile.parts)
-    return assemble_grid(evidence, profile)
+    return assemble_grid(evidence, profile, readings)
 
 
-def reading_profile(ring: Ring, log: Log, known: KnownReflectors, *, resolution: float) -> WallProfile:
-    """``profile_walls`` with the direct readings of a log; scans without a pose are skipped."""
+def facing_readings(ring: Ring, log: Log) -> FacingReadings:
+    """The direct readings of a log; scans without a pose are skipped."""
     sensors, readings = TransducerArrays.of(ring), DirectReadings.of(ring, log)
     posed = np.isfinite(log.pose).all(axis=-1)
     used = readings.measured & posed[:, None]
-    robot, sensor = readings.robot[used], np.nonzero(used)[1]
-    first = readings.first_echo[used]
-    return profile_walls(
-        known,
+    robot, sensor, first = readings.robot[used], np.nonzero(used)[1], readings.first_echo[used]
+    return FacingReadings(
         transform_points(robot, sensors.position[sensor]),
         sensors.heading[sensor] + robot[:, 2],
         SETTINGS.free.certain * sensors.half_width[sensor],
         np.where(np.isfinite(first), first, SETTINGS.free.reach * ring.max_range),
         log.pose[posed, :2],
-        max_range=ring.max_range,
-        resolution=resolution,
+        ring.max_range,
     )
 
 
-def assemble_grid(evidence: GridEvidence, profile: WallProfile) -> OccupancyGrid:
+def assemble_grid(evidence: GridEvidence, profile: WallProfile, readings: FacingReadings) -> OccupancyGrid:
     """The grid of what was accumulated, with known reflectors drawn into it."""
     area, resolution = evidence.area, evidence.resolution
     if not evidence.looks.size:
@@ -145,8 +150,11 @@ def assemble_grid(evidence: GridEvidence, profile: WallProfile) -> OccupancyGrid
     occupied = (walls & reached) | obstacle
     # Free: the likely directions of walls are excluded. Walls may go on, unseen, along their extensions.
     free = _excluded_share(evidence.passes, profile.parts.walls, resolution) >= SETTINGS.free.min_excluded
-    hidden = area.mask(KnownReflectors.of_walls(profile.extensions).cells(resolution))
-    free = (free & ~hidden & (found <= SETTINGS.free.max_evidence * parameters.occupied) | robot) & ~occupied
+    unseen = [profile.extensions, hidden_walls(profile.parts, _centers(obstacle, evidence), readings, resolution=resolution)]
+    hidden = area.mask(KnownReflectors.of_walls(np.concatenate(unseen)).cells(resolution))
+    beside = ndimage.binary_dilation(occupied | hidden, np.ones((3, 3)))
+    unclear = found > SETTINGS.free.max_evidence * parameters.occupied
+    free = (free & ~beside & ~unclear | robot) & ~occupied
     # Free cells that are not connected to where the robot drove are errors, or lie behind an unmapped wall.
     region, _ = ndimage.label(free)
     free &= np.isin(region, np.unique(region[robot & free]))
@@ -205,6 +213,13 @@ def _obstacle_evidence(
     return np.asarray(found)[:cells].reshape(area.shape), counts.reshape(area.shape)
 
 
+def _centers(obstacle: Bool[np.ndarray, "rows columns"], evidence: GridEvidence) -> Float[np.ndarray, "obstacles 2"]:
+    """Centers of connected obstacles, metres."""
+    region, count = ndimage.label(obstacle, np.ones((3, 3)))
+    row_column = np.array(ndimage.center_of_mass(obstacle, region, np.arange(1, count + 1))).reshape(-1, 2)
+    return (row_column[:, ::-1] + evidence.area.corner + 0.5) * evidence.resolution
+
+
 def _excluded_share(
     passes: np.ndarray, walls: Float[np.ndarray, "walls 2 2"], resolution: float
 ) -> Float[np.ndarray, "rows columns"]:
@@ -237,10 +252,14 @@ def _direction_shares(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray
         position = direction_of(walls) * (count / np.pi)
         low = np.floor(position).astype(int)
         found = np.zeros(count)
+        weight = lengths(walls)
         for turn in (0, count // 2):
             for offset, part in ((0, 1 - (position - low)), (1, position - low)):
-                np.add.at(found, (low + offset + turn) % count, part * lengths(walls))
-        share = SETTINGS.free.uniform * share + (1 - SETTINGS.free.uniform) * found / found.sum()
+                np.add.at(found, (low + offset + turn) % count, part * weight)
+        # Where the known walls are not at right angles to each other, unknown walls may have any direction.
+        regular = float(np.abs((weight * np.exp(4j * direction_of(walls))).sum()) / weight.sum())
+        uniform = max(1 - regular, SETTINGS.free.uniform)
+        share = uniform * share + (1 - uniform) * found / found.sum()
     return share
 
 

@@ -42,6 +42,8 @@ class ReflectorSettings:
     """Cells on each side, along a wall, whose readings are taken together."""
     max_extension: float = 3.0
     """Length by which a wall may go on, unseen, beyond its ends, metres."""
+    max_hidden: float = 0.7
+    """Distance up to which two edges may belong to one wall that no sensor has faced, metres."""
     touches: float = 0.1
     """A wall whose end is this close to another wall ends there, metres."""
 
@@ -50,7 +52,7 @@ class ReflectorSettings:
 class FreeSpaceSettings:
     """Which cells are free."""
 
-    certain: float = 2 / 3
+    certain: float = 0.5
     """Fraction of the cone in which a missing echo counts as free space. Toward the border a sensor hears only large
     walls: a cone ends where the one-way gain is 6 dB lower, 12 dB in both ways; over the inner two thirds the loss is
     5 dB."""
@@ -60,7 +62,7 @@ class FreeSpaceSettings:
     """Cells closer to the echo than this are not counted as free, metres; covers errors of ranges and poses."""
     min_looks: int = 2
     """Scans that must have looked through a cell in a direction to exclude walls of this direction."""
-    spread: int = 4
+    spread: int = 0
     """Cells on each side, along a wall, whose looks exclude it: walls are longer than a cell."""
     min_excluded: float = 0.4
     """Share of the wall directions that must be excluded in a free cell; in a building of right angles, one of two."""
@@ -82,7 +84,7 @@ class OccupancySettings:
     """Log-odds of all direct and cross echoes."""
     em: BayesSettings = BayesSettings(occupied=0.15, missed=0.15)
     """Expectation maximization."""
-    counts: BayesSettings = BayesSettings(occupied=1.0, missed=0.15)
+    counts: BayesSettings = BayesSettings(occupied=1.5, missed=0.15)
     """Expectation maximization of the echoes that no known reflector explains."""
     rounds: int = 10
     """Iterations of the expectation maximization."""
