@@ -154,7 +154,9 @@ def assemble_grid(evidence: GridEvidence, profile: WallProfile, readings: Facing
     hidden = area.mask(KnownReflectors.of_walls(np.concatenate(unseen)).cells(resolution))
     beside = ndimage.binary_dilation(occupied | hidden, np.ones((3, 3)))
     unclear = found > SETTINGS.free.max_evidence * parameters.occupied
-    free = (free & ~beside & ~unclear | robot) & ~occupied
+    # Thin needles of free cells are single readings: no robot fits there.
+    free = ndimage.binary_opening(free & ~beside & ~unclear | robot, np.ones((3, 3)))
+    free = (free | robot) & ~occupied
     # Free cells that are not connected to where the robot drove are errors, or lie behind an unmapped wall.
     region, _ = ndimage.label(free)
     free &= np.isin(region, np.unique(region[robot & free]))

@@ -52,7 +52,7 @@ class ReflectorSettings:
 class FreeSpaceSettings:
     """Which cells are free."""
 
-    certain: float = 0.5
+    certain: float = 0.6
     """Fraction of the cone in which a missing echo counts as free space. Toward the border a sensor hears only large
     walls: a cone ends where the one-way gain is 6 dB lower, 12 dB in both ways; over the inner two thirds the loss is
     5 dB."""
