@@ -107,10 +107,17 @@ class GridEvidence:
         """Looks through each cell, in 1/16, weighted by the angle off the axis."""
         self.footprint: Int[np.ndarray, "rows columns"] = np.zeros((0, 0), np.int32)
         """Scans in which the robot stood on each cell."""
-        self.arcs = EchoArcs.empty()
-        """Echoes that are to be explained."""
         self.scans = self.skipped = 0
         """Scans in the grid, and scans that were left out because they have no pose."""
+        self._arcs, self._new_arcs = EchoArcs.empty(), list[EchoArcs]()
+
+    @property
+    def arcs(self) -> EchoArcs:
+        """Echoes that are to be explained."""
+        if self._new_arcs:
+            self._arcs = EchoArcs.concatenate([self._arcs, *self._new_arcs]).thinned(self.ring)
+            self._new_arcs = []
+        return self._arcs
 
     def add(self, log: Log, known: KnownReflectors) -> None:
         """Add the scans of a log.
@@ -235,7 +242,9 @@ class GridEvidence:
         arcs = EchoArcs(pose, flat.path[rows], distance[rows], np.ones(len(rows), np.int64))
         if self.method == "counts":
             arcs = self._unexplained(arcs, known)
-        self.arcs = EchoArcs.concatenate([self.arcs, arcs]).thinned(ring)
+        self._new_arcs.append(arcs)
+        if sum(len(part.path) for part in self._new_arcs) > SETTINGS.max_arcs:
+            _ = self.arcs  # thin them now
 
     def _unexplained(self, arcs: EchoArcs, known: KnownReflectors) -> EchoArcs:
         """The arcs that no known reflector explains."""

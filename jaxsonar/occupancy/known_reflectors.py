@@ -1,5 +1,6 @@
 """Known walls and points: which echoes they explain, which of their parts later readings refute, and what they hide."""
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -132,6 +133,17 @@ class FacingReadings(NamedTuple):
     """Positions of the robot, metres."""
     max_range: float
     """Metres."""
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["FacingReadings"], max_range: float) -> "FacingReadings":
+        """All readings of several collections, possibly of none."""
+        empty = cls(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 2)), max_range)
+        columns = zip(*(part[:-1] for part in (empty, *parts)), strict=True)
+        return cls(*(np.concatenate(column) for column in columns), max_range)
+
+    def latest(self, count: int) -> "FacingReadings":
+        """The latest readings and positions, at most this many of each."""
+        return FacingReadings(*(column[-count:] for column in self[:-1]), self.max_range)
 
 
 class WallProfile(NamedTuple):

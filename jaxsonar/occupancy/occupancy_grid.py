@@ -7,25 +7,19 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 
 from jaxsonar import kernels
-from jaxsonar.geometry.se2 import tangent_of, transform_points
+from jaxsonar.geometry.se2 import tangent_of
 from jaxsonar.geometry.segments import lengths
-from jaxsonar.hardware.errors import SonarError
 from jaxsonar.kernels.shape_buckets import bucket_size, next_power_of_two, pad_rows
-from jaxsonar.occupancy.direct_readings import DirectReadings, TransducerArrays
 from jaxsonar.occupancy.echo_arcs import arc_table
-from jaxsonar.occupancy.grid_evidence import METHODS, GridEvidence, GridMethod
+from jaxsonar.occupancy.grid_evidence import GridEvidence
 from jaxsonar.occupancy.known_reflectors import (
     FacingReadings,
     KnownReflectors,
     WallProfile,
     direction_of,
     hidden_walls,
-    profile_walls,
 )
 from jaxsonar.occupancy.settings import SETTINGS, BayesSettings
-from jaxsonar.scans.scan_log import Log
-from jaxsonar.scans.single_firings import group_firings
-from jaxsonar.sensors.ring import Ring
 
 OCCUPIED, UNKNOWN, FREE = 0, 205, 254
 """Grey values of map_server's trinary images."""
@@ -74,62 +68,6 @@ class OccupancyGrid:
         return image[::-1]
 
 
-def occupancy(
-    ring: Ring,
-    log: Log,
-    *,
-    walls: Float[np.ndarray, "walls 2 2"] | KnownReflectors = NO_WALLS,
-    resolution: float = 0.05,
-    method: GridMethod = "counts",
-) -> OccupancyGrid:
-    """The occupancy grid of a log.
-
-    A cell is free if readings exclude walls of the likely directions in it, or if the robot stood there: a sensor that
-    heard nothing nearer excludes walls that face it, and no others. A sensor that a scan did not measure is no evidence
-    (``measured_paths``). Every reading counts at the pose of the robot when it was measured. Firings that stand in
-    scans of their own are grouped (``group_firings``).
-
-    Args:
-        ring: the sensors.
-        log: scans; those without a pose are counted and skipped.
-        walls: what is known, world frame, metres: end points of walls, or walls and points with their uncertainty.
-        resolution: side of a cell, metres.
-        method: how echoes become obstacles. "counts": echoes that no known reflector explains, each shared among the
-            cells of its arc by expectation maximization. "em": the same with all echoes. "logodds": log-odds of
-            independent cells from all direct and cross echoes. "wilkes": from all direct echoes (Wilkes et al.).
-            "elfes": from the first direct echo of each sensor (Matthies and Elfes 1988).
-
-    Raises:
-        SonarError: poses too far apart, or cells too small, for a grid; a wall that is not finite; a sensor number that
-            the ring does not have; an unknown method.
-    """
-    if method not in METHODS:
-        raise SonarError(f"grid: method {method!r}; allowed are {', '.join(METHODS)}")
-    known = walls if isinstance(walls, KnownReflectors) else KnownReflectors.of_walls(_checked(walls))
-    log = group_firings(log)
-    evidence = GridEvidence(ring, resolution=resolution, method=method)
-    readings = facing_readings(ring, log)
-    profile = profile_walls(known, readings, resolution=resolution)
-    evidence.add(log, profile.parts)
-    return assemble_grid(evidence, profile, readings)
-
-
-def facing_readings(ring: Ring, log: Log) -> FacingReadings:
-    """The direct readings of a log; scans without a pose are skipped."""
-    sensors, readings = TransducerArrays.of(ring), DirectReadings.of(ring, log)
-    posed = np.isfinite(log.pose).all(axis=-1)
-    used = readings.measured & posed[:, None]
-    robot, sensor, first = readings.robot[used], np.nonzero(used)[1], readings.first_echo[used]
-    return FacingReadings(
-        transform_points(robot, sensors.position[sensor]),
-        sensors.heading[sensor] + robot[:, 2],
-        SETTINGS.free.certain * sensors.half_width[sensor],
-        np.where(np.isfinite(first), first, SETTINGS.free.reach * ring.max_range),
-        log.pose[posed, :2],
-        ring.max_range,
-    )
-
-
 def assemble_grid(evidence: GridEvidence, profile: WallProfile, readings: FacingReadings) -> OccupancyGrid:
     """The grid of what was accumulated, with known reflectors drawn into it."""
     area, resolution = evidence.area, evidence.resolution
@@ -162,15 +100,6 @@ def assemble_grid(evidence: GridEvidence, profile: WallProfile, readings: Facing
     free &= np.isin(region, np.unique(region[robot & free]))
     probability = _probability(evidence, found, occupied, free)
     return _cropped(evidence, found, probability, occupied, free)
-
-
-def _checked(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, "walls 2 2"]:
-    limit = SETTINGS.max_wall_coordinate
-    bad = ~(np.abs(walls) <= limit).all(axis=(1, 2))
-    if bad.any():
-        k = int(np.argmax(bad))
-        raise SonarError(f"grid: wall {k} is {walls[k].tolist()}; allowed are finite coordinates up to {limit:g} m")
-    return walls
 
 
 def _obstacle_evidence(

@@ -117,6 +117,8 @@ class OccupancySettings:
     """Echoes of a path that agree in position (m), direction (rad) and range (m) up to these cells are one arc."""
     max_echoes: int = 2
     """An arc counts as this many echoes at most: echoes from the same viewpoint are not independent."""
+    max_readings: int = 500_000
+    """Number of direct readings, the latest, that test walls and hidden walls: 20,000 scans of 24 sensors."""
     max_arcs: int = 200_000
     """Largest number of arcs that are kept for the expectation maximization."""
 
