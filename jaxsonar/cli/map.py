@@ -33,6 +33,7 @@ from jaxsonar.cli.console import (
     with_progress,
     write_figure,
 )
+from jaxsonar.cli.grid_output import add_grid_arguments, grid_of, grid_outputs, save_grid
 from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 
@@ -60,12 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", type=filename, metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout"
     )
     parser.add_argument("--figure", type=figure_filename, metavar="FIG", help="draw the map, .svg, .png or .pdf")
-    parser.add_argument(
-        "--grid",
-        type=filename_ending_in(".yaml", ".yml"),
-        metavar="YAML",
-        help="occupancy grid for Nav2, with a .pgm beside",
-    )
+    add_grid_arguments(parser)
     parser.add_argument("--dxf", type=filename_ending_in(".dxf"), metavar="DXF", help="the walls for CAD (extra cad)")
     parser.add_argument(
         "--laser", type=filename, metavar="RECORDING", help="draw the laser points of a corridor8 recording below"
@@ -92,8 +88,7 @@ def run(options: argparse.Namespace) -> int:
             "-o": options.output,
             "settings beside the map:": settings_file,
             "--figure": options.figure,
-            "--grid": options.grid,
-            "--grid's image": options.grid and Path(options.grid).with_suffix(".pgm"),
+            **grid_outputs(options),
             "--dxf": options.dxf,
         },
         [options.log, options.ring, options.settings, *laser_files(options.laser)],
@@ -128,15 +123,9 @@ def run(options: argparse.Namespace) -> int:
     models, evidence, world = _build(ring, log, settings, options, window, left_out.append)
 
     # Compute everything before the first file is written.
-    grid = figure = None
+    figure = None
     has_pose = np.all(np.isfinite(log.pose), axis=1)
-    if options.grid:
-        from jaxsonar.occupancy.nav2_map import check_grid
-        from jaxsonar.occupancy.occupancy_grid import occupancy
-
-        with errors_in(f"--grid {options.grid}"):
-            grid = occupancy(ring, log, walls=world.segments)
-            check_grid(grid)
+    grid = grid_of(options, ring, log, world)
     if options.figure:
         from jaxsonar.reports.plot_map import map_figure
 
@@ -152,10 +141,7 @@ def run(options: argparse.Namespace) -> int:
         choices: dict[str, object] = {name: getattr(options, name) for name in ("method", "sigma", "merging")}
         choices["window"] = window
         write_toml(_run_settings(settings, choices), settings_file)
-    if grid is not None:
-        from jaxsonar.occupancy.nav2_map import save_nav2
-
-        save_nav2(grid, options.grid)
+    save_grid(options, grid)
     if options.dxf:
         from jaxsonar.mapping.map_dxf import save_dxf
 

@@ -2,7 +2,14 @@
 
 import argparse
 
-from jaxsonar.cli.arguments import add_slam_arguments, figure_filename, filename, finite, odometry_noise
+from jaxsonar.cli.arguments import (
+    add_slam_arguments,
+    figure_filename,
+    filename,
+    filename_ending_in,
+    finite,
+    odometry_noise,
+)
 from jaxsonar.cli.console import (
     ascii_name,
     errors_in,
@@ -12,6 +19,7 @@ from jaxsonar.cli.console import (
     write_figure,
     write_json,
 )
+from jaxsonar.cli.grid_output import add_grid_arguments, grid_of, grid_outputs, save_grid
 from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 
@@ -26,6 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", type=filename, metavar="MAP", required=True, help="GeoJSON, world metres; - = stdout"
     )
     parser.add_argument("--trajectory", type=filename, metavar="TRAJ", help="the poses, TUM format; - = stdout")
+    parser.add_argument(
+        "--log",
+        dest="corrected_log",
+        type=filename_ending_in(".csv", ".parquet"),
+        metavar="LOG",
+        help="the log with the estimated poses: .csv or .parquet",
+    )
+    add_grid_arguments(parser)
     parser.add_argument(
         "--figure", type=figure_filename, metavar="FIG", help="poses, odometry, walls: .svg, .png or .pdf"
     )
@@ -68,9 +84,17 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.hardware.errors import SonarError
     from jaxsonar.mapping.map_geojson import save_map
     from jaxsonar.scans.flat_echoes import FlatEchoes
+    from jaxsonar.scans.log_file import save_log
 
     check_outputs(
-        {"-o": options.output, "--trajectory": options.trajectory, "--figure": options.figure, "--json": options.json},
+        {
+            "-o": options.output,
+            "--trajectory": options.trajectory,
+            "--log": options.corrected_log,
+            **grid_outputs(options),
+            "--figure": options.figure,
+            "--json": options.json,
+        },
         [options.log, options.ring, options.truth],
     )
     messages = InputMessages(strict=options.strict)
@@ -116,9 +140,14 @@ def run(options: argparse.Namespace) -> int:
             title=f"{plural(len(trajectory), 'pose')}, {walls} from {ascii_name(options.log)}",
         )
     table = as_json(result, errors)
+    corrected = result.corrected(log)
+    grid = grid_of(options, ring, corrected, result.world)
     save_map(result.world, options.output)
     if options.trajectory:
         save_trajectory(trajectory, options.trajectory)
+    if options.corrected_log:
+        save_log(corrected, options.corrected_log, on_note=print_status)
+    save_grid(options, grid)
     write_figure(figure, options.figure)
     if options.json:
         write_json(table, options.json)

@@ -27,6 +27,7 @@ from jaxsonar.plausibility.odometry_jumps import OdometryJump
 from jaxsonar.registration.heading_slips import HeadingSlip
 from jaxsonar.scans.measured_paths import echoes_of_long_wall
 from jaxsonar.scans.scan_log import Log
+from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.scans.sliding_windows import SETTINGS as WINDOWS
 from jaxsonar.scans.sliding_windows import automatic_window, check_window
 from jaxsonar.sensors.ring import Ring
@@ -93,6 +94,14 @@ class Slam:
     def left_out(self) -> np.ndarray:
         """Rows of the scans without a pose."""
         return np.flatnonzero(~np.isfinite(self.poses).all(axis=1))
+
+    def corrected(self, log: Log) -> Log:
+        """The log of these poses, with its firings merged into scans; scans without an estimate have no pose.
+
+        The motion between the readings of a scan stays that of the odometry (``Log.motion``).
+        """
+        log = group_firings(log)
+        return replace(log, pose=self.poses, odometry=log.motion)
 
 
 def slam(

@@ -3,25 +3,35 @@
 import json
 import os
 from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
 
 from jaxsonar.fileio.atomic_files import atomic_write, shown
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.occupancy.occupancy_grid import OccupancyGrid
+from jaxsonar.occupancy.settings import SETTINGS
+
+Nav2Mode = Literal["trinary", "scale"]
+"""How map_server reads the image: cells are free, occupied or unknown; or have a probability, too."""
 
 
-def grid_image_filename(filename: str | os.PathLike[str]) -> Path:
-    """The image file of a grid: beside its YAML file, with the suffix .pgm.
+def grid_image_filename(filename: str | os.PathLike[str], *, mode: Nav2Mode = "trinary") -> Path:
+    """The image file of a grid: beside its YAML file, with the suffix .pgm, or .png in scale mode.
 
     Raises:
         SonarError: the filename does not end in .yaml or .yml.
     """
     suffix = Path(filename).suffix
+    image = ".png" if mode == "scale" else ".pgm"
     if suffix.lower() not in (".yaml", ".yml"):
         came = f"suffix '{shown(suffix)}'" if suffix else "no suffix"
         raise SonarError(
-            f"{shown(filename)}: {came} came; allowed for a grid is .yaml or .yml, its .pgm goes beside it"
+            f"{shown(filename)}: {came} came; allowed for a grid is .yaml or .yml, its {image} goes beside it"
         )
-    return Path(filename).with_suffix(".pgm")
+    return Path(filename).with_suffix(image)
 
 
 def check_grid(grid: OccupancyGrid) -> None:
@@ -31,32 +41,49 @@ def check_grid(grid: OccupancyGrid) -> None:
         raise SonarError(f"{why} came, the grid is empty; needed is a scan with a pose")
 
 
-def save_nav2(grid: OccupancyGrid, filename: str | os.PathLike[str]) -> None:
-    """Write a grid for Nav2's map_server: MAP.yaml, and the image MAP.pgm beside it.
+def save_nav2(grid: OccupancyGrid, filename: str | os.PathLike[str], *, mode: Nav2Mode = "trinary") -> None:
+    """Write a grid for Nav2's map_server: MAP.yaml, and the image beside it.
 
-    The threshold of free cells is 0.196, as in map_saver's trinary images. With Nav2's older 0.25, the grey of unknown
-    cells would be read as free (navigation2, pull request 5278).
+    Trinary: MAP.pgm, as map_saver writes it. Scale: MAP.png, in which cells that are neither free nor occupied are as
+    dark as they are likely to be occupied, and cells that were not observed are transparent.
 
     Args:
         grid: a grid with at least one cell.
         filename: the YAML file, .yaml or .yml.
+        mode: how map_server reads the image.
 
     Raises:
         SonarError: another suffix, a grid without cells, or a file that cannot be written.
     """
-    image_file = grid_image_filename(filename)
+    image_file = grid_image_filename(filename, mode=mode)
     try:
         check_grid(grid)
     except SonarError as error:
         raise SonarError(f"{shown(filename)}: {error}") from None
-    image = grid.classify()
-    rows, columns = image.shape
     x, y = grid.origin
     with atomic_write(image_file, binary=True) as file:
-        file.write(f"P5\n{columns} {rows}\n255\n".encode() + image.tobytes())
+        file.write(_png(scale_image(grid)) if mode == "scale" else _pgm(grid.classify()))
     with atomic_write(filename) as file:
         file.write(
             f"image: {json.dumps(image_file.name)}\n"  # a JSON string is a valid YAML string, for any name
-            f"mode: trinary\nresolution: {grid.resolution:.9g}\norigin: [{x:.9g}, {y:.9g}, 0.0]\n"
-            "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+            f"mode: {mode}\nresolution: {grid.resolution:.9g}\norigin: [{x:.9g}, {y:.9g}, 0.0]\n"
+            f"negate: 0\noccupied_thresh: {SETTINGS.occupied_threshold:g}\nfree_thresh: {SETTINGS.free_threshold:g}\n"
         )
+
+
+def scale_image(grid: OccupancyGrid) -> UInt8[np.ndarray, "rows columns 2"]:
+    """Grey values and opacity of the cells for map_server's scale mode; row 0 has the largest y."""
+    known = ~np.isnan(grid.probability)
+    grey = np.where(known, np.rint(255 * (1 - grid.probability)), 127)
+    return np.stack([grey, np.where(known, 255, 0)], axis=-1).astype(np.uint8)[::-1]
+
+
+def _pgm(image: UInt8[np.ndarray, "rows columns"]) -> bytes:
+    rows, columns = image.shape
+    return f"P5\n{columns} {rows}\n255\n".encode() + image.tobytes()
+
+
+def _png(image: UInt8[np.ndarray, "rows columns 2"]) -> bytes:
+    done, data = cv2.imencode(".png", image[..., [0, 0, 0, 1]])
+    assert done, "PNG cannot be encoded"
+    return data.tobytes()

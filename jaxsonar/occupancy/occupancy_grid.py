@@ -207,10 +207,11 @@ def _probability(
         probability = (found + 0.5) / (found + 1 + getattr(SETTINGS, evidence.method).missed * looks)
     else:
         probability = 1 / (1 + np.exp(-np.clip(found, -30, 30)))
-    low, high = SETTINGS.free_threshold, SETTINGS.occupied_threshold
-    undecided = np.clip(probability, low, high)
-    probability = np.where(occupied, np.maximum(probability, high + 0.01), undecided)
-    probability = np.where(free, np.minimum(probability, low - 0.01), probability)
+    # Keep a margin to the thresholds, because images have 256 grey values.
+    low, high, margin = SETTINGS.free_threshold, SETTINGS.occupied_threshold, 0.005
+    undecided = np.clip(probability, low + margin, high - margin)
+    probability = np.where(occupied, np.maximum(probability, high + margin), undecided)
+    probability = np.where(free, np.minimum(probability, low - margin), probability)
     nothing = (looks == 0) & (np.abs(found) < 1e-3) & ~occupied & ~free
     return np.where(nothing, np.nan, probability).astype(np.float32)
 
