@@ -335,8 +335,9 @@ def hidden_walls(
         resolution: side of a cell, metres.
     """
     ends = np.concatenate([known.points, known.walls.reshape(-1, 2), obstacles])
-    first, second = cKDTree(ends).query_pairs(_WALLS.max_hidden, output_type="ndarray").T if len(ends) else (ends, ends)
-    segments = np.stack([ends[first], ends[second]], axis=1).reshape(-1, 2, 2)
+    if not len(ends):
+        return np.zeros((0, 2, 2))
+    segments = ends[cKDTree(ends).query_pairs(_WALLS.max_hidden, output_type="ndarray")]
     segments = segments[lengths(segments) >= 2 * resolution]
     if not len(segments):
         return segments
