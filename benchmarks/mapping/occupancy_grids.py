@@ -1,4 +1,4 @@
-"""Occupancy grids of simulated rooms: the grid of ``jaxsonar map``, the Bayesian grids of the related work, the line map.
+"""Occupancy grids of simulated rooms: the grid of ``jaxsonar map``, the related work's Bayesian grids, the line map.
 
 Run ``python -m benchmarks.mapping.occupancy_grids`` for the table of the office and 12 random rooms, and with
 ``--train`` for the parameters of the Bayesian grids, which come from other rooms.
@@ -137,7 +137,9 @@ def train(seed: int) -> dict[GridMethod, tuple[float, BayesSettings]]:
         for prior, missed in product(priors, (0.005, 0.02, 0.05, 0.15)):
             parameters = replace(getattr(SETTINGS, method), prior=prior, missed=missed)
             found = [grid.update(parameters=parameters) for grid in growing]
-            thresholds = (0.03, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5) if method == "em" else np.arange(0.0, 5.1, 0.25).tolist()
+            thresholds = (
+                (0.03, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5) if method == "em" else np.arange(0.0, 5.1, 0.25).tolist()
+            )
             for threshold in thresholds:
                 scores = [
                     grid_accuracy(

@@ -195,7 +195,7 @@ def _along_walls(layer: np.ndarray, theta: float) -> Int[np.ndarray, "rows colum
 
 
 def _direction_shares(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, " directions"]:
-    """Distribution of the directions of walls in this building, those of the known walls and at right angles to them."""
+    """Distribution of the directions of walls: those of the known walls and at right angles to them."""
     count = kernels.DIRECTIONS
     share = np.full(count, 1.0 / count)
     if len(walls):

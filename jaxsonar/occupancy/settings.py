@@ -42,6 +42,8 @@ class ReflectorSettings:
     """Cells on each side, along a wall, whose readings are taken together."""
     max_extension: float = 3.0
     """Length by which a wall may go on, unseen, beyond its ends, metres."""
+    min_length: float = 0.2
+    """Shorter parts of an extension are no walls, metres."""
     max_hidden: float = 0.7
     """Distance up to which two edges may belong to one wall that no sensor has faced, metres."""
     small_obstacle: int = 12

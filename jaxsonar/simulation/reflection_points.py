@@ -22,7 +22,9 @@ def wall_reflection_points(
         simulation: their echoes.
     """
     echo = np.flatnonzero(simulation.kind == EchoKind.PLANE)
-    ends = transform_points(poses[simulation.scan[echo], None], np.asarray(ring.position)[ring.paths[simulation.path[echo]]])
+    ends = transform_points(
+        poses[simulation.scan[echo], None], np.asarray(ring.position)[ring.paths[simulation.path[echo]]]
+    )
     wall = room.walls[simulation.reflector[echo]]
     along = wall[:, 1] - wall[:, 0]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=-1) / np.linalg.norm(along, axis=-1, keepdims=True)
