@@ -19,7 +19,7 @@ from jaxsonar.mapping.artifact_removal import (
 )
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.hough_merging import merge_by_hough
-from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
+from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence_of_each
 from jaxsonar.mapping.observations import concatenate, merge_cells
 from jaxsonar.mapping.point_landmarks import PointLandmarks, cluster_points, is_static
 from jaxsonar.mapping.segment_fusion import estimate_systematic_error, fuse_segments, robust_refit
@@ -76,20 +76,23 @@ def build_map(
     is_grown = grow and merging == "fused" and window is not None
     lengths = window_lengths(window) if is_grown and window is not None else (window,)
     settings = widened(ring, settings, window=max(length or 0.0 for length in lengths))
-    evidence = []
-    for length in lengths:
-        # Detect lines, corners and edges in every scan or window.
-        models = local_models(
-            ring,
-            log,
-            method=method,
-            settings=settings,
-            sigma=sigma,
-            window=length,
-            on_left_out=on_left_out if length == window else None,
+    # Detect lines, corners and edges in every scan or window.
+    models = [
+        list(
+            local_models(
+                ring,
+                log,
+                method=method,
+                settings=settings,
+                sigma=sigma,
+                window=length,
+                on_left_out=on_left_out if length == window else None,
+            )
         )
-        # Transform them to the world frame, and find the free space from missing echoes.
-        evidence.append(gather_evidence(ring, log, models))
+        for length in lengths
+    ]
+    # Transform them to the world frame, and find the free space from missing echoes.
+    evidence = gather_evidence_of_each(ring, log, models)
     # Merge the observations of each wall and point.
     if is_grown:
         return assemble_grown_map(ring, log, evidence, sigma=sigma)
