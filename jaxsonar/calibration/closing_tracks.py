@@ -63,7 +63,7 @@ def estimate_scale(ring: Ring, logs: Sequence[Log]) -> ScaleEstimate:
     mean, spread, model_sd = robust_mean(value, sd)
     # Errors of poses and targets are common to tracks of one place: leave out one stretch at a time.
     start = np.array([one.start for one in tracks])
-    total = sum(float(distance_travelled(log).max(initial=0.0)) for log in logs)
+    total = sum(float(distance_travelled(log.pose).max(initial=0.0)) for log in logs)
     length = max(SETTINGS.stretch, total / SETTINGS.most_stretches)
     _, stretch = np.unique(np.floor(start / [1, length]), axis=0, return_inverse=True)
     stretch = stretch.ravel()
@@ -86,7 +86,7 @@ def find_tracks(ring: Ring, log: Log, number: int = 0) -> list[Track]:
         number: number of the log.
     """
     pose, corrected = reading_poses(log), np.asarray(ring.corrected(log.range, log.tx, log.rx))
-    travelled = distance_travelled(log)
+    travelled = distance_travelled(log.pose)
     usable = (log.tx == log.rx) & (corrected > 0) & np.isfinite(pose).all(axis=1)
     nearest, found = _nearest_echoes(log, corrected, np.flatnonzero(usable)), []
     for sensor in range(ring.count):
