@@ -134,7 +134,7 @@ DRAW = {
     ),
     "grid": lambda case: plot_grid.grid_figure(GridPanel("Grid", GRID, 0.1, (-1.0, 2.0))),
     "grid in the room": lambda case: plot_grid.grid_figure(
-        GridPanel("Grid", GRID, 0.1, (-1.0, 2.0)), room=case.room, poses=case.poses
+        GridPanel("Grid", GRID, 0.1, (-1.0, 2.0)), room=case.room, poses=np.array([[0.5, 0.2, 0.0]])
     ),
     "grids": lambda case: plot_grid.grid_comparison_figure(
         [GridPanel("A", GRID, 0.1, (-1.0, 2.0)), GridPanel("B", GRID, 0.2, (0.0, 0.0))], room=case.room
