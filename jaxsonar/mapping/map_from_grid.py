@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from jaxsonar.geometry.se2 import transform_points, wrap_angle
+from jaxsonar.geometry.segments import cross
 from jaxsonar.mapping.global_map import GlobalMap
 
 
@@ -45,6 +46,10 @@ class GridWallSettings:
     """... and if the joined line is at most this far from the middle of each part."""
     same_distance: float = 1.5
     """Two sides of a wall that are nearer to each other are one thin wall."""
+    corner_reach_m: float = 0.35
+    """Two walls meet in a corner if both end this near to their crossing, metres."""
+    corner_sine: float = 0.5
+    """... and if the sine of the angle between them is larger."""
     systematic: float = 0.29
     """Standard deviation of the offset of a wall that no number of cells removes: 1 / sqrt(12)."""
     min_theta_sd: float = float(np.radians(0.2))
@@ -99,7 +104,7 @@ def map_from_grid(
     least = SETTINGS.min_length_m / resolution
     lines = [line for line in lines if line.length >= least and len(line.cells) >= SETTINGS.min_cells]
     lines = _without_twins(sorted(lines, key=lambda line: -line.length))
-    return _as_map(lines, resolution, origin)
+    return _as_map(_met_at_corners(lines, SETTINGS.corner_reach_m / resolution), resolution, origin)
 
 
 def _surface(
@@ -236,6 +241,30 @@ def _without_twins(lines: list[_Line]) -> list[_Line]:
         else:
             kept.append(line)
     return kept
+
+
+def _met_at_corners(lines: list[_Line], reach: float) -> list[_Line]:
+    """Lines whose ends are moved to where they cross another line, if both end near there.
+
+    The cells in a corner belong to neither wall.
+    """
+    tangent = np.array([line.tangent for line in lines]).reshape(-1, 2)
+    center = np.array([line.center for line in lines]).reshape(-1, 2)
+    extent = np.array([line.extent for line in lines]).reshape(-1, 2)
+    sine = cross(tangent[:, None], tangent[None])
+    crossing = np.abs(sine) > SETTINGS.corner_sine
+    offset = center[None] - center[:, None]
+    # Position of the crossing along the first line of each pair; that along the second is the transposed matrix.
+    along = cross(offset, tangent[None]) / np.where(crossing, sine, 1.0)
+    gap = np.abs(along[..., None] - extent[:, None])  # (lines, lines, ends)
+    meets = crossing & (gap.min(axis=-1) < reach) & (reach > gap.min(axis=-1).T)
+    moved = extent.copy()
+    for k in range(len(lines)):
+        for end in (0, 1):
+            candidates = np.flatnonzero(meets[k] & (gap[k].argmin(axis=-1) == end))
+            if len(candidates):
+                moved[k, end] = along[k, candidates[gap[k, candidates, end].argmin()]]
+    return [line._replace(extent=ends) for line, ends in zip(lines, moved, strict=True) if ends[1] > ends[0]]
 
 
 def _as_map(lines: list[_Line], resolution: float, origin: Float[np.ndarray, "3"]) -> GlobalMap:

@@ -25,10 +25,11 @@ _MODES = ("trinary", "scale", "raw")
 _MOST_CELLS = 100_000_000
 _SERIALIZED = (".posegraph", ".data")
 _IMAGES = (".pgm", ".png")
-_LEAST_OCCUPIED = 50
-"""Occupancy from which a cell of a map in the mode scale or raw is occupied; below this half it is free."""
-_MOST_BETWEEN = 0.3
-"""Largest fraction of known cells that are neither free nor occupied: a cost map has more."""
+_LEAST_OCCUPIED, _MOST_FREE = 75, 25
+"""Occupancy from which a cell of a map in the mode scale or raw is occupied, and up to which it is free. A probability
+of 0.5 is about 65 in such a map."""
+_MOST_GRADED = 0.3
+"""Largest fraction of known cells that are neither free nor occupied: a map of costs has more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +46,12 @@ class Nav2Map:
     @property
     def occupied(self) -> Bool[np.ndarray, "rows columns"]:
         """Cells that are more likely occupied than not."""
-        return self.occupancy > _LEAST_OCCUPIED
+        return self.occupancy >= _LEAST_OCCUPIED
 
     @property
     def free(self) -> Bool[np.ndarray, "rows columns"]:
         """Cells that are free with some certainty."""
-        return (self.occupancy >= 0) & (self.occupancy < _LEAST_OCCUPIED / 2)
+        return (self.occupancy >= 0) & (self.occupancy <= _MOST_FREE)
 
 
 def check_occupancy(grid: Nav2Map) -> None:
@@ -61,12 +62,13 @@ def check_occupancy(grid: Nav2Map) -> None:
         raise SonarError(
             f"no {kind} cell among {known} known ones; allowed is a map of walls, with free cells beside them"
         )
-    between = known - int(grid.occupied.sum()) - int(grid.free.sum())
-    graded = int(((grid.occupancy > 0) & (grid.occupancy < 100)).sum())
-    if between > _MOST_BETWEEN * known or graded > 0.5 * known:
+    between = np.bincount(grid.occupancy[(grid.occupancy >= 0) & ~grid.occupied & ~grid.free], minlength=1)
+    # One value alone may stand for unobserved cells.
+    graded = int(between.sum() - between.max())
+    if graded > _MOST_GRADED * known:
         raise SonarError(
-            f"{100 * graded / known:.0f} % of the known cells are neither free nor occupied, as in a map of costs or speeds; "
-            "allowed is the map of the walls"
+            f"{100 * graded / known:.0f} % of the known cells are neither free nor occupied, as in a map of costs or "
+            "speeds; allowed is the map of the walls"
         )
 
 
