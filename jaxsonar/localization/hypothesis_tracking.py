@@ -68,10 +68,10 @@ class Hypotheses(NamedTuple):
 
     @property
     def is_determined(self) -> Bool[np.ndarray, " hypotheses"]:
-        """Whether the covariance of the latest pose is small in all directions."""
+        """Whether the covariance of the pose was small in all directions at one of the scans."""
         position, heading = SETTINGS.max_pose_sd
-        variance = np.linalg.eigvalsh(self.covariance[:, :2, :2])[:, -1]
-        return (variance < position**2) & (self.covariance[:, 2, 2] < heading**2)
+        variance = np.linalg.eigvalsh(self.covariances[:, :, :2, :2])[..., -1]
+        return ((variance < position**2) & (self.covariances[:, :, 2, 2] < heading**2)).any(axis=1)
 
 
 @dataclass(frozen=True)

@@ -92,11 +92,11 @@ class LocalizationSettings:
     """A hypothesis is dropped if it is behind the best by this many nats."""
     max_tracked: int = 48
     """Number of hypotheses that are tracked together."""
-    chance_nats: float = 0.15
+    chance_nats: float = 0.12
     """Evidence of an echo where the map explains as much as it would by chance, nats."""
     none_share: float = 0.05
     """Prior probability that the robot is at none of the places of the map that are found."""
-    plan_trust: MapTrust = MapTrust(1.5, 0.05, 8.0)
+    plan_trust: MapTrust = MapTrust(1.5, 0.05, 4.0)
     """Trust in a floor plan."""
     map_trust: MapTrust = MapTrust(0.5, 0.002, 4.0)
     """Trust in a map that was measured."""
@@ -112,7 +112,7 @@ class LocalizationSettings:
     """Standard deviations that are added in this test: position (m), heading (rad)."""
     same_pose_chi2: float = 16.0
     """Squared Mahalanobis distance up to which two hypotheses are the same."""
-    max_pose_sd: tuple[float, float] = (0.03, float(np.radians(2.0)))
+    max_pose_sd: tuple[float, float] = (0.04, float(np.radians(2.0)))
     """Largest standard deviations of a determined pose: position (m), heading (rad)."""
     later_groups: int = 4
     """Number of groups of ``first_scans`` later scans that contribute hypotheses."""

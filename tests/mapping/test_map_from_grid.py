@@ -2,35 +2,13 @@
 
 import numpy as np
 import pytest
+from support.grids import rasterized
 
 from jaxsonar.geometry.se2 import inverse, tangent_of, transform_points, unit, wrap_angle
 from jaxsonar.mapping.map_from_grid import map_from_grid
 
 CORNERS = np.array([[0, 0], [4, 0], [4, 1.2], [2.5, 1.2], [2.5, 3], [0, 3]], dtype=float)
 WALLS = np.stack([CORNERS, np.roll(CORNERS, -1, axis=0)], axis=1)
-
-
-def rasterized(resolution, origin, *, noise, seed=0, walls=WALLS, gaps=0.0):
-    """Cells that samples of walls hit, with noise across; the cells inside of the room are free."""
-    rng = np.random.default_rng(seed)
-    samples = []
-    for start, end in walls:
-        count = int(np.linalg.norm(end - start) / 0.01)
-        on = start + np.linspace(0, 1, count)[:, None] * (end - start)
-        on = on[rng.random(count) > gaps]
-        samples.append(on + rng.normal(0, noise, on.shape))
-    cells = np.floor(transform_points(inverse(origin), np.concatenate(samples)) / resolution).astype(int)
-    size = cells.max(axis=0) + 12
-    x, y = (part.ravel() for part in np.meshgrid(*(np.arange(n) + 0.5 for n in size)))
-    world = transform_points(origin, resolution * np.stack([x, y], axis=-1))
-    a, b = walls[:, 0], walls[:, 1]
-    # Even-odd rule.
-    above = (a[:, 1] > world[:, 1:]) != (b[:, 1] > world[:, 1:])
-    slope = np.divide(b[:, 0] - a[:, 0], b[:, 1] - a[:, 1], out=np.zeros(len(a)), where=b[:, 1] != a[:, 1])
-    inside = (above & (world[:, :1] < a[:, 0] + (world[:, 1:] - a[:, 1]) * slope)).sum(axis=1) % 2 == 1
-    occupied = np.zeros(size[::-1], dtype=bool)
-    occupied[cells[:, 1], cells[:, 0]] = True
-    return occupied, inside.reshape(occupied.shape) & ~occupied
 
 
 def errors(world, walls=WALLS):
@@ -56,7 +34,7 @@ def test_walls_of_a_room_are_found(yaw, resolution, noise, gaps):
     bounds = transform_points(inverse(np.array([0, 0, yaw])), CORNERS)
     corner = transform_points(np.array([0, 0, yaw]), bounds.min(axis=0)[None] - 0.4)[0]
     origin = np.array([*corner, yaw])
-    occupied, free = rasterized(resolution, origin, noise=noise, gaps=gaps)
+    occupied, free = rasterized(WALLS, resolution, origin, noise=noise, gaps=gaps)
     world = map_from_grid(occupied, free, resolution=resolution, origin=origin)
     across, turn, wall = errors(world)
     assert sorted(wall) == list(range(len(WALLS)))
