@@ -71,7 +71,8 @@ class Hypotheses(NamedTuple):
         """Whether the covariance of the pose was small in all directions at one of the scans."""
         position, heading = SETTINGS.max_pose_sd
         variance = np.linalg.eigvalsh(self.covariances[:, :, :2, :2])[..., -1]
-        return ((variance < position**2) & (self.covariances[:, :, 2, 2] < heading**2)).any(axis=1)
+        is_small = (variance < position**2) & (self.covariances[:, :, 2, 2] < heading**2)
+        return np.asarray(is_small.any(axis=1))
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from jaxsonar import kernels
 from jaxsonar.estimation.landmark_map import map_landmarks
 from jaxsonar.geometry.landmarks import concatenate_landmarks, landmarks_from_points, pad_landmarks, wall_segments
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
-from jaxsonar.geometry.segments import perpendicular_intersections
+from jaxsonar.geometry.segments import perpendicular_intersections, point_to_segments
 from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
 from jaxsonar.localization.scan_update import MapArrays
-from jaxsonar.localization.settings import SETTINGS
+from jaxsonar.localization.settings import SETTINGS, MapTrust
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.registration.features import Features, landmark_features
 
@@ -31,7 +31,7 @@ class KnownMap:
 
     @classmethod
     def of(cls, world: GlobalMap, map_sd: tuple[float, float] | None = None) -> "KnownMap":
-        """Landmarks of a map; a map without points, such as a floor plan, gets corners where its walls meet.
+        """Landmarks of a map; a map without points gets corners where its walls meet, a floor plan also edges.
 
         Args:
             world: the map.
@@ -50,6 +50,14 @@ class KnownMap:
             kind = np.full(len(corners), kernels.CORNER)
             landmarks = concatenate_landmarks([landmarks, landmarks_from_points(kind, corners)])
             opening = np.concatenate([opening, directions])
+        if is_floor_plan(world):
+            ends = _free_ends(world)
+            landmarks = concatenate_landmarks(
+                [landmarks, landmarks_from_points(np.full(len(ends), kernels.EDGE), ends)]
+            )
+            opening = np.concatenate([opening, np.zeros((len(ends), 2, 2))])
+            end_covariance = np.tile(np.eye(2) * map_sd[0] ** 2, (len(ends), 1, 1))
+            point_covariance = np.concatenate([point_covariance, end_covariance])
         return cls(landmarks, np.concatenate([wall_covariance, point_covariance]), opening)
 
     @property
@@ -111,14 +119,25 @@ class KnownMap:
         )
 
 
+def _free_ends(world: GlobalMap) -> Float[np.ndarray, "ends 2"]:
+    """Ends of walls that touch no other wall, such as those beside the gap of a door: they diffract sound."""
+    ends = world.segments.reshape(-1, 2)
+    distance = point_to_segments(ends, world.segments)
+    distance[np.arange(len(ends)), np.arange(len(ends)) // 2] = np.inf
+    return ends[distance.min(axis=1, initial=np.inf) > SETTINGS.corner_gap]
+
+
 def is_floor_plan(world: GlobalMap) -> bool:
     """Whether a map is a drawing: it has no points, and its walls count as exact (``map_from_room``)."""
     return not world.point_kinds and bool((world.sigma_rho < SETTINGS.exact_sd).all())
 
 
-def was_observed(world: GlobalMap) -> bool:
-    """Whether a map was made from echoes: drawings and the maps of lasers show other things than those that answer."""
-    return not is_floor_plan(world) and any(len(scans) > 0 for scans in (*world.scans, *world.point_scans))
+def trust_in(world: GlobalMap) -> MapTrust:
+    """How far a map is trusted: as a floor plan, as a map of another sensor (no scan observed it), or of echoes."""
+    if is_floor_plan(world):
+        return SETTINGS.plan_trust
+    observed = any(len(scans) > 0 for scans in (*world.scans, *world.point_scans))
+    return SETTINGS.map_trust if observed else SETTINGS.laser_trust
 
 
 def _wall_covariances(world: GlobalMap, least: tuple[float, float]) -> Float[np.ndarray, "walls 2 2"]:

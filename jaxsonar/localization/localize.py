@@ -21,7 +21,7 @@ from jaxsonar.estimation.trajectory import Trajectory, stamps_of
 from jaxsonar.geometry.se2 import subtract_poses
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.localization.hypothesis_tracking import Hypotheses, HypothesisTracker
-from jaxsonar.localization.known_map import KnownMap, was_observed
+from jaxsonar.localization.known_map import KnownMap, trust_in
 from jaxsonar.localization.place_probabilities import place_probabilities
 from jaxsonar.localization.settings import SETTINGS
 from jaxsonar.mapping.global_map import GlobalMap
@@ -106,7 +106,7 @@ def localize(
         models.append(model)
         progress("local models", len(models), len(log))
     odometry, noise = _odometry(ring, log, models), odometry_noise or OdometryNoise()
-    trust = SETTINGS.map_trust if was_observed(world) else SETTINGS.plan_trust
+    trust = trust_in(world)
     tracker = HypothesisTracker(ring, KnownMap.of(world, map_sd), log, models, odometry, sigma, noise, trust)
     if not len(tracker.rows):
         raise SonarError("localize: no scan could be registered to another; allowed are scans with odometry, or nearby")

@@ -34,4 +34,8 @@ def place_probabilities(log_likelihood: Float[np.ndarray, " places"], none: floa
     """
     count = max(len(log_likelihood), 1)
     prior = np.log(np.append(np.full(len(log_likelihood), (1 - SETTINGS.none_share) / count), SETTINGS.none_share))
-    return softmax(np.append(log_likelihood, none) + prior)[:-1]
+    # What a place explains by chance it has in common with every other place.
+    beyond_chance = np.maximum(log_likelihood - none, 0.0)
+    with np.errstate(divide="ignore"):
+        own = none + np.where(beyond_chance > 30, beyond_chance, np.log(np.expm1(np.minimum(beyond_chance, 30))))
+    return softmax(np.append(own, none) + prior)[:-1]
