@@ -29,7 +29,7 @@ from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
 
-class Hypotheses(NamedTuple):
+class PoseTracks(NamedTuple):
     """Pose hypotheses and their tracks through the scans so far, one row each."""
 
     pose: Float[np.ndarray, "hypotheses 3"]
@@ -51,20 +51,20 @@ class Hypotheses(NamedTuple):
     @classmethod
     def at(
         cls, pose: Float[np.ndarray, "hypotheses 3"], covariance: Float[np.ndarray, "hypotheses 3 3"], landmarks: int
-    ) -> "Hypotheses":
+    ) -> "PoseTracks":
         """Hypotheses before the first scan, in a map with this many landmarks."""
         count = len(pose)
         tracks = np.zeros((count, 0, 3)), np.zeros((count, 0, 3, 3)), np.zeros((count, 0))
         nothing, table = np.zeros(count), np.zeros((count, landmarks))
         return cls(pose, covariance, table, nothing, np.zeros(count, dtype=bool), *tracks)
 
-    def take(self, rows: Int[np.ndarray, " rows"] | Bool[np.ndarray, " hypotheses"]) -> "Hypotheses":
+    def take(self, rows: Int[np.ndarray, " rows"] | Bool[np.ndarray, " hypotheses"]) -> "PoseTracks":
         """Select some of the hypotheses."""
-        return Hypotheses(*(column[rows] for column in self))
+        return PoseTracks(*(column[rows] for column in self))
 
-    def join(self, other: "Hypotheses") -> "Hypotheses":
+    def join(self, other: "PoseTracks") -> "PoseTracks":
         """These hypotheses and others after the same scans."""
-        return Hypotheses(*(np.concatenate([mine, its]) for mine, its in zip(self, other, strict=True)))
+        return PoseTracks(*(np.concatenate([mine, its]) for mine, its in zip(self, other, strict=True)))
 
     @property
     def is_determined(self) -> Bool[np.ndarray, " hypotheses"]:
@@ -162,7 +162,7 @@ class HypothesisTracker:
 
     def initial_hypotheses(
         self, start: Float[np.ndarray, "3"] | None, progress: Callable[[str, int, int], None]
-    ) -> Hypotheses:
+    ) -> PoseTracks:
         """Hypotheses for the pose of the first scan.
 
         They are a given start pose, and poses at which features of the first scans match the map. If the pose is
@@ -173,7 +173,7 @@ class HypothesisTracker:
             matching_poses(self.known_map.features, self.models, self.odometry, rows[: SETTINGS.first_scans], start)
         )
         if start is not None:
-            given = Hypotheses.at(start[None], diagonal_covariance(SETTINGS.start_sd)[None], size)
+            given = PoseTracks.at(start[None], diagonal_covariance(SETTINGS.start_sd)[None], size)
             return given._replace(is_start=np.ones(1, dtype=bool)).join(found)
         later = np.arange(SETTINGS.first_scans, len(rows) - 1, SETTINGS.first_scans)
         later = (
@@ -191,7 +191,7 @@ class HypothesisTracker:
                 found = found.join(self._at(list(back.pose)))
         return found
 
-    def similar_hypotheses(self, hypotheses: Hypotheses) -> Hypotheses:
+    def similar_hypotheses(self, hypotheses: PoseTracks) -> PoseTracks:
         """Hypotheses for the pose of the first scan at which the map looks as it does along the track of the best one.
 
         The features of single scans may miss one of several places that look alike; what a whole track sees does not.
@@ -202,18 +202,18 @@ class HypothesisTracker:
         first = self.smooth(hypotheses.poses[0], hypotheses.covariances[0])[0][0]
         return self._at(similar_poses(self.known_map.features, seen, first)[: SETTINGS.similar_hypotheses])
 
-    def _at(self, poses: Sequence[Float[np.ndarray, "3"]]) -> Hypotheses:
+    def _at(self, poses: Sequence[Float[np.ndarray, "3"]]) -> PoseTracks:
         covariance = np.tile(diagonal_covariance(SETTINGS.hypothesis_sd), (len(poses), 1, 1))
-        return Hypotheses.at(
+        return PoseTracks.at(
             np.array(poses, dtype=np.float64).reshape(-1, 3), covariance, len(self.known_map.arrays.covariance)
         )
 
     def track(
         self,
-        hypotheses: Hypotheses,
+        hypotheses: PoseTracks,
         numbers: Int[np.ndarray, " steps"],
         progress: Callable[[str, int, int], None] | None = None,
-    ) -> Hypotheses:
+    ) -> PoseTracks:
         """Track hypotheses through scans, forward or backward; the most likely first. Those far behind are dropped.
 
         Args:
@@ -231,7 +231,7 @@ class HypothesisTracker:
                 progress("hypotheses", k + 1, len(numbers))
         return hypotheses
 
-    def step(self, hypotheses: Hypotheses, number: int, previous: int | None) -> Hypotheses:
+    def step(self, hypotheses: PoseTracks, number: int, previous: int | None) -> PoseTracks:
         """Predict by odometry from the scan ``previous`` (None: no motion), and update by the scan ``number``."""
         pose, covariance = hypotheses.pose, hypotheses.covariance
         if previous is not None:
@@ -243,7 +243,7 @@ class HypothesisTracker:
         of_scan = found.evidence.sum(axis=1)
         if previous is not None:
             of_scan = of_scan - SETTINGS.crossing_nats * self._crosses(hypotheses.pose, poses)
-        return Hypotheses(
+        return PoseTracks(
             poses,
             covariances,
             evidence,
@@ -255,7 +255,7 @@ class HypothesisTracker:
         )
 
     def log_likelihoods(
-        self, hypotheses: Hypotheses, numbers: Int[np.ndarray, " steps"]
+        self, hypotheses: PoseTracks, numbers: Int[np.ndarray, " steps"]
     ) -> tuple[Float[np.ndarray, " hypotheses"], float]:
         """Log-likelihoods of hypotheses that were tracked through these scans, and of none of them, nats.
 
@@ -266,7 +266,7 @@ class HypothesisTracker:
         found = relative_log_likelihood(both, self.scan_weights[numbers], self.trust)
         return found[:-1], float(found[-1])
 
-    def best_of(self, hypotheses: Hypotheses, numbers: Int[np.ndarray, " steps"]) -> Hypotheses:
+    def best_of(self, hypotheses: PoseTracks, numbers: Int[np.ndarray, " steps"]) -> PoseTracks:
         """The distinct hypotheses whose odds against the best one may still change, the most likely first.
 
         A given start pose is kept, and preferred to others that are the same, because it assumes least.
@@ -349,7 +349,7 @@ def _take(paths: kernels.EchoPaths, rows: Int[np.ndarray, " rows"]) -> kernels.E
     return jax.tree.map(lambda leaf: np.asarray(leaf)[rows], paths)
 
 
-def _distinct(hypotheses: Hypotheses) -> Int[np.ndarray, " kept"]:
+def _distinct(hypotheses: PoseTracks) -> Int[np.ndarray, " kept"]:
     """Rows of the first of those that are statistically the same."""
     pose, covariance = hypotheses.pose, hypotheses.covariance
     off = subtract_poses(pose[:, None], pose[None])

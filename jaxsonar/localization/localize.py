@@ -20,7 +20,7 @@ from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.trajectory import Trajectory, stamps_of
 from jaxsonar.geometry.se2 import subtract_poses
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.localization.hypothesis_tracking import Hypotheses, HypothesisTracker
+from jaxsonar.localization.hypothesis_tracking import HypothesisTracker, PoseTracks
 from jaxsonar.localization.known_map import KnownMap, trust_in
 from jaxsonar.localization.place_probabilities import place_probabilities
 from jaxsonar.localization.settings import SETTINGS
@@ -142,7 +142,7 @@ def localize(
 
 
 def _log_prior(
-    poses: Float[np.ndarray, "hypotheses 3"], start: Float[np.ndarray, "3"], tracks: Hypotheses
+    poses: Float[np.ndarray, "hypotheses 3"], start: Float[np.ndarray, "3"], tracks: PoseTracks
 ) -> Float[np.ndarray, " hypotheses"]:
     """Log-prior of poses of the first scan by a start pose, nats.
 

@@ -59,7 +59,7 @@ class GridWallSettings:
 SETTINGS = GridWallSettings()
 
 
-class _Line(NamedTuple):
+class _FittedLine(NamedTuple):
     """A line that is fitted to surface cells."""
 
     cells: Int[np.ndarray, " cells"]
@@ -147,7 +147,7 @@ def _groups(points: Float[np.ndarray, "cells 2"], facing: Float[np.ndarray, "cel
     return np.split(order, np.cumsum(np.bincount(label, minlength=count))[:-1])
 
 
-def _fit(points: Float[np.ndarray, "cells 2"], facing: Float[np.ndarray, "cells 2"], cells: np.ndarray) -> _Line:
+def _fit(points: Float[np.ndarray, "cells 2"], facing: Float[np.ndarray, "cells 2"], cells: np.ndarray) -> _FittedLine:
     """Total least squares line through surface cells; the cells in its middle are as thick as those at its ends."""
     some = points[cells]
     center = some.mean(axis=0)
@@ -159,12 +159,12 @@ def _fit(points: Float[np.ndarray, "cells 2"], facing: Float[np.ndarray, "cells 
     across = (some - center) @ np.array([-tangent[1], tangent[0]])
     # Cells end half a cell beyond their centers.
     extent = np.array([along.min() - 0.5, along.max() + 0.5])
-    return _Line(cells, center, tangent, extent, float(np.sqrt(np.mean(across**2))))
+    return _FittedLine(cells, center, tangent, extent, float(np.sqrt(np.mean(across**2))))
 
 
 def _split(
     points: Float[np.ndarray, "cells 2"], facing: Float[np.ndarray, "cells 2"], cells: np.ndarray, max_gap: float
-) -> list[_Line]:
+) -> list[_FittedLine]:
     """Lines through a group of surface cells, split at gaps and where the group is far from its line."""
     if len(cells) < 2:
         return []
@@ -193,8 +193,8 @@ def _split(
 
 
 def _joined(
-    points: Float[np.ndarray, "cells 2"], facing: Float[np.ndarray, "cells 2"], lines: list[_Line], max_gap: float
-) -> list[_Line]:
+    points: Float[np.ndarray, "cells 2"], facing: Float[np.ndarray, "cells 2"], lines: list[_FittedLine], max_gap: float
+) -> list[_FittedLine]:
     """Lines of which neighboring collinear ones are joined, the longest first."""
     lines = sorted(lines, key=lambda line: -line.length)
     k = 0
@@ -212,8 +212,12 @@ def _joined(
 
 
 def _union(
-    points: Float[np.ndarray, "cells 2"], facing: Float[np.ndarray, "cells 2"], one: _Line, other: _Line, max_gap: float
-) -> _Line | None:
+    points: Float[np.ndarray, "cells 2"],
+    facing: Float[np.ndarray, "cells 2"],
+    one: _FittedLine,
+    other: _FittedLine,
+    max_gap: float,
+) -> _FittedLine | None:
     """The line through both, or None if they are not parts of one wall."""
     if other.tangent @ one.tangent < np.cos(SETTINGS.merge_angle + 1.0 / max(other.length, 1.0)):
         return None
@@ -227,9 +231,9 @@ def _union(
     return both if max(far) < SETTINGS.merge_distance and both.rms < SETTINGS.split_distance else None
 
 
-def _without_twins(lines: list[_Line]) -> list[_Line]:
+def _without_twins(lines: list[_FittedLine]) -> list[_FittedLine]:
     """Lines without those that are the other side of a thin wall; the longest first."""
-    kept: list[_Line] = []
+    kept: list[_FittedLine] = []
     for line in lines:
         ends = line.center + line.extent[:, None] * line.tangent
         for other in kept:
@@ -243,7 +247,7 @@ def _without_twins(lines: list[_Line]) -> list[_Line]:
     return kept
 
 
-def _met_at_corners(lines: list[_Line], reach: float) -> list[_Line]:
+def _met_at_corners(lines: list[_FittedLine], reach: float) -> list[_FittedLine]:
     """Lines whose ends are moved to where they cross another line, if both end near there.
 
     The cells in a corner belong to neither wall.
@@ -267,7 +271,7 @@ def _met_at_corners(lines: list[_Line], reach: float) -> list[_Line]:
     return [line._replace(extent=ends) for line, ends in zip(lines, moved, strict=True) if ends[1] > ends[0]]
 
 
-def _as_map(lines: list[_Line], resolution: float, origin: Float[np.ndarray, "3"]) -> GlobalMap:
+def _as_map(lines: list[_FittedLine], resolution: float, origin: Float[np.ndarray, "3"]) -> GlobalMap:
     """Lines in cells as walls in the world frame, with standard deviations by the size of the cells."""
     count = len(lines)
     ends = np.array([line.center + line.extent[:, None] * line.tangent for line in lines]).reshape(-1, 2, 2)
