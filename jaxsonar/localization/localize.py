@@ -106,7 +106,8 @@ def localize(
         models.append(model)
         progress("local models", len(models), len(log))
     odometry, noise = _odometry(ring, log, models), odometry_noise or OdometryNoise()
-    trust = trust_in(world)
+    # Near a start pose, structure seldom repeats itself.
+    trust = trust_in(world) if start is None else SETTINGS.map_trust
     tracker = HypothesisTracker(ring, KnownMap.of(world, map_sd), log, models, odometry, sigma, noise, trust)
     if not len(tracker.rows):
         raise SonarError("localize: no scan could be registered to another; allowed are scans with odometry, or nearby")
