@@ -46,9 +46,8 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.fileio.atomic_files import check_outputs
     from jaxsonar.localization.localize import localize as run_localize
 
-    check_outputs(
-        {"--trajectory": options.trajectory, "--figure": options.figure}, [options.log, options.ring, options.map]
-    )
+    inputs = [options.log, options.ring, options.map, *_images_of(options.map)]
+    check_outputs({"--trajectory": options.trajectory, "--figure": options.figure}, inputs)
     messages = InputMessages(strict=options.strict)
     world = _load_known_map(options.map, messages)
     ring, log = load_inputs(options, messages=messages)
@@ -109,6 +108,15 @@ def _load_known_map(map_filename: str, messages: InputMessages) -> "GlobalMap":
     if not len(world):
         raise SonarError(f"{shown(map_filename)}: no wall; allowed is a map with walls")
     return world
+
+
+def _images_of(map_filename: str) -> list[str]:
+    """The image of a map of Nav2, which no output may replace."""
+    if not map_filename.lower().endswith(NAV2_SUFFIXES):
+        return []
+    from jaxsonar.occupancy.nav2_reader import image_filename
+
+    return [str(image_filename(map_filename))]
 
 
 def _load_nav2_map(map_filename: str) -> "GlobalMap":

@@ -79,16 +79,7 @@ def load_nav2(filename: str | os.PathLike[str]) -> Nav2Map:
         SonarError: the files cannot be read, or a value is missing or out of range. The message names the file, the key
             and what is allowed.
     """
-    if Path(filename).suffix.lower() in _SERIALIZED:
-        raise SonarError(
-            f"{shown(filename)}: a serialized pose graph of slam_toolbox came; allowed is the map that "
-            "'ros2 run nav2_map_server map_saver_cli -f MAP' saves: MAP.yaml and its image"
-        )
-    if Path(filename).suffix.lower() in _IMAGES:
-        raise SonarError(
-            f"{shown(filename)}: the image of a map came; allowed is its YAML file, which states resolution and origin"
-        )
-    values = _parse_yaml(read_bytes(filename, what="a map of map_server"), filename)
+    values = _values(filename)
     try:
         mode, negate = _mode(values), _negate(values)
         resolution = _number(values, "resolution", 1e-4, 100.0)
@@ -96,12 +87,9 @@ def load_nav2(filename: str | os.PathLike[str]) -> Nav2Map:
         if not free < occupied:
             raise SonarError(f"free_thresh {free:g}, occupied_thresh {occupied:g}; allowed is free_thresh below it")
         origin = _origin(values)
-        name = values.get("image")
-        if not isinstance(name, str) or not name:
-            raise SonarError("no image; needed is 'image: MAP.pgm', the file of the cells")
     except SonarError as error:
         raise SonarError(f"{shown(filename)}: {error}") from None
-    image_file = Path(filename).parent / name
+    image_file = image_filename(filename)
     channels = read_image(image_file)
     if not 0 < channels.shape[0] * channels.shape[1] <= _MOST_CELLS:
         rows, columns = channels.shape[:2]
@@ -109,6 +97,18 @@ def load_nav2(filename: str | os.PathLike[str]) -> Nav2Map:
     cells = classify(channels, mode=mode, negate=negate, occupied_thresh=occupied, free_thresh=free)
     # The first row of the image is that of the largest y.
     return Nav2Map(cells[::-1], resolution, origin)
+
+
+def image_filename(filename: str | os.PathLike[str]) -> Path:
+    """The image that the YAML file of a map names.
+
+    Raises:
+        SonarError: the YAML file cannot be read, or names none.
+    """
+    name = _values(filename).get("image")
+    if not isinstance(name, str) or not name:
+        raise SonarError(f"{shown(filename)}: no image; needed is 'image: MAP.pgm', the file of the cells")
+    return Path(filename).parent / name
 
 
 def classify(
@@ -148,6 +148,20 @@ def classify(
     if mode == "scale" and has_alpha:
         cells = np.where(channels[..., -1] < 1, UNKNOWN, cells)
     return cells
+
+
+def _values(filename: str | os.PathLike[str]) -> dict[str, object]:
+    """The keys of the YAML file of a map; other files of slam_toolbox are rejected."""
+    if Path(filename).suffix.lower() in _SERIALIZED:
+        raise SonarError(
+            f"{shown(filename)}: a serialized pose graph of slam_toolbox came; allowed is the map that "
+            "'ros2 run nav2_map_server map_saver_cli -f MAP' saves: MAP.yaml and its image"
+        )
+    if Path(filename).suffix.lower() in _IMAGES:
+        raise SonarError(
+            f"{shown(filename)}: the image of a map came; allowed is its YAML file, which states resolution and origin"
+        )
+    return _parse_yaml(read_bytes(filename, what="a map of map_server"), filename)
 
 
 def _parse_yaml(content: bytes, filename: str | os.PathLike[str]) -> dict[str, object]:

@@ -64,3 +64,10 @@ def test_a_map_that_cannot_be_used_is_rejected_in_one_line(here, capsys, name, c
     assert len(said) == 1, said
     assert says in said[0]
     assert not (here / "where.tum").exists()
+
+
+def test_no_output_replaces_the_image_of_the_map(here, capsys):
+    before = (here / "map.pgm").read_bytes()
+    assert call("localize", "log.csv", "--ring", "faw", "--map", "map.yaml", "--trajectory", "map.pgm") == 2
+    assert "map.pgm" in capsys.readouterr().err
+    assert (here / "map.pgm").read_bytes() == before
