@@ -159,8 +159,6 @@ class LocalizationSettings:
     """Smallest padded number of landmarks; powers of two from there on are compiled."""
     wall_scans: float = 4.0
     """Number of scans that every wall of the map is taken to be observed by."""
-    wall_extension: float = 0.3
-    """A wall is detected at most this far beyond its ends, metres."""
     corner_gap: float = 0.05
     """Walls whose ends are this near form a corner, metres."""
     corner_angle: float = float(np.radians(3.0))
