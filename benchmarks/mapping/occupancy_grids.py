@@ -91,9 +91,9 @@ def grids(scene: Scene) -> Iterator[tuple[str, Row]]:
         bayesian = occupancy(scene.ring, scene.log, method=method)
         yield name, score(scene, bayesian, free=likely_free(bayesian, method))
     lines = np.zeros(grid.occupied.shape, bool)
-    cell = known.cells(grid.resolution) - grid.corner
-    cell = cell[((cell >= 0) & (cell < lines.shape[::-1])).all(axis=1)]
-    lines[cell[:, 1], cell[:, 0]] = True
+    column, row = (known.cells(grid.resolution) - np.array(grid.corner, int)).T
+    inside = (column >= 0) & (row >= 0) & (column < lines.shape[1]) & (row < lines.shape[0])
+    lines[row[inside], column[inside]] = True
     yield LINES, score(scene, grid, occupied=lines, free=np.zeros_like(lines))
 
 
@@ -121,7 +121,8 @@ def score(scene: Scene, grid: OccupancyGrid, **cells: np.ndarray) -> Row:
 def floor(room: Room) -> shapely.Polygon:
     """The outline of a room: the largest closed face of its walls."""
     faces = shapely.polygonize([shapely.LineString(wall) for wall in room.walls]).geoms
-    return max((shapely.Polygon(face.exterior) for face in faces), key=lambda face: face.area)
+    polygons = [shapely.Polygon(face.exterior) for face in faces if isinstance(face, shapely.Polygon)]
+    return max(polygons, key=lambda face: face.area)
 
 
 def train(seed: int) -> dict[GridMethod, tuple[float, BayesSettings]]:

@@ -168,8 +168,10 @@ def test_localize_reports_an_uncertain_pose(here, capsys):
     files = ("--map", "alike.geojson", "--trajectory", "where.tum")
     assert call("localize", "alike.csv", "--ring", "faw", *files) == 1
     said = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
-    assert len(said) == 1
+    assert len(said) == 3
     assert "ambiguous, 2 places look alike" in said[0]
+    chance = [float(line.split(" %")[0]) for line in said[1:]]
+    assert 40 < chance[1] <= chance[0] < 60
     assert not (here / "where.tum").exists()
 
 
