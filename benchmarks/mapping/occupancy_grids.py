@@ -90,7 +90,7 @@ def grids(scene: Scene) -> Iterator[tuple[str, Row]]:
     for method, name in BAYESIAN.items():
         bayesian = occupancy(scene.ring, scene.log, method=method)
         yield name, score(scene, bayesian, free=likely_free(bayesian, method))
-    lines = np.zeros(grid.occupied.shape, bool)
+    lines = np.zeros_like(grid.occupied)
     column, row = (known.cells(grid.resolution) - np.array(grid.corner, int)).T
     inside = (column >= 0) & (row >= 0) & (column < lines.shape[1]) & (row < lines.shape[0])
     lines[row[inside], column[inside]] = True
@@ -98,12 +98,9 @@ def grids(scene: Scene) -> Iterator[tuple[str, Row]]:
 
 
 def likely_free(grid: OccupancyGrid, method: GridMethod) -> np.ndarray:
-    """Free cells as the related work has them: those that are probably not occupied, whatever was proven."""
-    if method == "em":
-        probability = (grid.evidence + 0.5) / (grid.evidence + 1 + SETTINGS.em.missed * grid.looks)
-    else:
-        probability = 1 / (1 + np.exp(-grid.evidence))
-    return (probability < SETTINGS.free_threshold) & ~grid.occupied
+    """Free cells as the related work has them: looked through, with more evidence against an obstacle than for one."""
+    least = SETTINGS.em.occupied / 2 if method == "em" else 0.0
+    return (grid.looks >= 1) & (grid.evidence < least) & ~grid.occupied
 
 
 def score(scene: Scene, grid: OccupancyGrid, **cells: np.ndarray) -> Row:

@@ -96,7 +96,7 @@ def assemble_grid(
     occupied = walls | obstacle
     # Free: the likely directions of walls are excluded. Walls may go on, unseen, along their extensions.
     share, uniform = _direction_shares(profile.parts.walls)
-    needed = SETTINGS.free.min_excluded + SETTINGS.free.irregular * uniform
+    needed = SETTINGS.free.min_excluded + SETTINGS.free.irregular * (uniform - SETTINGS.free.uniform)
     free = _excluded_share(evidence.passes, share) >= needed
     between = hidden_walls(profile.parts, _small_obstacles(obstacle, evidence), readings, resolution=resolution)
     hidden = area.mask(KnownReflectors.of_walls(np.concatenate([profile.extensions, between])).cells(resolution))
