@@ -55,11 +55,11 @@ def visible_distance(
         max_range: metres.
     """
     ray = normal(angle)
-    start, along = walls[:, 0] - position, walls[:, 1] - walls[:, 0]
-    across = ray[:, None, 0] * along[:, 1] - ray[:, None, 1] * along[:, 0]
+    start, along = walls[:, 0] - position[None], walls[:, 1] - walls[:, 0]
+    across = ray[:, None, 0] * along[None, :, 1] - ray[:, None, 1] * along[None, :, 0]
     safe = jnp.where(across == 0, 1, across)
-    distance = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / safe
-    fraction = (start[:, 0] * ray[:, None, 1] - start[:, 1] * ray[:, None, 0]) / safe
+    distance = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0])[None] / safe
+    fraction = (start[None, :, 0] * ray[:, None, 1] - start[None, :, 1] * ray[:, None, 0]) / safe
     hit = (across != 0) & (distance >= 0) & (fraction >= -1e-6) & (fraction <= 1 + 1e-6)
     return jnp.where(hit, distance, max_range).min(axis=1, initial=max_range)
 
@@ -84,7 +84,7 @@ def arc_cells(
         points: number of points of the arc; they should be at most one cell apart.
     """
     path = transform_path(path, pose)
-    theta = path.start + (jnp.arange(points) + 0.5) * (path.width / points)
+    theta = path.start + (jnp.arange(points, dtype=distance.dtype) + 0.5) * (path.width / points)
     point = jax.vmap(arc_point, in_axes=(None, None, 0))(path, distance, theta)
     spacing = distance * path.width / points
     # Interpolate across the arc, along the axis that its normal is closer to.
@@ -103,7 +103,7 @@ def arc_cells(
     major = jnp.maximum(jnp.abs(n[:, 0]), jnp.abs(n[:, 1]))
     off_axis = (theta - path.start - path.width / 2) / jnp.maximum(path.width / 2, 1e-6)
     gain = (spacing * major / resolution) * (1 - 0.75 * off_axis**2)
-    from_midpoint = point - path.midpoint
+    from_midpoint = point - path.midpoint[None]
     far = jnp.sqrt((from_midpoint**2).sum(-1))
     direction = jnp.arctan2(from_midpoint[:, 1], from_midpoint[:, 0])
     limit = visible_distance(path.midpoint, direction, walls, jnp.asarray(jnp.inf, distance.dtype))
@@ -178,8 +178,9 @@ def seen_through(
     tolerance = resolution / 2**0.5
 
     def one_cone(pose, corner, half_width, first_echo, walls):
-        x = (corner[0] + jnp.arange(cone) + 0.5) * resolution - pose[0]
-        y = (corner[1] + jnp.arange(cone) + 0.5) * resolution - pose[1]
+        cells = jnp.arange(cone, dtype=pose.dtype) + 0.5
+        x = (corner[0].astype(pose.dtype) + cells) * resolution - pose[0]
+        y = (corner[1].astype(pose.dtype) + cells) * resolution - pose[1]
         cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
         ahead, left = x[None, :] * cos + y[:, None] * sin, y[:, None] * cos - x[None, :] * sin
         distance = jnp.sqrt(ahead * ahead + left * left)

@@ -1,7 +1,7 @@
 """Known walls and points: which echoes they explain, which of their parts later readings refute, and what they hide."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,6 +14,7 @@ from jaxsonar.occupancy.settings import SETTINGS
 _WALLS = SETTINGS.reflectors
 
 
+@runtime_checkable
 class ReflectorMap(Protocol):
     """What a grid uses of a map, such as ``GlobalMap``."""
 
