@@ -203,7 +203,9 @@ def seen_through(
     def one_scan(scan):
         sensor_pose, corners, first_echo, walls = scan
 
-        bits, looks = jax.vmap(one_cone, in_axes=(0, 0, 0, 0, None))(sensor_pose, corners, half_width, first_echo, walls)
+        bits, looks = jax.vmap(one_cone, in_axes=(0, 0, 0, 0, None))(
+            sensor_pose, corners, half_width, first_echo, walls
+        )
 
         def add(k, seen):
             at = corners[k, 1], corners[k, 0]

@@ -25,7 +25,7 @@ def add_grid_arguments(parser: argparse.ArgumentParser) -> None:
         "--grid-method",
         choices=("counts", "elfes", "wilkes", "logodds", "em"),
         help="how echoes become obstacles: those that no wall explains (counts, default); log-odds of the first "
-        "(elfes) or all (wilkes) direct echoes, or of all echoes (logodds); all echoes by expectation maximization (em)",
+        "(elfes) or all (wilkes) direct echoes, or of all echoes (logodds); all echoes, iterated (em)",
     )
     parser.add_argument(
         "--grid-mode",

@@ -15,6 +15,7 @@ from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.occupancy.occupancy_grid import OccupancyGrid
 from jaxsonar.reports import plot_map, plot_scan
 from jaxsonar.reports.html_page import Column, Picture, Section, Table, save_report
+from jaxsonar.reports.plot_grid import GridPanel, grid_comparison_figure, grid_figure
 from jaxsonar.reports.terminal_tables import LINE_COLUMNS, MAP_COLUMNS
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.simulation.office import Office
@@ -31,7 +32,7 @@ def draw_figures(
     models: Sequence[LocalModel],
     paper_models: Sequence[LocalModel],
     world: GlobalMap,
-    grid: OccupancyGrid,
+    grids: Mapping[str, tuple[OccupancyGrid, float]],
 ) -> dict[str, Figure]:
     """Draw the paper's figures 1 to 7, the accumulator and the grid.
 
@@ -41,7 +42,7 @@ def draw_figures(
         models: local model of each scan.
         paper_models: local models by the paper's method, for the accumulator.
         world: the map.
-        grid: the occupancy grid.
+        grids: occupancy grids by their names, with their F1 scores; the first is that of the map.
 
     Returns:
         Figures by the names of their files, without suffix.
@@ -52,6 +53,10 @@ def draw_figures(
     ranges = laser_ranges(room, first, bearing)
     laser_points = transform_points(first, (ranges[:, None] * unit(bearing))[np.isfinite(ranges)])
     laser = polygonal_model(bearing, ranges).transform(first)
+    panels = [
+        GridPanel(f"{name}: F1 {f1:.2f}", grid.classify(), grid.resolution, grid.origin)
+        for name, (grid, f1) in grids.items()
+    ]
     return {
         "1-ring": plot_scan.ring_figure(ring),
         "2-reference": plot_map.laser_figure(laser, laser_points),
@@ -65,7 +70,8 @@ def draw_figures(
         "7-map": plot_map.map_figure(
             world, aggregated=plot_map.aggregated_segments(models, poses), poses=poses, room=room
         ),
-        "8-grid": plot_map.grid_figure(grid.classify(), resolution=grid.resolution, origin=grid.origin, world=world),
+        "8-grid": grid_figure(panels[0], room=room, poses=poses),
+        "9-grids": grid_comparison_figure(panels, room=room),
     }
 
 
@@ -106,7 +112,16 @@ def write_page(
         ),
         figure("6-segments", "The segments of all 17 scans in the world frame (figure 6)."),
         figure("7-map", "The map: one segment per wall (figure 7)."),
-        figure("8-grid", "The occupancy grid from the echoes, for Nav2 (map.yaml, map.pgm)."),
+        figure(
+            "8-grid",
+            "The occupancy grid of map and echoes, for Nav2 (map.yaml, map.pgm). F1: occupied cells against the "
+            "parts of the true walls that were heard.",
+        ),
+        figure(
+            "9-grids",
+            "The same scans, without the map: independent cells and log-odds, and expectation maximization, in which "
+            "one reflector explains each echo.",
+        ),
         Table(_columns(MAP_COLUMNS), list(maps), f"Segments of the office against its true walls, simulated, {sigma}."),
     ]
     table_parts = [

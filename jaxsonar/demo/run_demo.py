@@ -21,6 +21,7 @@ from jaxsonar.detection.extract import local_models
 from jaxsonar.detection.local_model import LocalModel, save_models
 from jaxsonar.detection.settings import hough_settings
 from jaxsonar.detection.settings_toml import save_settings
+from jaxsonar.evaluation.grid_accuracy import grid_accuracy
 from jaxsonar.evaluation.line_accuracy import LineAccuracy, line_accuracy
 from jaxsonar.evaluation.map_accuracy import evaluate
 from jaxsonar.evaluation.settings import SETTINGS as EVALUATION
@@ -29,8 +30,9 @@ from jaxsonar.floor_plans.room_geojson import save_room
 from jaxsonar.mapping.build_map import assemble_map
 from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.mapping.map_geojson import save_map
+from jaxsonar.occupancy.incremental_grid import occupancy
+from jaxsonar.occupancy.known_reflectors import KnownReflectors
 from jaxsonar.occupancy.nav2_map import save_nav2
-from jaxsonar.occupancy.occupancy_grid import occupancy
 from jaxsonar.reports.plot_style import save_figure
 from jaxsonar.scans.log_file import save_log
 from jaxsonar.scans.readings import explicit_log
@@ -38,6 +40,7 @@ from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_toml import save_ring
 from jaxsonar.simulation.office import load_office
 from jaxsonar.simulation.poses_csv import save_poses
+from jaxsonar.simulation.reflection_points import wall_reflection_points
 from jaxsonar.simulation.simulator import Simulation, simulate
 
 SETTINGS = DemoSettings()
@@ -77,7 +80,12 @@ def run_demo(
     evidence = gather_evidence(ring, log, models)
     paper_evidence = gather_evidence(ring, log, paper_models)
     world = assemble_map(evidence)
-    grid = occupancy(ring, log, walls=world.segments)
+    heard = wall_reflection_points(ring, office.room, office.poses, simulation)
+    grids = {
+        "map and echoes": occupancy(ring, log, walls=KnownReflectors.of_map(world)),
+        "log-odds": occupancy(ring, log, method="logodds"),
+        "expectation maximization": occupancy(ring, log, method="em"),
+    }
     visible, gates = visible_walls(simulation, office.room, len(office.poses)), EVALUATION.lines
     map_rows = []
     for name, segments in (
@@ -120,11 +128,15 @@ def run_demo(
     save_models(models, output / "lines.jsonl")
     save_settings(hough_settings(ring, None), output / "lines.settings.toml")
     save_map(world, output / "map.geojson")
-    save_nav2(grid, output / "map.yaml")
+    save_nav2(grids["map and echoes"], output / "map.yaml")
     for name, rows in (("table", line_rows), ("map-table", map_rows)):
         with atomic_write(output / f"{name}.json") as file:
             json.dump(rows, file, indent=1)
-    figures = draw_figures(office, log, models, paper_models, world, grid)
+    scored = {
+        name: (grid, grid_accuracy(grid, office.room.walls, office.room.poles, heard).f1)
+        for name, grid in grids.items()
+    }
+    figures = draw_figures(office, log, models, paper_models, world, scored)
     for name, figure in figures.items():
         save_figure(figure, output / f"{name}.svg")
         save_figure(figure, output / f"{name}.png")

@@ -11,6 +11,7 @@ from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
+
 class TransducerArrays(NamedTuple):
     """The direct paths of a ring as NumPy arrays, and the outline of the robot."""
 

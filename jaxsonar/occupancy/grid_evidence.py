@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt16
 from jaxsonar import kernels
 from jaxsonar.geometry.se2 import compose, transform_points
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.kernels.shape_buckets import bucket_size, pad_rows
+from jaxsonar.kernels.shape_buckets import pad_rows
 from jaxsonar.occupancy.direct_readings import DirectReadings, TransducerArrays, footprint_cells
 from jaxsonar.occupancy.echo_arcs import EchoArcs, walls_near
 from jaxsonar.occupancy.known_reflectors import KnownReflectors, explained_by_reflectors
@@ -178,14 +178,18 @@ class GridEvidence:
         position = transform_points(robot, sensors.position)
         center = np.floor(pose[rows, :2] / resolution).astype(int)
         far = np.linalg.norm(position - (center * resolution)[:, None], axis=-1)
-        motion = float(np.where(measured, far, 0).max(initial=0.0)) - float(np.linalg.norm(sensors.position, axis=-1).max())
+        motion = float(np.where(measured, far, 0).max(initial=0.0)) - float(
+            np.linalg.norm(sensors.position, axis=-1).max()
+        )
         size = 2 * (int(np.ceil((sensors.max_distance + max(motion, 0.0)) / resolution)) + 2)
         size = -(-size // 16) * 16
         low = center - size // 2
         sensor_pose = np.concatenate(
             [position - (low * resolution)[:, None], (sensors.heading + robot[..., 2])[..., None]], axis=-1
         )
-        silent = np.where(np.isfinite(readings.first_echo[rows]), readings.first_echo[rows], free.reach * self.ring.max_range)
+        silent = np.where(
+            np.isfinite(readings.first_echo[rows]), readings.first_echo[rows], free.reach * self.ring.max_range
+        )
         first_echo = np.where(measured, np.minimum(silent, self.ring.max_range), 0.0)
         walls = walls_near(known.walls, pose[rows, :2], sensors.max_distance + max(motion, 0.0))
         walls = walls[None] - (low * resolution)[:, None, None].astype(np.float32)

@@ -9,7 +9,7 @@ from jaxsonar.occupancy.direct_readings import DirectReadings, TransducerArrays
 from jaxsonar.occupancy.grid_evidence import METHODS, GridEvidence, GridMethod
 from jaxsonar.occupancy.known_reflectors import FacingReadings, KnownReflectors, profile_walls
 from jaxsonar.occupancy.occupancy_grid import NO_WALLS, OccupancyGrid, assemble_grid
-from jaxsonar.occupancy.settings import SETTINGS
+from jaxsonar.occupancy.settings import SETTINGS, BayesSettings
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.sensors.ring import Ring
@@ -44,12 +44,18 @@ class IncrementalGrid:
         if len(log):
             self._pending.append(group_firings(log))
 
-    def update(self, walls: Float[np.ndarray, "walls 2 2"] | KnownReflectors = NO_WALLS) -> OccupancyGrid:
+    def update(
+        self,
+        walls: Float[np.ndarray, "walls 2 2"] | KnownReflectors = NO_WALLS,
+        *,
+        parameters: BayesSettings | None = None,
+    ) -> OccupancyGrid:
         """The grid of all scans so far.
 
         Args:
             walls: what is known now, world frame, metres: end points of walls, or walls and points with their
                 uncertainty.
+            parameters: of the Bayesian model; those of the method in ``settings`` if omitted.
 
         Raises:
             SonarError: poses too far apart for a grid; a wall that is not finite; a sensor number that the ring does
@@ -63,7 +69,7 @@ class IncrementalGrid:
         for log in self._pending:
             self.evidence.add(log, profile.parts)
         self._pending = []
-        return assemble_grid(self.evidence, profile, readings)
+        return assemble_grid(self.evidence, profile, readings, parameters=parameters)
 
 
 def occupancy(

@@ -113,7 +113,7 @@ class KnownReflectors(NamedTuple):
         reach = int(np.ceil(radius.max(initial=0)))
         for column in range(-reach, reach + 1):
             for line in range(-reach, reach + 1):
-                cell = center + [column, line]
+                cell = center + np.array([column, line])
                 inside = np.linalg.norm(cell + 0.5 - points / resolution, axis=-1) <= radius
                 found.append(cell[inside])
         return np.unique(np.concatenate(found), axis=0)
@@ -220,7 +220,9 @@ def look_through(
         cell = cell[(cell >= 0) & (cell < bins[wall])]
         refuted[wall, cell] += 1_000
     kernel = np.ones(2 * _WALLS.window + 1, np.int64)
-    refuted, confirmed = (np.apply_along_axis(np.convolve, 1, counts, kernel, "same") for counts in (refuted, confirmed))
+    refuted, confirmed = (
+        np.apply_along_axis(np.convolve, 1, counts, kernel, "same") for counts in (refuted, confirmed)
+    )
     return LookedThrough((refuted >= _WALLS.min_looks) & (refuted > 2 * confirmed), before, bins)
 
 
@@ -250,6 +252,7 @@ def profile_walls(known: KnownReflectors, readings: FacingReadings, *, resolutio
         unseen = ~inside & ~open_[wall, : bins[wall]]
         edges = np.flatnonzero(np.diff(np.concatenate([[0], unseen.astype(int), [0]])))
         along = (edges.reshape(-1, 2) - beyond) * resolution
+        along = along[along[:, 1] - along[:, 0] >= _WALLS.min_length]
         limit = _meeting_points(walls, wall)
         along = np.where(along < 0, np.maximum(along, limit[0]), np.minimum(along, limit[1]))
         for first, last in along[along[:, 1] - along[:, 0] > 1e-6]:
@@ -336,8 +339,9 @@ def hidden_walls(
         resolution: side of a cell, metres.
     """
     ends = np.concatenate([known.points, known.walls.reshape(-1, 2), obstacles])
-    first, second = cKDTree(ends).query_pairs(_WALLS.max_hidden, output_type="ndarray").T if len(ends) else (ends, ends)
-    segments = np.stack([ends[first], ends[second]], axis=1).reshape(-1, 2, 2)
+    if not len(ends):
+        return np.zeros((0, 2, 2))
+    segments = ends[cKDTree(ends).query_pairs(_WALLS.max_hidden, output_type="ndarray")]
     segments = segments[lengths(segments) >= 2 * resolution]
     if not len(segments):
         return segments

@@ -46,6 +46,8 @@ class OccupancyGrid:
     """Cells of known reflectors and obstacles."""
     free: Bool[np.ndarray, "rows columns"]
     """Cells that are proven to be free, and connected to where the robot drove."""
+    looks: Float[np.ndarray, "rows columns"]
+    """Number of looks through each cell, weighted by the angle off the axes."""
     footprint: Int[np.ndarray, "rows columns"]
     """Number of scans in which the robot stood on each cell."""
     scans: int = 0
@@ -68,15 +70,28 @@ class OccupancyGrid:
         return image[::-1]
 
 
-def assemble_grid(evidence: GridEvidence, profile: WallProfile, readings: FacingReadings) -> OccupancyGrid:
-    """The grid of what was accumulated, with known reflectors drawn into it."""
+def assemble_grid(
+    evidence: GridEvidence,
+    profile: WallProfile,
+    readings: FacingReadings,
+    *,
+    parameters: BayesSettings | None = None,
+) -> OccupancyGrid:
+    """The grid of what was accumulated, with known reflectors drawn into it.
+
+    Args:
+        evidence: of all scans.
+        profile: known reflectors, and where walls may go on unseen.
+        readings: of all scans.
+        parameters: of the Bayesian model; those of the evidence's method if omitted.
+    """
     area, resolution = evidence.area, evidence.resolution
     if not evidence.looks.size:
         none = np.zeros((0, 0))
         return OccupancyGrid(
-            resolution, (0, 0), none, none, none > 0, none > 0, none.astype(int), evidence.scans, evidence.skipped
+            resolution, (0, 0), none, none, none > 0, none > 0, none, none.astype(int), evidence.scans, evidence.skipped
         )
-    parameters: BayesSettings = getattr(SETTINGS, evidence.method)
+    parameters = parameters or getattr(SETTINGS, evidence.method)
     found, viewpoints = _obstacle_evidence(evidence, profile, parameters)
     robot = evidence.footprint > 0
     walls = area.mask(profile.parts.cells(resolution)) & ~robot
@@ -88,8 +103,8 @@ def assemble_grid(evidence: GridEvidence, profile: WallProfile, readings: Facing
     occupied = (walls & reached) | obstacle
     # Free: the likely directions of walls are excluded. Walls may go on, unseen, along their extensions.
     free = _excluded_share(evidence.passes, profile.parts.walls, resolution) >= SETTINGS.free.min_excluded
-    unseen = [profile.extensions, hidden_walls(profile.parts, _centers(obstacle, evidence), readings, resolution=resolution)]
-    hidden = area.mask(KnownReflectors.of_walls(np.concatenate(unseen)).cells(resolution))
+    between = hidden_walls(profile.parts, _small_obstacles(obstacle, evidence), readings, resolution=resolution)
+    hidden = area.mask(KnownReflectors.of_walls(np.concatenate([profile.extensions, between])).cells(resolution))
     beside = ndimage.binary_dilation(occupied | hidden, np.ones((3, 3)))
     unclear = found > SETTINGS.free.max_evidence * parameters.occupied
     # Thin needles of free cells are single readings: no robot fits there.
@@ -98,7 +113,7 @@ def assemble_grid(evidence: GridEvidence, profile: WallProfile, readings: Facing
     # Free cells that are not connected to where the robot drove are errors, or lie behind an unmapped wall.
     region, _ = ndimage.label(free)
     free &= np.isin(region, np.unique(region[robot & free]))
-    probability = _probability(evidence, found, occupied, free)
+    probability = _probability(evidence, parameters, found, occupied, free)
     return _cropped(evidence, found, probability, occupied, free)
 
 
@@ -144,11 +159,15 @@ def _obstacle_evidence(
     return np.asarray(found)[:cells].reshape(area.shape), counts.reshape(area.shape)
 
 
-def _centers(obstacle: Bool[np.ndarray, "rows columns"], evidence: GridEvidence) -> Float[np.ndarray, "obstacles 2"]:
-    """Centers of connected obstacles, metres."""
+def _small_obstacles(
+    obstacle: Bool[np.ndarray, "rows columns"], evidence: GridEvidence
+) -> Float[np.ndarray, "obstacles 2"]:
+    """Centers of obstacles of few cells, metres."""
     region, count = ndimage.label(obstacle, np.ones((3, 3)))
-    row_column = np.array(ndimage.center_of_mass(obstacle, region, np.arange(1, count + 1))).reshape(-1, 2)
-    return (row_column[:, ::-1] + evidence.area.corner + 0.5) * evidence.resolution
+    number = np.arange(1, count + 1)
+    number = number[ndimage.sum_labels(obstacle, region, number) <= SETTINGS.reflectors.small_obstacle]
+    center = np.array(ndimage.center_of_mass(obstacle, region, number)).reshape(-1, 2)[:, ::-1]
+    return (center + evidence.area.corner + 0.5) * evidence.resolution
 
 
 def _excluded_share(
@@ -176,7 +195,7 @@ def _along_walls(layer: np.ndarray, theta: float) -> Int[np.ndarray, "rows colum
 
 
 def _direction_shares(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, " directions"]:
-    """Distribution of the directions of walls in this building, those of the known walls and at right angles to them."""
+    """Distribution of the directions of walls: those of the known walls and at right angles to them."""
     count = kernels.DIRECTIONS
     share = np.full(count, 1.0 / count)
     if len(walls):
@@ -196,6 +215,7 @@ def _direction_shares(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray
 
 def _probability(
     evidence: GridEvidence,
+    parameters: BayesSettings,
     found: Float[np.ndarray, "rows columns"],
     occupied: Bool[np.ndarray, "rows columns"],
     free: Bool[np.ndarray, "rows columns"],
@@ -204,7 +224,7 @@ def _probability(
     looks = evidence.looks / 16
     if evidence.method in ("counts", "em"):
         # Echoes explained against looks without, with one observation of even odds before any of them.
-        probability = (found + 0.5) / (found + 1 + getattr(SETTINGS, evidence.method).missed * looks)
+        probability = (found + 0.5) / (found + 1 + parameters.missed * looks)
     else:
         probability = 1 / (1 + np.exp(-np.clip(found, -30, 30)))
     # Keep a margin to the thresholds, because images have 256 grey values.
@@ -227,7 +247,8 @@ def _cropped(
     row, column = np.nonzero(~np.isnan(probability))
     rows, columns = (slice(int(k.min()), int(k.max()) + 1) for k in (row, column))
     corner = evidence.area.corner[0] + columns.start, evidence.area.corner[1] + rows.start
-    layers = [np.ascontiguousarray(a[rows, columns]) for a in (found, probability, occupied, free, evidence.footprint)]
+    layers = (found, probability, occupied, free, evidence.looks / 16, evidence.footprint)
+    layers = [np.ascontiguousarray(layer[rows, columns]) for layer in layers]
     for layer in layers:
         layer.setflags(write=False)
     return OccupancyGrid(evidence.resolution, corner, *layers, evidence.scans, evidence.skipped)

@@ -42,8 +42,12 @@ class ReflectorSettings:
     """Cells on each side, along a wall, whose readings are taken together."""
     max_extension: float = 3.0
     """Length by which a wall may go on, unseen, beyond its ends, metres."""
+    min_length: float = 0.2
+    """Shorter parts of an extension are no walls, metres."""
     max_hidden: float = 0.7
     """Distance up to which two edges may belong to one wall that no sensor has faced, metres."""
+    small_obstacle: int = 12
+    """Obstacles of at most this many cells may be such edges."""
     touches: float = 0.1
     """A wall whose end is this close to another wall ends there, metres."""
 
@@ -76,13 +80,13 @@ class FreeSpaceSettings:
 class OccupancySettings:
     """Bayesian models, known reflectors, free space, and the grid."""
 
-    elfes: BayesSettings = BayesSettings(occupied=2.0, missed=0.1, prior=0.01)
+    elfes: BayesSettings = BayesSettings(occupied=1.5, missed=0.05, prior=0.03)
     """Log-odds of first direct echoes."""
     wilkes: BayesSettings = BayesSettings(occupied=1.5, missed=0.02, prior=0.03)
     """Log-odds of all direct echoes."""
-    logodds: BayesSettings = BayesSettings(occupied=2.0, missed=0.1, prior=0.1)
+    logodds: BayesSettings = BayesSettings(occupied=1.5, missed=0.02, prior=0.1)
     """Log-odds of all direct and cross echoes."""
-    em: BayesSettings = BayesSettings(occupied=0.15, missed=0.15)
+    em: BayesSettings = BayesSettings(occupied=0.1, missed=0.02)
     """Expectation maximization."""
     counts: BayesSettings = BayesSettings(occupied=1.5, missed=0.15)
     """Expectation maximization of the echoes that no known reflector explains."""

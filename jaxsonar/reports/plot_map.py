@@ -1,9 +1,9 @@
-"""Figures of many scans: segments in the world frame, maps, laser references, grids (paper, figures 5 to 7)."""
+"""Figures of many scans: segments in the world frame, maps, laser references (paper, figures 5 to 7)."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -16,7 +16,6 @@ from jaxsonar.evaluation.laser_polygonal_model import PolygonalModel
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.mapping.global_map import POINT_KINDS, GlobalMap
-from jaxsonar.occupancy.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from jaxsonar.reports.plot_style import (
     CROSS_COLOR,
     DIRECT_COLOR,
@@ -221,36 +220,6 @@ def laser_figure(
         points = points[((points > low) & (points < high)).all(axis=1)]
     axes.plot(*points.T, ".", color=WALL_COLOR, ms=1.5, mew=0, alpha=0.5, zorder=1, rasterized=True)
     handles.append(Line2D([], [], color=WALL_COLOR, marker=".", ls="", label="laser points"))
-    return finish_plan_view(figure, axes, handles, width=8.4)
-
-
-def grid_figure(
-    image: UInt8[np.ndarray, "rows columns"],
-    *,
-    resolution: float,
-    origin: tuple[float, float],
-    world: GlobalMap | None = None,
-) -> Figure:
-    """Draw an occupancy grid, and a map over it.
-
-    Args:
-        image: 0 occupied, 205 unknown, 254 free (ROS); row 0 is the top.
-        resolution: size of a cell, metres.
-        origin: the lower left corner (x, y) of the image in the world frame, metres.
-        world: the map, if it is to be drawn.
-    """
-    rows, columns = image.shape
-    figure, axes = plan_view(f"Occupancy grid: {columns} x {rows} cells of {resolution:g} m")
-    (left, low), width, height = origin, columns * resolution, rows * resolution
-    box = (left, left + width, low, low + height)
-    axes.imshow(image, cmap="gray", vmin=OCCUPIED, vmax=FREE, extent=box, interpolation="nearest")
-    axes.grid(visible=False)
-    handles = [
-        Line2D([], [], marker="s", ls="", ms=8, mec=WALL_COLOR, mew=0.6, mfc=str(value / FREE), label=label)
-        for value, label in ((OCCUPIED, "occupied"), (UNKNOWN, "unknown"), (FREE, "free"))
-    ]
-    if world is not None:
-        handles += _draw_map(axes, world)
     return finish_plan_view(figure, axes, handles, width=8.4)
 
 

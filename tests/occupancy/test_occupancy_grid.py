@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import shapely
+from jaxsonar.occupancy.wall_visibility import WallMap, estimate_extensions
 
 from jaxsonar import Log, Ring, random_pose, random_room, simulate
 from jaxsonar.floor_plans.room import Room
@@ -17,7 +18,6 @@ from jaxsonar.mapping.build_map import build_map
 from jaxsonar.occupancy.nav2_map import grid_image_filename, save_nav2
 from jaxsonar.occupancy.occupancy_grid import FREE, NO_WALLS, OCCUPIED, UNKNOWN, OccupancyGrid, occupancy
 from jaxsonar.occupancy.settings import SETTINGS
-from jaxsonar.occupancy.wall_visibility import WallMap, estimate_extensions
 
 QUARTER = np.pi / 2
 RING = Ring.circular()
