@@ -140,8 +140,17 @@ def small_grid(corner, columns, value):
     """A grid whose image tells where its origin is."""
     occupied = np.zeros((2, columns), bool)
     occupied[:, :value] = True
-    layers = np.zeros(occupied.shape)
-    return OccupancyGrid(0.05, corner, layers, layers, occupied, ~occupied, layers.astype(int), 1)
+    zero = np.zeros(occupied.shape)
+    return OccupancyGrid(
+        resolution=0.05,
+        corner=corner,
+        evidence=zero,
+        probability=zero,
+        occupied=occupied,
+        free=~occupied,
+        looks=zero,
+        footprint=zero.astype(int),
+    )
 
 
 def pair(text, folder):
