@@ -1,6 +1,6 @@
 """Known walls and points: which echoes they explain, which of their parts later readings refute, and what they hide."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -187,32 +187,24 @@ def look_through(
         beyond: length of the extensions, metres.
         resolution: length of a part, metres.
     """
-    position, heading, certain, first_echo, driven, max_range = readings
     length, before = lengths(segments), int(np.ceil(beyond / resolution))
     bins = np.ceil(length / resolution).astype(int) + 2 * before
     confirmed, refuted = (np.zeros((len(segments), bins.max()), np.int64) for _ in range(2))
     tangent = (segments[:, 1] - segments[:, 0]) / length[:, None]
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
-    rows = max(1, 2_000_000 // len(segments))
-    for begin in range(0, len(position), rows):
-        here = slice(begin, begin + rows)
-        offset = position[here, None] - segments[:, 0]
-        height, along = (offset * normal).sum(-1), (offset * tangent).sum(-1)
-        toward = np.arctan2(-normal[:, 1], -normal[:, 0]) + np.where(height < 0, np.pi, 0)
-        off_axis = np.abs(wrap_angle(toward - heading[here, None]))
+    for here, reading, wall, height in _facing_pairs(segments, normal, readings, beyond=beyond):
+        along = ((here.position[reading] - segments[wall, 0]) * tangent[wall]).sum(-1)
         cell = np.floor(along / resolution).astype(int) + before
-        facing = (off_axis <= certain[here, None]) & (np.abs(height) < max_range) & (cell >= 0) & (cell < bins)
-        reading, wall = np.nonzero(facing & (first_echo[here, None] > np.abs(height) - _WALLS.explained))
-        if not len(reading):
-            continue
+        on_segment = np.flatnonzero((cell >= 0) & (cell < bins[wall]))
+        reading, wall, height, cell = (column[on_segment] for column in (reading, wall, height, cell))
         # Another wall in between hides the part.
-        start = position[here][reading]
-        foot = start - height[reading, wall][:, None] * normal[wall]
-        hidden = _is_hidden(start, foot, segments[wall], walls)
-        reading, wall = reading[~hidden], wall[~hidden]
-        passed = first_echo[here][reading] > np.abs(height[reading, wall]) + _WALLS.explained
-        for counts, some in ((refuted, passed), (confirmed, ~passed)):
-            np.add.at(counts, (wall[some], cell[reading[some], wall[some]]), 1)
+        start = here.position[reading]
+        foot = start - height[:, None] * normal[wall]
+        shown = ~_is_hidden(start, foot, segments[wall], walls)
+        passed = here.first_echo[reading] > np.abs(height) + _WALLS.explained
+        for counts, some in ((refuted, shown & passed), (confirmed, shown & ~passed)):
+            np.add.at(counts, (wall[some], cell[some]), 1)
+    driven = readings.driven
     for wall in range(len(segments)):  # where the robot drove, there is no wall
         offset = driven - segments[wall, 0]
         near = np.abs(offset @ normal[wall]) <= resolution
@@ -224,6 +216,48 @@ def look_through(
         np.apply_along_axis(np.convolve, 1, counts, kernel, "same") for counts in (refuted, confirmed)
     )
     return LookedThrough((refuted >= _WALLS.min_looks) & (refuted > 2 * confirmed), before, bins)
+
+
+def _facing_pairs(
+    segments: Float[np.ndarray, "segments 2 2"],
+    normal: Float[np.ndarray, "segments 2"],
+    readings: FacingReadings,
+    *,
+    beyond: float,
+) -> Iterator[tuple[FacingReadings, Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]]:
+    """Readings that face the lines of segments, and hear nothing nearer, in one square of the floor after the other.
+
+    Args:
+        segments: world frame, metres.
+        normal: of each.
+        readings: of all scans.
+        beyond: length of the extensions of the segments, metres.
+
+    Yields:
+        The readings in a square; rows of these readings and of the segments; heights of the readings above the
+        segments' lines, in the direction of the normals, metres.
+    """
+    max_range = readings.max_range
+    low, high = segments.min(axis=1) - beyond - max_range, segments.max(axis=1) + beyond + max_range
+    limit = np.minimum(max_range, readings.first_echo + _WALLS.explained)
+    square = np.floor(readings.position / max_range).astype(int)
+    order = np.lexsort(square.T)
+    new = np.flatnonzero((np.diff(square[order], axis=0) != 0).any(axis=1)) + 1
+    for rows in np.split(order, new):
+        position = readings.position[rows]
+        near = np.flatnonzero(((low <= position.max(axis=0)) & (high >= position.min(axis=0))).all(axis=1))
+        ray = np.stack([np.cos(readings.heading[rows]), np.sin(readings.heading[rows])], axis=-1)
+        count = max(1, 4_000_000 // max(len(near), 1))
+        for begin in range(0, len(rows) if len(near) else 0, count):
+            part = slice(begin, begin + count)
+            some = rows[part]
+            height = position[part] @ normal[near].T - (segments[near, 0] * normal[near]).sum(-1)
+            ahead = ray[part] @ normal[near].T * np.where(height < 0, 1, -1)
+            facing = (ahead >= np.cos(readings.certain[some])[:, None]) & (np.abs(height) < limit[some, None])
+            reading, wall = np.nonzero(facing)
+            if len(reading):
+                here = FacingReadings(*(column[some] for column in readings[:4]), readings.driven, max_range)
+                yield here, reading, near[wall], height[reading, wall]
 
 
 def profile_walls(known: KnownReflectors, readings: FacingReadings, *, resolution: float) -> WallProfile:
