@@ -197,10 +197,14 @@ def look_through(
         cell = np.floor(along / resolution).astype(int) + before
         on_segment = np.flatnonzero((cell >= 0) & (cell < bins[wall]))
         reading, wall, height, cell = (column[on_segment] for column in (reading, wall, height, cell))
+        if not len(cell):
+            continue
         # Another wall in between hides the part.
         start = here.position[reading]
         foot = start - height[:, None] * normal[wall]
-        shown = ~_is_hidden(start, foot, segments[wall], walls)
+        rays = np.concatenate([start, foot])
+        between = ((walls.max(axis=1) >= rays.min(axis=0)) & (walls.min(axis=1) <= rays.max(axis=0))).all(axis=1)
+        shown = ~_is_hidden(start, foot, segments[wall], walls[between])
         passed = here.first_echo[reading] > np.abs(height) + _WALLS.explained
         for counts, some in ((refuted, shown & passed), (confirmed, shown & ~passed)):
             np.add.at(counts, (wall[some], cell[some]), 1)
@@ -225,7 +229,7 @@ def _facing_pairs(
     *,
     beyond: float,
 ) -> Iterator[tuple[FacingReadings, Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]]:
-    """Readings that face the lines of segments, and hear nothing nearer, in one square of the floor after the other.
+    """Readings that face the lines of segments, and hear nothing nearer, one part of the floor after the other.
 
     Args:
         segments: world frame, metres.
@@ -234,30 +238,38 @@ def _facing_pairs(
         beyond: length of the extensions of the segments, metres.
 
     Yields:
-        The readings in a square; rows of these readings and of the segments; heights of the readings above the
-        segments' lines, in the direction of the normals, metres.
+        Readings of about the same place and direction; rows of these readings and of the segments; heights of the
+        readings above the segments' lines, in the direction of the normals, metres.
     """
-    max_range = readings.max_range
-    low, high = segments.min(axis=1) - beyond - max_range, segments.max(axis=1) + beyond + max_range
-    limit = np.minimum(max_range, readings.first_echo + _WALLS.explained)
-    square = np.floor(readings.position / max_range).astype(int)
-    order = np.lexsort(square.T)
-    new = np.flatnonzero((np.diff(square[order], axis=0) != 0).any(axis=1)) + 1
-    for rows in np.split(order, new):
-        position = readings.position[rows]
-        near = np.flatnonzero(((low <= position.max(axis=0)) & (high >= position.min(axis=0))).all(axis=1))
-        ray = np.stack([np.cos(readings.heading[rows]), np.sin(readings.heading[rows])], axis=-1)
-        count = max(1, 4_000_000 // max(len(near), 1))
-        for begin in range(0, len(rows) if len(near) else 0, count):
+    low, high = segments.min(axis=1) - beyond, segments.max(axis=1) + beyond
+    limit = np.minimum(readings.max_range, readings.first_echo + _WALLS.explained)
+    sector = np.floor(readings.heading % (2 * np.pi) / (np.pi / 4))
+    key = np.column_stack([np.floor(readings.position / (readings.max_range / 2)), sector]).astype(int)
+    order = np.lexsort(key.T)
+    new = np.flatnonzero((np.diff(key[order], axis=0) != 0).any(axis=1)) + 1
+    for rows in np.split(order, new) if len(order) else []:
+        position, heading, certain = readings.position[rows], readings.heading[rows], readings.certain[rows]
+        # Footpoints lie in the cones: in a box around them.
+        angle = heading[:, None] + certain[:, None] * np.linspace(-1, 1, 5)
+        rim = position[:, None] + limit[rows, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        cones = np.concatenate([position, rim.reshape(-1, 2)])
+        sagitta = float(limit[rows].max() * (1 - np.cos(certain.max() / 4)))
+        inside = (low <= cones.max(axis=0) + sagitta) & (high >= cones.min(axis=0) - sagitta)
+        near = np.flatnonzero(inside.all(axis=1))
+        if not len(near):
+            continue
+        here = FacingReadings(*(column[rows] for column in readings[:4]), readings.driven, readings.max_range)
+        ray = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+        count = max(1, 4_000_000 // len(near))
+        for begin in range(0, len(rows), count):
             part = slice(begin, begin + count)
-            some = rows[part]
             height = position[part] @ normal[near].T - (segments[near, 0] * normal[near]).sum(-1)
             ahead = ray[part] @ normal[near].T * np.where(height < 0, 1, -1)
-            facing = (ahead >= np.cos(readings.certain[some])[:, None]) & (np.abs(height) < limit[some, None])
-            reading, wall = np.nonzero(facing)
+            reading, wall = np.nonzero(
+                (ahead >= np.cos(certain[part, None])) & (np.abs(height) < limit[rows[part], None])
+            )
             if len(reading):
-                here = FacingReadings(*(column[some] for column in readings[:4]), readings.driven, max_range)
-                yield here, reading, near[wall], height[reading, wall]
+                yield here, reading + begin, near[wall], height[reading, wall]
 
 
 def profile_walls(known: KnownReflectors, readings: FacingReadings, *, resolution: float) -> WallProfile:
