@@ -54,14 +54,21 @@ def visible_distance(
         walls: end points; a wall without length, such as padding, hides nothing.
         max_range: metres.
     """
-    ray = normal(angle)
-    start, along = walls[:, 0] - position[None], walls[:, 1] - walls[:, 0]
-    across = ray[:, None, 0] * along[None, :, 1] - ray[:, None, 1] * along[None, :, 0]
-    safe = jnp.where(across == 0, 1, across)
-    distance = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0])[None] / safe
-    fraction = (start[None, :, 0] * ray[:, None, 1] - start[None, :, 1] * ray[:, None, 0]) / safe
-    hit = (across != 0) & (distance >= 0) & (fraction >= -1e-6) & (fraction <= 1 + 1e-6)
-    return jnp.where(hit, distance, max_range).min(axis=1, initial=max_range)
+
+    def to_wall(angle: Float[Array, ""], wall: Float[Array, "2 2"]) -> Float[Array, ""]:
+        ray, start, along = normal(angle), wall[0] - position, wall[1] - wall[0]
+        across = _cross(ray, along)
+        safe = jnp.where(across == 0, 1, across)
+        distance, fraction = _cross(start, along) / safe, _cross(start, ray) / safe
+        hit = (across != 0) & (distance >= 0) & (fraction >= -1e-6) & (fraction <= 1 + 1e-6)
+        return jnp.where(hit, distance, max_range)
+
+    each_ray = jax.vmap(jax.vmap(to_wall, in_axes=(None, 0)), in_axes=(0, None))
+    return each_ray(angle, walls).min(axis=1, initial=max_range)
+
+
+def _cross(a: Float[Array, "2"], b: Float[Array, "2"]) -> Float[Array, ""]:
+    return a[0] * b[1] - a[1] * b[0]
 
 
 def arc_cells(
@@ -84,7 +91,7 @@ def arc_cells(
         points: number of points of the arc; they should be at most one cell apart.
     """
     path = transform_path(path, pose)
-    theta = path.start + (jnp.arange(points, dtype=distance.dtype) + 0.5) * (path.width / points)
+    theta = path.start + (jnp.arange(points, dtype=path.width.dtype) + 0.5) * (path.width / points)
     point = jax.vmap(arc_point, in_axes=(None, None, 0))(path, distance, theta)
     spacing = distance * path.width / points
     # Interpolate across the arc, along the axis that its normal is closer to.
@@ -103,9 +110,8 @@ def arc_cells(
     major = jnp.maximum(jnp.abs(n[:, 0]), jnp.abs(n[:, 1]))
     off_axis = (theta - path.start - path.width / 2) / jnp.maximum(path.width / 2, 1e-6)
     gain = (spacing * major / resolution) * (1 - 0.75 * off_axis**2)
-    from_midpoint = point - path.midpoint[None]
-    far = jnp.sqrt((from_midpoint**2).sum(-1))
-    direction = jnp.arctan2(from_midpoint[:, 1], from_midpoint[:, 0])
+    x, y = point[:, 0] - path.midpoint[0], point[:, 1] - path.midpoint[1]
+    far, direction = jnp.sqrt(x * x + y * y), jnp.arctan2(y, x)
     limit = visible_distance(path.midpoint, direction, walls, jnp.asarray(jnp.inf, distance.dtype))
     exists = (path.width > 0) & (distance > jnp.sqrt((path.half_baseline**2).sum())) & (far < limit + resolution)
     weight = jnp.where(exists, gain, 0)[:, None] * jnp.stack([1 - upper, upper], axis=-1)

@@ -7,9 +7,10 @@ from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.occupancy.direct_readings import DirectReadings, TransducerArrays
 from jaxsonar.occupancy.grid_evidence import METHODS, GridEvidence, GridMethod
-from jaxsonar.occupancy.known_reflectors import FacingReadings, KnownReflectors, profile_walls
+from jaxsonar.occupancy.known_reflectors import KnownReflectors
 from jaxsonar.occupancy.occupancy_grid import NO_WALLS, OccupancyGrid, assemble_grid
 from jaxsonar.occupancy.settings import SETTINGS, BayesSettings
+from jaxsonar.occupancy.wall_profile import FacingReadings, profile_walls
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.sensors.ring import Ring

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from scipy import ndimage
 
 from jaxsonar import kernels
@@ -12,14 +12,9 @@ from jaxsonar.geometry.segments import lengths
 from jaxsonar.kernels.shape_buckets import bucket_size, next_power_of_two, pad_rows
 from jaxsonar.occupancy.echo_arcs import arc_table
 from jaxsonar.occupancy.grid_evidence import GridEvidence
-from jaxsonar.occupancy.known_reflectors import (
-    FacingReadings,
-    KnownReflectors,
-    WallProfile,
-    direction_of,
-    hidden_walls,
-)
+from jaxsonar.occupancy.known_reflectors import KnownReflectors, direction_of
 from jaxsonar.occupancy.settings import SETTINGS, BayesSettings
+from jaxsonar.occupancy.wall_profile import FacingReadings, WallProfile, hidden_walls
 
 OCCUPIED, UNKNOWN, FREE = 0, 205, 254
 """Grey values of map_server's trinary images."""
@@ -95,14 +90,14 @@ def assemble_grid(
     found, viewpoints = _obstacle_evidence(evidence, profile, parameters)
     robot = evidence.footprint > 0
     walls = area.mask(profile.parts.cells(resolution)) & ~robot
-    observed = robot | evidence.passes.any(axis=0)
-    reached = ndimage.binary_dilation(observed, iterations=3)
     obstacle = (found > parameters.occupied) & ~robot
     if evidence.method == "counts":
         obstacle &= viewpoints >= SETTINGS.min_viewpoints
-    occupied = (walls & reached) | obstacle
+    occupied = walls | obstacle
     # Free: the likely directions of walls are excluded. Walls may go on, unseen, along their extensions.
-    free = _excluded_share(evidence.passes, profile.parts.walls, resolution) >= SETTINGS.free.min_excluded
+    share, uniform = _direction_shares(profile.parts.walls)
+    needed = SETTINGS.free.min_excluded + SETTINGS.free.irregular * uniform
+    free = _excluded_share(evidence.passes, share) >= needed
     between = hidden_walls(profile.parts, _small_obstacles(obstacle, evidence), readings, resolution=resolution)
     hidden = area.mask(KnownReflectors.of_walls(np.concatenate([profile.extensions, between])).cells(resolution))
     beside = ndimage.binary_dilation(occupied | hidden, np.ones((3, 3)))
@@ -171,11 +166,10 @@ def _small_obstacles(
 
 
 def _excluded_share(
-    passes: np.ndarray, walls: Float[np.ndarray, "walls 2 2"], resolution: float
+    passes: UInt16[np.ndarray, "directions rows columns"], share: Float[np.ndarray, " directions"]
 ) -> Float[np.ndarray, "rows columns"]:
     """Share of the wall directions that readings exclude in each cell."""
     count = kernels.DIRECTIONS
-    share = _direction_shares(walls)
     looked = np.stack([_along_walls(layer, k * np.pi / count) for k, layer in enumerate(passes)])
     excluded = np.zeros(passes.shape[1:], np.float32)
     for k in range(count):
@@ -194,9 +188,12 @@ def _along_walls(layer: np.ndarray, theta: float) -> Int[np.ndarray, "rows colum
     return ndimage.correlate(np.minimum(layer, 255).astype(np.int32), kernel.astype(np.int32), mode="constant")
 
 
-def _direction_shares(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, " directions"]:
-    """Distribution of the directions of walls: those of the known walls and at right angles to them."""
-    count = kernels.DIRECTIONS
+def _direction_shares(walls: Float[np.ndarray, "walls 2 2"]) -> tuple[Float[np.ndarray, " directions"], float]:
+    """Distribution of the directions of walls: those of the known walls and at right angles to them.
+
+    Also the part of it that is uniform: small if the known walls are at right angles, 1 without any.
+    """
+    count, uniform = kernels.DIRECTIONS, 1.0
     share = np.full(count, 1.0 / count)
     if len(walls):
         position = direction_of(walls) * (count / np.pi)
@@ -210,7 +207,7 @@ def _direction_shares(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray
         regular = float(np.abs((weight * np.exp(4j * direction_of(walls))).sum()) / weight.sum())
         uniform = max(1 - regular, SETTINGS.free.uniform)
         share = uniform * share + (1 - uniform) * found / found.sum()
-    return share
+    return share, uniform
 
 
 def _probability(

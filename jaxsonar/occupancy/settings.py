@@ -27,6 +27,9 @@ class ReflectorSettings:
 
     explained: float = 0.08
     """An echo within this distance of the range of a known wall, wall end or corner is attributed to it, metres."""
+    distinct: float = 0.02
+    """An echo that is later than that of a wall by more is that of a known point or wall end, if it fits it better,
+    metres."""
     beyond_end: float = 0.3
     """Known walls also reflect this far beyond their mapped ends, metres: a map has them up to the outermost
     footpoint (paper, section 5)."""
@@ -70,6 +73,9 @@ class FreeSpaceSettings:
     """Cells on each side, along a wall, whose looks exclude it: walls are longer than a cell."""
     min_excluded: float = 0.4
     """Share of the wall directions that must be excluded in a free cell; in a building of right angles, one of two."""
+    irregular: float = 0.1
+    """... and more where the known walls are not at right angles, or none is known: so much for a uniform
+    distribution of the directions."""
     max_evidence: float = 0.5
     """Evidence of an obstacle up to which a cell can be free, as a fraction of that of an occupied cell."""
     uniform: float = 0.15
