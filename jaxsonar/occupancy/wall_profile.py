@@ -164,7 +164,8 @@ def _facing_pairs(
         near = np.flatnonzero(inside.all(axis=1))
         if not len(near):
             continue
-        here = FacingReadings(*(column[rows] for column in readings[:4]), readings.driven, readings.max_range)
+        first_echo = readings.first_echo[rows]
+        here = FacingReadings(position, heading, certain, first_echo, readings.driven, readings.max_range)
         ray = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         count = max(1, 4_000_000 // len(near))
         for begin in range(0, len(rows), count):
