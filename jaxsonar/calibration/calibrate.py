@@ -60,7 +60,8 @@ def calibrate(
         free: estimated parameter groups, of "offset", "speed", "position", "radius", "heading"; the others are held.
         poses: "trust" takes the poses of the log as exact; "estimate" takes them as odometry, if there are any.
         odometry: standard deviation of odometry, as a fraction of the displacement and rotation between scans; 0.02 if
-            omitted. A ring that is calibrated from the run needs none: the standard errors come from the run itself.
+            omitted. Only with poses to estimate. A ring that is calibrated from the run needs none: the standard errors
+            come from the run itself.
         temperature: measured temperature of the air, deg C: prior mean of the speed of sound.
         sigma: standard deviation of the range noise, metres; estimated from the residuals if left out.
         window: length of trajectory gathered into one local model, metres, as in ``build_map``; for sparse rings, which
@@ -102,6 +103,11 @@ def calibrate(
             sigma=sigma,
             window=window,
             progress=progress,
+        )
+    if odometry is not None and not poses_free:
+        raise SonarError(
+            f"calibration: odometry {odometry:g} came with poses 'trust'; allowed is poses 'estimate' with it: "
+            "trusted poses have no error"
         )
     basis = parameter_basis(prior_ring, free, poses_free=poses_free, speed_sd=speed_sd)
     error = SETTINGS.odometry_error if odometry is None else odometry

@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from jaxsonar.calibration.calibration_result import Calibration, RunResiduals
 from jaxsonar.calibration.echo_model import EchoStatistics
-from jaxsonar.calibration.robust_statistics import robust_deviation
 from jaxsonar.fileio.atomic_files import open_output
+from jaxsonar.geometry.robust_statistics import robust_deviation
 from jaxsonar.sensors.ring_toml import ring_toml
 
 DECIMALS = 8

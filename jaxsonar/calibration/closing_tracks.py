@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsonar.calibration.robust_statistics import student_weights
 from jaxsonar.calibration.settings import TRACK_SETTINGS as SETTINGS
+from jaxsonar.geometry.robust_statistics import student_weights
 from jaxsonar.geometry.se2 import transform_points, unit, wrap_angle
 from jaxsonar.registration.wall_readings import distance_travelled
 from jaxsonar.scans.firing_poses import reading_poses
@@ -63,7 +63,7 @@ def estimate_scale(ring: Ring, logs: Sequence[Log]) -> ScaleEstimate:
     mean, spread, model_sd = robust_mean(value, sd)
     # Errors of poses and targets are common to tracks of one place: leave out one stretch at a time.
     start = np.array([one.start for one in tracks])
-    total = sum(float(distance_travelled(log).max(initial=0.0)) for log in logs)
+    total = sum(float(distance_travelled(log.pose).max(initial=0.0)) for log in logs)
     length = max(SETTINGS.stretch, total / SETTINGS.most_stretches)
     _, stretch = np.unique(np.floor(start / [1, length]), axis=0, return_inverse=True)
     stretch = stretch.ravel()
@@ -86,7 +86,7 @@ def find_tracks(ring: Ring, log: Log, number: int = 0) -> list[Track]:
         number: number of the log.
     """
     pose, corrected = reading_poses(log), np.asarray(ring.corrected(log.range, log.tx, log.rx))
-    travelled = distance_travelled(log)
+    travelled = distance_travelled(log.pose)
     usable = (log.tx == log.rx) & (corrected > 0) & np.isfinite(pose).all(axis=1)
     nearest, found = _nearest_echoes(log, corrected, np.flatnonzero(usable)), []
     for sensor in range(ring.count):
@@ -148,7 +148,7 @@ def _slope(
     for _ in range(SETTINGS.iterations):
         value = np.linalg.lstsq(design * np.sqrt(weight)[:, None], measured * np.sqrt(weight), rcond=None)[0]
         residual = measured - design @ value
-        weight = student_weights(residual / scale, SETTINGS.freedom)
+        weight = student_weights((residual / scale) ** 2, SETTINGS.freedom)
         scale = float(np.sqrt((weight * residual**2).sum() / (len(along) - 2)))
         scale = max(scale, SETTINGS.min_noise)
     along, across = (one - np.average(one, weights=weight) for one in (along, across))
@@ -195,7 +195,7 @@ def robust_mean(value: Float[np.ndarray, " tracks"], sd: Float[np.ndarray, " tra
     for spread in SETTINGS.spreads:
         scale, mean, weight = np.hypot(sd, spread), float(np.median(value)), np.ones(len(value))
         for _ in range(SETTINGS.iterations):
-            weight = student_weights((value - mean) / scale, SETTINGS.freedom) / scale**2
+            weight = student_weights(((value - mean) / scale) ** 2, SETTINGS.freedom) / scale**2
             mean = float(np.average(value, weights=weight))
         tails = np.log1p(((value - mean) / scale) ** 2 / SETTINGS.freedom)
         now = float((-np.log(scale) - (SETTINGS.freedom + 1) / 2 * tails).sum())

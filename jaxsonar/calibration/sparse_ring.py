@@ -177,7 +177,7 @@ def _echoes_of_maps(
     """Echoes at the walls of the map of each log, in one table."""
     tables, walls, begin = [], 0, 0.0
     for new, world in zip(fresh, maps, strict=True):
-        travelled = distance_travelled(new)
+        travelled = distance_travelled(new.pose)
         one = assign_echoes(ring, new, travelled, world.segments, scaled, stretch=stretch)
         tables.append(replace(one, wall=one.wall + walls, travelled=one.travelled + begin))
         walls += len(one.center)

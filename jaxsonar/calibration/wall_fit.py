@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.calibration.robust_statistics import student_weights
 from jaxsonar.calibration.settings import SPARSE_SETTINGS as SETTINGS
 from jaxsonar.calibration.wall_echoes import WallEchoes
+from jaxsonar.geometry.robust_statistics import student_weights
 from jaxsonar.geometry.se2 import rotate, transform_points
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.sensors.range_models import plane_range
@@ -179,7 +179,7 @@ class _WallSystem:
         """
         distance, d_plane = self._predict()
         residual, wall, factor = self._residual(value, distance), self.echoes.wall, self.factor * np.exp(-value[-1])
-        weight = student_weights(residual / sigma, SETTINGS.freedom) / sigma**2
+        weight = student_weights((residual / sigma) ** 2, SETTINGS.freedom) / sigma**2
         if kept is not None:
             weight = weight * kept
         ring = np.concatenate([self.sensors, -factor * distance[:, None]], axis=1)
@@ -210,7 +210,7 @@ class _WallSystem:
     def _scale(self, value: Float[np.ndarray, " parameters"], scale: float) -> float:
         """The next scale of the residuals, metres (expectation maximization of the t distribution)."""
         residual = self.residual(value)
-        weight = student_weights(residual / scale, SETTINGS.freedom)
+        weight = student_weights((residual / scale) ** 2, SETTINGS.freedom)
         return max(float(np.sqrt(np.mean(weight * residual**2))), SETTINGS.min_noise)
 
     def _predict(self) -> tuple[Float[np.ndarray, " echoes"], Float[np.ndarray, "echoes 2"]]:

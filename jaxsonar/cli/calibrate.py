@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--odometry",
         type=finite(1e-4, 1),
         metavar="SHARE",
-        help="relative error of the odometry (default: 0.02); not for rings with few sensors",
+        help="relative error of the odometry, for --poses estimate (default: 0.02); not for rings with few sensors",
     )
     parser.add_argument("--temperature", type=finite(-60, 85), metavar="DEG_C", help="measured air temperature")
     parser.add_argument(

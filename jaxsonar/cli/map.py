@@ -1,7 +1,7 @@
 """``jaxsonar map``: a map from scans with known poses."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,7 @@ from jaxsonar.cli.console import (
     print_left_out,
     print_status,
     settings_filename,
-    with_progress,
+    stage_status,
     write_figure,
 )
 from jaxsonar.cli.grid_output import add_grid_arguments, grid_of, grid_outputs, save_grid
@@ -169,42 +169,28 @@ def _build(
     options: argparse.Namespace,
     window: float | None,
     on_left_out: Callable[[int], None],
-) -> "tuple[list[LocalModel], MapEvidence, GlobalMap]":
-    """The map of a log as ``build_map`` makes it, with progress; also the local models and their evidence.
+) -> "tuple[Sequence[LocalModel], MapEvidence, GlobalMap]":
+    """The map of a log, with progress; also the local models (with windows, of the given length) and their evidence."""
+    from jaxsonar.mapping.build_map import build_map
 
-    With windows, these are those of the given length. Walls are sought in windows of other lengths, too, unless the
-    paper's merging is requested.
-    """
-    from jaxsonar.detection.extract import local_models
-    from jaxsonar.detection.settings import widened
-    from jaxsonar.mapping.build_map import assemble_grown_map, assemble_map, required_scans
-    from jaxsonar.mapping.map_evidence import gather_evidence
-    from jaxsonar.scans.sliding_windows import window_lengths
-
-    lengths = window_lengths(window) if window is not None and options.merging == "fused" else (window,)
-    settings = widened(ring, settings, window=max(length or 0.0 for length in lengths))
-    models, evidence = [], []
-    for length in lengths:
-        with errors_in(options.log):
-            found = local_models(
-                ring,
-                log,
-                method=options.method,
-                settings=settings,
-                sigma=options.sigma,
-                window=length,
-                on_left_out=on_left_out,
-            )
-        models.append(list(with_progress(found, len(log) if length is None else None, "local models")))
-        evidence.append(gather_evidence(ring, log, models[-1]))
-    if window is not None and options.merging == "fused":
-        world = assemble_grown_map(ring, log, evidence, sigma=options.sigma)
-    else:
-        world = assemble_map(evidence[0], merging=options.merging, min_scans=required_scans(window))
-    return models[0], evidence[0], world
+    observed: list[tuple[Sequence[LocalModel], MapEvidence]] = []
+    with errors_in(options.log), stage_status() as progress:
+        world = build_map(
+            ring,
+            log,
+            method=options.method,
+            settings=settings,
+            sigma=options.sigma,
+            window=window,
+            merging=options.merging,
+            on_left_out=on_left_out,
+            on_observed=lambda models, evidence: observed.append((models, evidence)),
+            progress=progress,
+        )
+    return *observed[0], world
 
 
-def _why_no_wall(models: "list[LocalModel]", evidence: "MapEvidence", merging: str, min_scans: int) -> str:
+def _why_no_wall(models: "Sequence[LocalModel]", evidence: "MapEvidence", merging: str, min_scans: int) -> str:
     """Why local models give a map without walls.
 
     Args:

@@ -57,7 +57,7 @@ class Health:
     quartiles: Float[np.ndarray, "sensors 4"]
     """5, 25, 75 and 95 % quantiles of the same residuals, metres."""
     spread: Float[np.ndarray, "sensors 2"]
-    """1.4826 x median absolute deviation of the residuals of its direct echoes, and of all its echoes, metres."""
+    """Robust standard deviation of the residuals of its direct echoes, and of all its echoes, metres."""
     repeats: Float[np.ndarray, " sensors"]
     """Fraction of its first direct echoes with exactly the range of the previous scan, while the robot moved."""
     constant: Float[np.ndarray, "sensors 2"]

@@ -13,6 +13,7 @@ from scipy import stats
 
 from jaxsonar.diagnostics.echo_residuals import ResidualTable
 from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.geometry.robust_statistics import robust_deviation
 from jaxsonar.plausibility.pose_agreement import select_groups
 from jaxsonar.scans.scan_log import Log
 
@@ -81,7 +82,7 @@ def estimate_offsets(
     prior = settings.prior_information
     for _ in range(settings.iterations if len(row) else 0):
         left = residual - (d_wall * correction[wall]).sum(axis=1) - (offset[tx] + offset[rx]) / 2
-        noise = max(1.4826 * float(np.median(np.abs(left))), min_noise)
+        noise = max(robust_deviation(left, center=0.0), min_noise)
         weight = np.clip(1 - (left / (settings.tukey * noise)) ** 2, 0, None) ** 2 / noise**2
         # Normal equations; the walls are eliminated one by one (Schur complement).
         info_wall = _sum_groups(wall, weight[:, None, None] * d_wall[:, :, None] * d_wall[:, None, :], walls)

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.diagnostics.echo_residuals import ResidualTable
 from jaxsonar.diagnostics.findings import Finding, GradedFinding, confidence_of
 from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.geometry.robust_statistics import robust_deviation
 
 _SETTINGS = SETTINGS.alternatives
 
@@ -202,7 +203,7 @@ def _usual_rates(rows: list[_DirectEchoes], counts: list[_Counts]) -> Rates | No
     beside = _weighted_median(strange / np.maximum(faced, 1), faced)
     if rate < _SETTINGS.least_rate or beside > 1 - _SETTINGS.least_rate or foreign > 1 - _SETTINGS.least_explained:
         return None
-    scatter = 1.4826 * float(np.median(np.abs(each - rate)))
+    scatter = robust_deviation(each)
     least = 1 - _SETTINGS.most_rate
     return Rates(min(rate, _SETTINGS.most_rate), max(foreign, least), max(beside, least), scatter)
 

@@ -13,6 +13,7 @@ from jaxsonar.diagnostics.health_report import Health
 from jaxsonar.diagnostics.measured_sensors import MeasuredSensors
 from jaxsonar.diagnostics.sensor_alternatives import SensorAlternative, explained_otherwise
 from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.geometry.robust_statistics import robust_deviation
 from jaxsonar.sensors.ring import Ring
 
 _FINDINGS = SETTINGS.findings
@@ -292,7 +293,7 @@ def _weak_sensors(health: Health, evidence: SensorEvidence) -> Iterator[GradedFi
 def _turned_sensors(health: Health, evidence: SensorEvidence) -> Iterator[GradedFinding]:
     """Sensors that point in another direction."""
     turns = np.degrees(health.centre[:, 0])
-    scatter = 1.4826 * float(np.median(np.abs(turns[np.isfinite(turns)]))) if np.isfinite(turns).any() else 0.0
+    scatter = robust_deviation(turns[np.isfinite(turns)], center=0.0)
     for k in range(health.ring.count):
         turn, error = np.degrees(health.centre[k])
         nats = float(evidence.turn_nats[k])

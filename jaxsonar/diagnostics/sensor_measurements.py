@@ -11,6 +11,7 @@ from jaxsonar.diagnostics.echo_residuals import ResidualTable, explained_fractio
 from jaxsonar.diagnostics.range_offsets import OffsetEstimate, estimate_offsets, stretches_of_scans
 from jaxsonar.diagnostics.reference_scene import ReferenceScene
 from jaxsonar.diagnostics.settings import SETTINGS
+from jaxsonar.geometry.robust_statistics import robust_deviation
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -152,12 +153,12 @@ def _residual_statistics(
     direct = [residual[(tx == k) & (rx == k)] + offset[k] for k in range(sensors)]
     both = [residual[(tx == k) | (rx == k)] for k in range(sensors)]
     quantiles = [np.percentile(x, (5, 25, 50, 75, 95)) if len(x) >= least else np.full(5, np.nan) for x in direct]
-    spread = [[_scaled_mad(x), _scaled_mad(y)] for x, y in zip(direct, both, strict=True)]
+    spread = [[_deviation_of_many(x), _deviation_of_many(y)] for x, y in zip(direct, both, strict=True)]
     return np.array(quantiles), np.array(spread)
 
 
-def _scaled_mad(values: Float[np.ndarray, " echoes"]) -> float:
-    """1.4826 x median absolute deviation; NaN for fewer than five values."""
+def _deviation_of_many(values: Float[np.ndarray, " echoes"]) -> float:
+    """Robust standard deviation; NaN for fewer than five values."""
     if len(values) < SETTINGS.detection.min_residuals:
         return float("nan")
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+    return robust_deviation(values)

@@ -17,6 +17,7 @@ from jaxsonar.estimation.adjustment_state import AdjustmentResult, AdjustmentSta
 from jaxsonar.estimation.batch_data import BatchData
 from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
 from jaxsonar.estimation.robust_adjustment import RobustAdjustment
+from jaxsonar.geometry.robust_statistics import robust_deviation, student_weights
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import ParameterBasis
@@ -97,7 +98,7 @@ def heavy_tailed_adjust(
         # 3. Rotations that the odometry measures badly count less.
         turn = np.asarray(kernels.odometry_residuals(problem, solution.unknowns))[:, 2]
         heading = information.copy()
-        heading[: len(turn), 2] *= _student_weight(turn**2 * information[: len(turn), 2], settings.odometry_dof)
+        heading[: len(turn), 2] *= student_weights(turn**2 * information[: len(turn), 2], settings.odometry_dof)
         data = replace(data, odometry_information=heading)
         residual = np.where(used, job.residual(state, reflection), 0)
         result = AdjustmentResult(state, problem, solution, used, candidate, residual, found.sigma, found.pairs)
@@ -126,9 +127,8 @@ def _weights(
     change = np.diff(off[order])[np.diff(same[order]) == 0]
     noise, pairs = sigma, 0
     if noise is None:
-        spread = GNC_SETTINGS.mad_to_sigma * float(np.median(np.abs(change))) / np.sqrt(2) if len(change) else 0.0
-        noise, pairs = max(float(spread), least), len(change)
-    tail = _student_weight(off**2 / (noise**2 + relief**2), settings.range_dof)
+        noise, pairs = max(robust_deviation(change, center=0.0) / float(np.sqrt(2)), least), len(change)
+    tail = student_weights(off**2 / (noise**2 + relief**2), settings.range_dof)
     mean = np.bincount(same, tail * off) / np.maximum(np.bincount(same, tail), 1e-12)
     relief = _relief(mean, relief, settings)
     weight = np.zeros(residual.shape)
@@ -140,7 +140,7 @@ def _relief(mean: Float[np.ndarray, " groups"], start: float, settings: HeavyTai
     """Standard deviation of the surface of walls, metres, from the mean residuals of groups of echoes."""
     spread = start / settings.relief_factor
     for _ in range(settings.iterations):
-        weight = _student_weight((mean / spread) ** 2, settings.range_dof)
+        weight = student_weights((mean / spread) ** 2, settings.range_dof)
         squares = settings.relief_groups * (settings.relief / settings.relief_factor) ** 2 + (weight * mean**2).sum()
         spread = float(np.sqrt(squares / (settings.relief_groups + len(mean))))
     return settings.relief_factor * spread
@@ -150,11 +150,6 @@ def _resolution(reported: Float[np.ndarray, "scans echoes"]) -> float:
     """Step to which ranges are rounded, metres: the smallest difference of two of them, as far as floats show it."""
     steps = np.diff(np.unique(np.round(reported[np.isfinite(reported)], 6)))
     return float(steps.min(initial=np.inf)) if len(steps) else 0.0
-
-
-def _student_weight(squared: Float[np.ndarray, "*any"], dof: float) -> Float[np.ndarray, "*any"]:
-    """Weight in reweighted least squares of a residual of Student's distribution, from its square in variances."""
-    return (dof + 1) / (dof + squared)
 
 
 def _stretches(data: BatchData, settings: HeavyTailSettings) -> Int[np.ndarray, " scans"]:

@@ -51,7 +51,7 @@ def map_with_tentative_points(
     ring: Ring,
     log: Log,
     *,
-    window: float | None,
+    window: float | None = None,
     models: Sequence[LocalModel] | None = None,
     settings: LandmarkMapSettings = SETTINGS,
 ) -> GlobalMap:

@@ -19,6 +19,7 @@ from jaxsonar.estimation.batch_data import BatchData
 from jaxsonar.estimation.landmark_map import LandmarkMap
 from jaxsonar.estimation.landmark_selection import reclassify_points, remove_misfitting_points
 from jaxsonar.estimation.sparse_adjustment import AdjustmentSolution, absorbed_freedom, solve_adjustment
+from jaxsonar.geometry.robust_statistics import MAD_TO_SIGMA
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import PRIOR, ParameterBasis, parameter_basis
 
@@ -47,8 +48,6 @@ class GncSettings:
     max_unknowns: float = 0.2
     """Number of unknowns, as a fraction of the number of echoes, up to which the echoes alone determine all of them.
     With more, odometry and priors determine a part."""
-    mad_to_sigma: float = 1.4826
-    """Standard deviation of a normal distribution over its median absolute deviation (exact value)."""
 
 
 SETTINGS = GncSettings()
@@ -215,7 +214,7 @@ class RobustAdjustment:
             residual = self.residual(state, reflection)
             inliers = np.abs(residual[used & (np.abs(residual) < gate)])
             median = float(np.median(inliers)) if len(inliers) else None
-            spread = scale / settings.gate_sigmas if median is None else settings.mad_to_sigma * median
+            spread = scale / settings.gate_sigmas if median is None else MAD_TO_SIGMA * median
             spread = max(spread, settings.min_sigma)
             if last:
                 break

@@ -11,10 +11,10 @@ import numpy as np
 import tomli_w
 from jaxtyping import Float, Int
 
-from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
 from jaxsonar.evaluation.laser_reference_map import reference_map
 from jaxsonar.evaluation.settings import SETTINGS as EVALUATION
 from jaxsonar.fileio.atomic_files import open_output
+from jaxsonar.geometry.robust_statistics import robust_deviation, student_weights
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.laser_datasets import LaserRecording
@@ -57,8 +57,7 @@ class LaserRanges:
         for every ring.
         """
         residual = self.residual(ring)
-        deviation = np.abs(residual - np.median(residual)) if len(residual) else np.array([np.nan])
-        return GNC_SETTINGS.mad_to_sigma * float(np.median(deviation))
+        return robust_deviation(residual) if len(residual) else float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +235,7 @@ def _robust_line(
     value, sigma = np.append([0.0, 1.0], np.zeros(count)), SETTINGS.first_noise
     for _ in range(SETTINGS.iterations):
         residual = measured[kept] - design @ value
-        weight = (SETTINGS.freedom + 1) / (SETTINGS.freedom + (residual / sigma) ** 2)
+        weight = student_weights((residual / sigma) ** 2, SETTINGS.freedom)
         sigma = max(float(np.sqrt(np.mean(weight * residual**2))), SETTINGS.min_noise)
         information = design.T @ (weight[:, None] * design) / sigma**2
         value = np.linalg.solve(information + prior, design.T @ (weight * measured[kept]) / sigma**2)

@@ -1,7 +1,8 @@
-"""Planar geometry in NumPy, the lowest layer of the product.
+"""Planar geometry and robust statistics in NumPy, the lowest layer of the product.
 
 Modules: ``se2`` (poses, their Jacobians and covariances), ``segments`` (line segments), ``landmarks`` (operations on
-``kernels.Landmarks``: concatenation, padding, change of frame with Jacobians).
+``kernels.Landmarks``: concatenation, padding, change of frame with Jacobians), ``robust_statistics`` (weights and
+spreads of residuals with heavy tails).
 
 Design decisions:
 

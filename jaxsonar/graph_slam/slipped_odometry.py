@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from jaxsonar.estimation.odometry_noise import OdometryNoiseModel
 from jaxsonar.geometry.se2 import compose
 from jaxsonar.registration.heading_slips import HeadingSlip, find_heading_slips, slip_transform
+from jaxsonar.registration.wall_readings import distance_travelled
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
@@ -39,11 +40,10 @@ class SlippedOdometryNoise:
     ) -> Float[np.ndarray, "_ 3"]:
         """See ``OdometryNoiseModel``."""
         sd = self.noise(measured, rows).copy()
-        length = _travelled(measured)[rows]
-        at = _travelled(measured)
+        travelled = distance_travelled(measured)
         for slip in self.slips:
             near = (rows[:-1] <= slip.row) & (slip.row < rows[1:])
-            near |= np.abs(length[1:] - at[slip.row]) <= SETTINGS.reach
+            near |= np.abs(travelled[rows[1:]] - travelled[slip.row]) <= SETTINGS.reach
             sd[near, 2] = np.hypot(sd[near, 2], abs(slip.angle) / np.sqrt(max(near.sum(), 1)))
         return sd
 
@@ -66,11 +66,3 @@ def repair_heading_slips(ring: Ring, log: Log) -> tuple[Log, tuple[HeadingSlip, 
         pose[slip.row + 1 :] = compose(moved, pose[slip.row + 1 :])
         log = replace(log, pose=pose, odometry=samples)
     return log, slips
-
-
-def _travelled(poses: Float[np.ndarray, "scans 3"]) -> Float[np.ndarray, " scans"]:
-    """Length of the trajectory up to each scan, metres; missing poses add nothing."""
-    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
-    steps = np.zeros(len(poses))
-    steps[known[1:]] = np.hypot(*np.diff(poses[known, :2], axis=0).T)
-    return np.cumsum(steps)

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxsonar import kernels
 from jaxsonar.detection.extract import local_models
+from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.detection.settings import hough_settings, widened
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
@@ -19,7 +20,7 @@ from jaxsonar.mapping.artifact_removal import (
 )
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.hough_merging import merge_by_hough
-from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
+from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence_of_each
 from jaxsonar.mapping.observations import concatenate, merge_cells
 from jaxsonar.mapping.point_landmarks import PointLandmarks, cluster_points, is_static
 from jaxsonar.mapping.segment_fusion import estimate_systematic_error, fuse_segments, robust_refit
@@ -48,6 +49,8 @@ def build_map(
     merging: str = "fused",
     grow: bool = True,
     on_left_out: Callable[[int], None] | None = None,
+    on_observed: Callable[[Sequence[LocalModel], MapEvidence], None] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> GlobalMap:
     """The walls, corners and edges of the world, from a log of scans with poses (paper, section 5).
 
@@ -65,6 +68,8 @@ def build_map(
         grow: with windows and merging "fused": whether to use several lengths and growth. False: the walls of windows
             of one length, as ``Mapper`` finds them scan by scan.
         on_left_out: called with the number of echoes on pairs of sensors that this ring does not listen to.
+        on_observed: called with the local models and their evidence; with windows, those of the given length.
+        progress: called with the stage and (scans done, scans); 0 scans if the stage does not count them.
 
     Raises:
         SonarError: as for ``local_models``; an unknown merging method; or no scan with a pose.
@@ -76,10 +81,12 @@ def build_map(
     is_grown = grow and merging == "fused" and window is not None
     lengths = window_lengths(window) if is_grown and window is not None else (window,)
     settings = widened(ring, settings, window=max(length or 0.0 for length in lengths))
-    evidence = []
+    report = progress or (lambda stage, done, total: None)
+    # Detect lines, corners and edges in every scan or window.
+    models: list[list[LocalModel]] = []
+    row_of_scan = {number: row for row, number in enumerate(log.scan.tolist())}
     for length in lengths:
-        # Detect lines, corners and edges in every scan or window.
-        models = local_models(
+        found = local_models(
             ring,
             log,
             method=method,
@@ -88,8 +95,15 @@ def build_map(
             window=length,
             on_left_out=on_left_out if length == window else None,
         )
-        # Transform them to the world frame, and find the free space from missing echoes.
-        evidence.append(gather_evidence(ring, log, models))
+        models.append([])
+        for model in found:
+            models[-1].append(model)
+            report("local models", row_of_scan[model.scan] + 1, len(log))
+    # Transform them to the world frame, and find the free space from missing echoes.
+    report("map", 0, 0)
+    evidence = gather_evidence_of_each(ring, log, models)
+    if on_observed is not None:
+        on_observed(models[0], evidence[0])
     # Merge the observations of each wall and point.
     if is_grown:
         return assemble_grown_map(ring, log, evidence, sigma=sigma)

@@ -8,6 +8,7 @@ scans that would have detected a wall there. Only paths that were measured can m
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -68,10 +69,10 @@ class DirectionalFreeSpace:
         tiles = dict(self.tiles)
         tile, inside = np.divmod(cells[:, :2], _FREE.tile_cells)
         # Sort by cell, latest first, and rank the times within each cell.
-        order = np.lexsort((-times, cells[:, 2], cells[:, 1], cells[:, 0], tile[:, 1], tile[:, 0]))
+        code, _, _ = _encode(np.column_stack([tile, inside, cells[:, 2]]).T)
+        order = np.lexsort((-times, code))
         tile, inside, cells, times = tile[order], inside[order], cells[order], times[order]
-        new = np.ones(len(cells), dtype=bool)
-        new[1:] = (np.diff(cells, axis=0) != 0).any(axis=1)
+        new = np.append(True, np.diff(code[order]) != 0)
         row = np.arange(len(cells))
         rank = row - np.maximum.accumulate(np.where(new, row, 0))
         remembered = rank < _FREE.remembered
@@ -79,11 +80,17 @@ class DirectionalFreeSpace:
         for first, last in zip(edges, [*edges[1:], len(tile)], strict=True):
             key = (int(tile[first, 0]), int(tile[first, 1]))
             part = np.arange(first, last)[remembered[first:last]]
-            both = np.full((_FREE.tile_cells, _FREE.tile_cells, _FREE.directions, 2 * _FREE.remembered), -np.inf)
-            if key in tiles:
-                both[..., : _FREE.remembered] = tiles[key]
-            both[inside[part, 0], inside[part, 1], cells[part, 2], _FREE.remembered + rank[part]] = times[part]
-            tiles[key] = _latest(both)
+            # Only cells with new times change.
+            index = np.cumsum(new[part]) - 1
+            at = tuple(np.column_stack([inside[part], cells[part, 2]])[new[part]].T)
+            before = tiles.get(key)
+            shape = (_FREE.tile_cells, _FREE.tile_cells, _FREE.directions, _FREE.remembered)
+            tile_times = np.full(shape, -np.inf) if before is None else before.copy()
+            both = np.full((len(at[0]), 2 * _FREE.remembered), -np.inf)
+            both[:, : _FREE.remembered] = tile_times[at]
+            both[index, _FREE.remembered + rank[part]] = times[part]
+            tile_times[at] = _latest(both)
+            tiles[key] = tile_times
         return DirectionalFreeSpace(tiles)
 
     def union(self, other: "DirectionalFreeSpace") -> "DirectionalFreeSpace":
@@ -129,30 +136,167 @@ def observe_free_space(
     Returns:
         The cells (cell x, cell y, direction), and the row of ``pose`` of the scan that saw through each.
     """
-    direct = np.flatnonzero((ring.paths[:, 0] == ring.paths[:, 1]) & (np.asarray(ring.echo_paths.width) > 0))
-    path_at = np.broadcast_to(pose[:, None], (len(pose), len(ring.paths), 3))
-    if path_pose is not None:
-        path_at = compose(path_at, path_pose)
-    measured = np.ones((len(pose), len(ring.paths)), bool) if measured is None else measured
-    reach = _FREE.certain * ring.max_range + _FREE.margin
-    first = np.where(measured, reach, 0.0)
-    np.minimum.at(first, (scan, path), distance)
-    free, sensor = _free_cells(ring, path_at, direct, first[:, direct], walls)
-    on_arcs = _cells_on_arcs(ring, path_at[scan, path], path, distance, scan)
+    return ScanViews.of(ring, pose, scan, path, distance, measured=measured, path_pose=path_pose).free_cells(walls)
 
-    code, low, size = _encode(np.concatenate([free, on_arcs], axis=1))
-    cells, echo_cells = code[: free.shape[1]], code[free.shape[1] :]
-    if np.asarray(ring.echo_paths.width)[direct].sum() >= 2 * 2 * np.pi:
-        visible, observer = free[:, :0], sensor[:0]
+
+@dataclass(frozen=True, eq=False)
+class ScanViews:
+    """What scans show of free space before the walls of their own models occlude a part of it.
+
+    The walls depend on the length of the windows, the views do not.
+    """
+
+    free: "_RayViews"
+    """Cells in front of the first echoes."""
+    visible: "_RayViews | None"
+    """Cells that all sensors would have seen without echoes, in the scans that did not measure all direct paths; None
+    where a single sensor decides, or every scan measured all of them."""
+    on_arcs: Int[np.ndarray, "4 points"]
+    """Cells that the arcs of echoes cross: rows of scan, cell x, cell y, direction."""
+    measured: Bool[np.ndarray, "scans direct"]
+    """Direct paths that each scan measured."""
+    confirms: bool
+    """Whether a second sensor must agree."""
+
+    @classmethod
+    def of(
+        cls,
+        ring: Ring,
+        pose: Float[np.ndarray, "scans 3"],
+        scan: Int[np.ndarray, " echoes"],
+        path: Int[np.ndarray, " echoes"],
+        distance: Float[np.ndarray, " echoes"],
+        *,
+        measured: Bool[np.ndarray, "scans paths"] | None = None,
+        path_pose: Float[np.ndarray, "scans paths 3"] | None = None,
+    ) -> "ScanViews":
+        """The views of scans; arguments as for ``observe_free_space``."""
+        direct = np.flatnonzero((ring.paths[:, 0] == ring.paths[:, 1]) & (np.asarray(ring.echo_paths.width) > 0))
+        path_at = np.broadcast_to(pose[:, None], (len(pose), len(ring.paths), 3))
+        if path_pose is not None:
+            path_at = compose(path_at, path_pose)
+        measured = np.ones((len(pose), len(ring.paths)), bool) if measured is None else measured
+        reach = _FREE.certain * ring.max_range + _FREE.margin
+        first = np.where(measured, reach, 0.0)
+        np.minimum.at(first, (scan, path), distance)
+        confirms = bool(np.asarray(ring.echo_paths.width)[direct].sum() >= 2 * 2 * np.pi)
         partial = ~measured[:, direct].all(axis=1)
-        if partial.any():
-            reach = np.where(partial, reach, 0.0)
-            visible, observer = _free_cells(ring, path_at, direct, np.tile(reach[:, None], len(direct)), walls)
-        cells = cells[_is_agreed(free, sensor, visible, observer, measured[:, direct])]
-    cells = _sorted_unique(cells)
-    cells = cells[~_is_in(cells, np.sort(echo_cells))]
-    who, x, y, direction = (value + least for value, least in zip(np.unravel_index(cells, size), low, strict=True))
-    return np.column_stack([x, y, direction]), who
+        visible = None
+        if confirms and partial.any():
+            without_echoes = np.tile(np.where(partial, reach, 0.0)[:, None], len(direct))
+            visible = _RayViews.of(ring, path_at, direct, without_echoes)
+        return cls(
+            free=_RayViews.of(ring, path_at, direct, first[:, direct]),
+            visible=visible,
+            on_arcs=_cells_on_arcs(ring, path_at[scan, path], path, distance, scan),
+            measured=measured[:, direct],
+            confirms=confirms,
+        )
+
+    def free_cells(
+        self, walls: Sequence[Float[np.ndarray, "_ 2 2"]]
+    ) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, " cells"]]:
+        """Cells that each scan saw through, and the scans; ``walls`` and results as for ``observe_free_space``."""
+        occluded_from = self.free.distance_to_walls(walls)
+        free, sensor = self.free.unoccluded(occluded_from)
+        code, low, size = _encode(np.concatenate([free, self.on_arcs], axis=1))
+        cells, echo_cells = code[: free.shape[1]], code[free.shape[1] :]
+        if self.confirms:
+            views = free[:, :0], sensor[:0]
+            if self.visible is not None:
+                views = self.visible.unoccluded(occluded_from)
+            cells = cells[_is_agreed(free, sensor, *views, self.measured)]
+        cells = _sorted_unique(cells)
+        cells = cells[~_is_in(cells, np.sort(echo_cells))]
+        who, x, y, direction = (value + least for value, least in zip(np.unravel_index(cells, size), low, strict=True))
+        return np.column_stack([x, y, direction]), who
+
+
+@dataclass(frozen=True, eq=False)
+class _RayViews:
+    """Cells in front of the first echo of a sensor that faces them, found along rays. A cell may be repeated."""
+
+    cells: Int[np.ndarray, "4 views"]
+    """Rows of scan, cell x, cell y, direction."""
+    sensor: Int[np.ndarray, " views"]
+    """Index into the direct paths."""
+    ray: Int[np.ndarray, " views"]
+    """Row of the ray among those of all scans and sensors."""
+    depth: Float[np.ndarray, " views"]
+    """Distance of the cell from the sensor, metres: that along the ray or that of its center, the larger one."""
+    position: Float[np.ndarray, "scans direct 2"]
+    """Positions of the sensors, world frame, metres."""
+    directions: Float[np.ndarray, "scans direct rays 2"]
+    """Unit vectors of the rays."""
+
+    @classmethod
+    def of(
+        cls,
+        ring: Ring,
+        path_at: Float[np.ndarray, "scans paths 3"],
+        direct: Int[np.ndarray, " direct"],
+        first: Float[np.ndarray, "scans direct"],
+    ) -> "_RayViews":
+        """The views of all scans.
+
+        Args:
+            ring: the sensors.
+            path_at: world_from_robot when each path was measured.
+            direct: rows of ``ring.paths``, the direct paths.
+            first: distance of the first echo of each scan and direct path, metres.
+        """
+        geometry = ring.echo_paths
+        midpoint, start, width = (np.asarray(v)[direct] for v in (geometry.midpoint, geometry.start, geometry.width))
+        distances = np.arange(_FREE.cell / 2, _FREE.certain * ring.max_range, _FREE.cell * 0.7)
+        # Arrays are (scans, direct paths, rays).
+        fraction = 0.5 + _FREE.certain * np.linspace(-0.5, 0.5, _FREE.rays)
+        robot = path_at[:, direct]
+        theta = robot[..., None, 2] + (start[:, None] + width[:, None] * fraction)
+        sensor = robot[..., :2] + rotate(midpoint[None], robot[..., 2])
+        ray = unit(theta)
+        free_until = first - _FREE.margin
+        # A sensor faces a cell only if it would hear walls of every direction in the cell's sector.
+        direction = _sector_of(theta)
+        begin = direction * _FREE.sector - robot[..., None, 2] - start[:, None]
+        faces = np.mod(begin, 2 * np.pi) <= width[:, None] - _FREE.sector
+        is_free = distances < free_until[..., None]
+        who, sensor_row, ray_row, step = np.nonzero(is_free[:, :, None] & faces[..., None])
+        of_sensor = who * len(direct) + sensor_row
+        ray_of = of_sensor * theta.shape[-1] + ray_row
+        from_x, from_y = sensor.reshape(-1, 2)[of_sensor].T
+        toward, distance = ray.reshape(-1, 2)[ray_of], distances[step]
+        cell_x = np.floor((from_x + distance * toward[:, 0]) / _FREE.cell)
+        cell_y = np.floor((from_y + distance * toward[:, 1]) / _FREE.cell)
+        # The center of the cell must be closer than the echo, too.
+        to_center = np.hypot((cell_x + 0.5) * _FREE.cell - from_x, (cell_y + 0.5) * _FREE.cell - from_y)
+        near = to_center < free_until.ravel()[of_sensor]
+        cell_x, cell_y = cell_x[near].astype(np.int64), cell_y[near].astype(np.int64)
+        return cls(
+            cells=np.stack([who[near], cell_x, cell_y, direction.ravel()[ray_of[near]]]),
+            sensor=sensor_row[near],
+            ray=ray_of[near],
+            depth=np.maximum(distance, to_center)[near],
+            position=sensor,
+            directions=ray,
+        )
+
+    def distance_to_walls(self, walls: Sequence[Float[np.ndarray, "_ 2 2"]]) -> Float[np.ndarray, "scans direct rays"]:
+        """Distance along each ray to the first wall that its scan shows, metres; inf for none."""
+        distance = np.full(self.directions.shape[:3], np.inf)
+        # Consecutive scans of one window show the same walls.
+        for _, group in groupby(range(len(walls)), key=lambda k: id(walls[k])):
+            rows = list(group)
+            if len(walls[rows[0]]):
+                rows = slice(rows[0], rows[-1] + 1)
+                distance[rows] = _distance_to_walls(self.position[rows], self.directions[rows], walls[rows.start])
+        return distance
+
+    def unoccluded(
+        self, occluded_from: Float[np.ndarray, "scans direct rays"]
+    ) -> tuple[Int[np.ndarray, "4 views"], Int[np.ndarray, " views"]]:
+        """Cells and sensors of the views before the rays are occluded."""
+        kept = self.depth < (occluded_from.ravel() - _FREE.margin)[self.ray]
+        return self.cells[:, kept], self.sensor[kept]
 
 
 def _is_agreed(
@@ -188,56 +332,6 @@ def _is_agreed(
     return agreed | _is_in(block, blocks[alone])
 
 
-def _free_cells(
-    ring: Ring,
-    path_at: Float[np.ndarray, "scans paths 3"],
-    direct: Int[np.ndarray, " direct"],
-    first: Float[np.ndarray, "scans direct"],
-    walls: Sequence[Float[np.ndarray, "_ 2 2"]],
-) -> tuple[Int[np.ndarray, "4 views"], Int[np.ndarray, " views"]]:
-    """Cells in front of the first echo of a sensor that faces them, found along rays.
-
-    Args:
-        ring: the sensors.
-        path_at: world_from_robot when each path was measured.
-        direct: rows of ``ring.paths``, the direct paths.
-        first: distance of the first echo of each scan and direct path, metres.
-        walls: segments that each scan shows, world frame, metres.
-
-    Returns:
-        Rows of scan, cell x, cell y, direction; and the index into ``direct``. A cell may be repeated.
-    """
-    geometry = ring.echo_paths
-    midpoint, start, width = (np.asarray(v)[direct] for v in (geometry.midpoint, geometry.start, geometry.width))
-    distances = np.arange(_FREE.cell / 2, _FREE.certain * ring.max_range, _FREE.cell * 0.7)
-    # Arrays are (scans, direct paths, rays).
-    fraction = 0.5 + _FREE.certain * np.linspace(-0.5, 0.5, _FREE.rays)
-    robot = path_at[:, direct]
-    theta = robot[..., None, 2] + (start[:, None] + width[:, None] * fraction)
-    sensor = robot[..., :2] + rotate(midpoint[None], robot[..., 2])
-    ray = unit(theta)
-    free_until = np.broadcast_to(first[..., None] - _FREE.margin, theta.shape).copy()
-    for k, segments in enumerate(walls):
-        if len(segments):
-            occluded_from = _distance_to_walls(sensor[k], ray[k], segments)
-            free_until[k] = np.minimum(free_until[k], occluded_from - _FREE.margin)
-    # A sensor faces a cell only if it would hear walls of every direction in the cell's sector.
-    direction = _sector_of(theta)
-    begin = direction * _FREE.sector - robot[..., None, 2] - start[:, None]
-    faces = np.mod(begin, 2 * np.pi) <= width[:, None] - _FREE.sector
-    who, sensor_row, ray_row, step = np.nonzero((distances < free_until[..., None]) & faces[..., None])
-    ray_of = (who * len(direct) + sensor_row) * theta.shape[-1] + ray_row
-    from_x, from_y = sensor.reshape(-1, 2)[who * len(direct) + sensor_row].T
-    toward, distance = ray.reshape(-1, 2)[ray_of], distances[step]
-    cell_x = np.floor((from_x + distance * toward[:, 0]) / _FREE.cell)
-    cell_y = np.floor((from_y + distance * toward[:, 1]) / _FREE.cell)
-    # The center of the cell must be closer than the echo, too.
-    to_center = np.hypot((cell_x + 0.5) * _FREE.cell - from_x, (cell_y + 0.5) * _FREE.cell - from_y)
-    near = to_center < free_until.ravel()[ray_of]
-    cell_x, cell_y = cell_x[near].astype(np.int64), cell_y[near].astype(np.int64)
-    return np.stack([who[near], cell_x, cell_y, direction.ravel()[ray_of[near]]]), sensor_row[near]
-
-
 def _cells_on_arcs(
     ring: Ring,
     robot: Float[np.ndarray, "echoes 3"],
@@ -259,19 +353,19 @@ def _cells_on_arcs(
 
 
 def _distance_to_walls(
-    sensor: Float[np.ndarray, "sensors 2"],
-    ray: Float[np.ndarray, "sensors rays 2"],
+    sensor: Float[np.ndarray, "scans sensors 2"],
+    ray: Float[np.ndarray, "scans sensors rays 2"],
     segments: Float[np.ndarray, "walls 2 2"],
-) -> Float[np.ndarray, "sensors rays"]:
+) -> Float[np.ndarray, "scans sensors rays"]:
     """Distance along each ray to the first wall, or to where a wall may extend beyond its end, metres; inf for none."""
     along = segments[:, 1] - segments[:, 0]
     length = np.linalg.norm(along, axis=-1)
     tangent = along / np.maximum(length, 1e-9)[:, None]
     normal = perpendicular(tangent)
-    offset = segments[:, 0] - sensor[:, None]
-    toward = np.einsum("srk,wk->srw", ray, normal)
-    distance = (offset * normal).sum(-1)[:, None] / np.where(np.abs(toward) > 1e-9, toward, np.nan)
-    position = distance * np.einsum("srk,wk->srw", ray, tangent) - (offset * tangent).sum(-1)[:, None]
+    offset = segments[:, 0] - sensor[..., None, :]
+    toward = np.einsum("nsrk,wk->nsrw", ray, normal)
+    distance = (offset * normal).sum(-1)[..., None, :] / np.where(np.abs(toward) > 1e-9, toward, np.nan)
+    position = distance * np.einsum("nsrk,wk->nsrw", ray, tangent) - (offset * tangent).sum(-1)[..., None, :]
     # A ray that faces the wall would have detected the extension, so the extension occludes nothing from it.
     extension = np.where(np.abs(toward) < np.cos(_FREE.facing), _FREE.extension, 0.0)
     meets = (distance > 0) & (position > -extension) & (position < length + extension)

@@ -1,6 +1,6 @@
 """The evidence that scans contribute to a map. Evidence adds up in any order, so maps can be built scan by scan."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.mapping.driven_space import DrivenSpace
-from jaxsonar.mapping.free_space import DirectionalFreeSpace, observe_free_space
+from jaxsonar.mapping.free_space import DirectionalFreeSpace, ScanViews
 from jaxsonar.mapping.observations import concatenate, merge_cells
 from jaxsonar.mapping.point_landmarks import PointLandmarks, aggregate_points
 from jaxsonar.mapping.settings import SETTINGS
@@ -17,6 +17,8 @@ from jaxsonar.mapping.wall_segments import WallSegments, aggregate_segments
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
+
+_NO_WALLS = np.zeros((0, 2, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,22 +92,33 @@ def gather_evidence(ring: Ring, log: Log, models: Iterable[LocalModel]) -> MapEv
         log: the scans that the models come from, with their poses. Scans and models without a pose are left out.
         models: local models in the order of the log. A model of a window represents all scans since the previous one.
     """
-    models = list(models)
+    return gather_evidence_of_each(ring, log, [list(models)])[0]
+
+
+def gather_evidence_of_each(ring: Ring, log: Log, models: Sequence[Sequence[LocalModel]]) -> list[MapEvidence]:
+    """The evidence of several lists of local models of one log, such as those of windows of several lengths.
+
+    Args:
+        ring: the sensors.
+        log: as for ``gather_evidence``.
+        models: lists as for ``gather_evidence``.
+    """
     row_of_scan = {int(number): row for row, number in enumerate(log.scan)}
-    rows = np.array([row_of_scan[model.scan] for model in models], dtype=np.int64)
-    poses = log.pose[rows]
-    has_pose = np.all(np.isfinite(poses), axis=1)
-    # Observed walls, corners and edges.
-    segments, points = aggregate_segments(models, poses), aggregate_points(models, poses)
+    rows = [np.array([row_of_scan[model.scan] for model in of_one], dtype=np.int64) for of_one in models]
+    observations = [_observations(of_one, log.pose[at]) for of_one, at in zip(models, rows, strict=True)]
     # Free space, limited by the walls that each model shows.
-    lines = [len(model.lines) if posed else 0 for model, posed in zip(models, has_pose, strict=True)]
-    walls_of_model = np.split(segments.endpoints, np.cumsum(lines)[:-1])
-    free_space = _free_space(ring, log, rows, walls_of_model)
-    # Where the robot was.
-    robot_cells = np.round(poses[has_pose, :2] / SETTINGS.evidence.position_cell).astype(np.int64)
-    before = np.arange(len(log)) <= rows.max(initial=-1)
-    driven = DrivenSpace.of(ring, log.pose[before], scan_times(log)[before])
-    return MapEvidence(segments, points, free_space, np.unique(robot_cells, axis=0), int(has_pose.sum()), driven)
+    free_spaces = _free_spaces(ring, log, rows, [walls for _, _, walls in observations])
+    evidence = []
+    for at, (segments, points, _), free_space in zip(rows, observations, free_spaces, strict=True):
+        # Where the robot was.
+        position = log.pose[at][np.all(np.isfinite(log.pose[at]), axis=1), :2]
+        robot_cells = np.round(position / SETTINGS.evidence.position_cell).astype(np.int64)
+        before = np.arange(len(log)) <= at.max(initial=-1)
+        driven = DrivenSpace.of(ring, log.pose[before], scan_times(log)[before])
+        evidence.append(
+            MapEvidence(segments, points, free_space, np.unique(robot_cells, axis=0), len(position), driven)
+        )
+    return evidence
 
 
 def scan_times(log: Log) -> Float[np.ndarray, " scans"]:
@@ -113,38 +126,53 @@ def scan_times(log: Log) -> Float[np.ndarray, " scans"]:
     return np.where(np.isnan(log.stamp), log.scan, log.stamp)
 
 
-def _free_space(
-    ring: Ring, log: Log, rows: Int[np.ndarray, " models"], walls_of_model: list[Float[np.ndarray, "_ 2 2"]]
-) -> DirectionalFreeSpace:
-    """The free space that the scans up to the last model observe.
+def _observations(
+    models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]
+) -> tuple[WallSegments, PointLandmarks, list[Float[np.ndarray, "_ 2 2"]]]:
+    """Observed walls, corners and edges of models at these poses (NaN: none), and the wall segments of each model."""
+    segments, points = aggregate_segments(models, poses), aggregate_points(models, poses)
+    has_pose = np.all(np.isfinite(poses), axis=1)
+    lines = [len(model.lines) if posed else 0 for model, posed in zip(models, has_pose, strict=True)]
+    return segments, points, np.split(segments.endpoints, np.cumsum(lines)[:-1])
+
+
+def _free_spaces(
+    ring: Ring,
+    log: Log,
+    rows: Sequence[Int[np.ndarray, " _"]],
+    walls: Sequence[Sequence[Float[np.ndarray, "_ 2 2"]]],
+) -> list[DirectionalFreeSpace]:
+    """The free space that the scans up to the last model observe, for several lists of models.
 
     Args:
         ring: the sensors.
         log: the scans.
-        rows: row of the last scan of each model, ascending.
-        walls_of_model: segments that each model shows, world frame, metres.
+        rows: of each list, the row of the last scan of each model, ascending.
+        walls: of each list, the segments that each model shows, world frame, metres.
     """
     flat, _ = FlatEchoes.from_log(ring, log)
     distance = np.asarray(ring.corrected(flat.reported, *ring.paths[flat.path].T))
     posed = np.flatnonzero(np.all(np.isfinite(log.pose), axis=1))
-    posed = posed[posed <= rows.max(initial=-1)]
+    posed = posed[posed <= max((int(at.max(initial=-1)) for at in rows), default=-1)]
     time = scan_times(log)
-    free_space = DirectionalFreeSpace()
+    free_spaces = [DirectionalFreeSpace() for _ in rows]
     for first in range(0, len(posed), SETTINGS.evidence.block_scans):
         block = posed[first : first + SETTINGS.evidence.block_scans]
         echo = np.arange(int(flat.start[block[0]]), int(flat.start[block[-1] + 1]))
         echo = echo[(distance[echo] > 0) & (distance[echo] < ring.max_range) & np.isin(flat.scan[echo], block)]
-        scan = np.searchsorted(block, flat.scan[echo])
-        walls = [walls_of_model[k] for k in np.searchsorted(rows, block)]
-        cells, who = observe_free_space(
+        views = ScanViews.of(
             ring,
             log.pose[block],
-            scan,
+            np.searchsorted(block, flat.scan[echo]),
             flat.path[echo],
             distance[echo],
-            walls,
             measured=None if flat.measured is None else flat.measured[block],
             path_pose=None if flat.path_pose is None else flat.path_pose[block],
         )
-        free_space = free_space.updated(cells, time[block][who])
-    return free_space
+        for k, (at, walls_of_model) in enumerate(zip(rows, walls, strict=True)):
+            model = np.searchsorted(at, block)
+            represented = model < len(at)
+            cells, who = views.free_cells([walls_of_model[m] if m < len(at) else _NO_WALLS for m in model.tolist()])
+            counts = represented[who]
+            free_spaces[k] = free_spaces[k].updated(cells[counts], time[block][who[counts]])
+    return free_spaces

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxsonar.geometry.robust_statistics import robust_deviation
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.scans.measured_paths import path_rows
 from jaxsonar.scans.readings import is_repeated
@@ -55,10 +55,5 @@ def range_noise(ring: Ring, log: Log) -> float:
     second = second[np.isfinite(second)]
     if len(second) < SETTINGS.min_samples:
         return float("nan")
-    noise = _robust_deviation(second) / np.sqrt(6)
+    noise = robust_deviation(second, center=0.0) / np.sqrt(6)
     return noise if noise > SETTINGS.min_noise else float("nan")
-
-
-def _robust_deviation(values: Float[np.ndarray, " values"]) -> float:
-    """1.4826 x median absolute value."""
-    return 1.4826 * float(np.median(np.abs(values)))

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxsonar.geometry.robust_statistics import robust_deviation
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.plausibility.constant_ranges import (
     distinct_views,
@@ -387,7 +388,7 @@ def _fullest_window(
         for _ in range(3):
             near = ordered[np.abs(ordered - center) <= 3 * max(sigma, SETTINGS.min_half_width / 3)]
             center = float(np.median(near))
-            sigma = 1.4826 * float(np.median(np.abs(near - center)))
+            sigma = robust_deviation(near)
         half_width = max(SETTINGS.spread * sigma, SETTINGS.min_half_width, SETTINGS.resolution * resolution)
         deviation = ordered - center
         inside = int((np.abs(deviation) <= half_width).sum())

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
+from jaxsonar.geometry.robust_statistics import robust_deviation
 from jaxsonar.geometry.se2 import rotate, transform_points, unit, wrap_angle
 from jaxsonar.scans.firing_poses import poses_at, reading_poses
 from jaxsonar.scans.measured_paths import path_rows
@@ -259,7 +260,7 @@ def _best_kind(
 
 def residual_noise(residual: Float[np.ndarray, " echoes"]) -> float:
     """Robust standard deviation of residuals, metres, at least ``min_noise``."""
-    return max(1.4826 * float(np.median(np.abs(residual))), SETTINGS.min_noise) if len(residual) else SETTINGS.min_noise
+    return max(robust_deviation(residual, center=0.0), SETTINGS.min_noise)
 
 
 def biweight(residual: Float[np.ndarray, " echoes"], noise: float) -> Float[np.ndarray, " echoes"]:

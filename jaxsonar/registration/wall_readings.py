@@ -51,10 +51,12 @@ def fresh_readings(ring: Ring, log: Log) -> Log:
     return without_readings(log, removed)
 
 
-def distance_travelled(log: Log) -> Float[np.ndarray, " scans"]:
-    """Length of the trajectory up to each scan, metres; steps to and from a scan without a pose count as 0."""
-    step = np.hypot(*np.diff(log.pose[:, :2], axis=0).T)
-    return np.append(0.0, np.cumsum(np.nan_to_num(step)))[: len(log)]
+def distance_travelled(poses: Float[np.ndarray, "scans 3"]) -> Float[np.ndarray, " scans"]:
+    """Length of the trajectory up to each scan, metres, along the scans with a pose (the others: NaN)."""
+    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
+    steps = np.zeros(len(poses))
+    steps[known[1:]] = np.hypot(*np.diff(poses[known, :2], axis=0).T)
+    return np.cumsum(steps)
 
 
 def nearest_faces(

@@ -10,8 +10,8 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxsonar.calibration.calibration_result import Calibration
 from jaxsonar.calibration.echo_model import EchoStatistics
-from jaxsonar.calibration.robust_statistics import robust_deviation
 from jaxsonar.evaluation.laser_range_fit import LaserRangeFit
+from jaxsonar.geometry.robust_statistics import robust_deviation
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.reports.plot_style import (
     CROSS_COLOR,

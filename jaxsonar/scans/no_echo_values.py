@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxsonar.geometry.robust_statistics import robust_deviation
 from jaxsonar.scans.readings import explicit_log, without_readings
 from jaxsonar.scans.scan_log import InvalidLogValue, Log
 
@@ -342,7 +343,7 @@ def _center_and_spread(reported: Float[np.ndarray, " echoes"], center: float, sp
         near = reported[np.abs(reported - center) <= SETTINGS.half_width * spread]
         center = float(np.median(near))
         # The deviation of a truncated normal distribution is too small; the factor holds without truncation.
-        spread = min(1.4826 * float(np.median(np.abs(near - center))), SETTINGS.noise[-1])
+        spread = min(robust_deviation(near), SETTINGS.noise[-1])
         if spread == 0:
             break
     return center, spread

@@ -180,7 +180,7 @@ class Smoother:
     def _build_map(self, data: BatchData, log: Log, state: AdjustmentState, outliers: OdometryOutliers) -> GlobalMap:
         """The map at the poses of a state, with landmarks split by covisibility and odometry outliers."""
         placed = data.logs_with_poses([log], state.poses)[0]
-        world = map_with_tentative_points(self.ring_of(state), placed, window=None, models=self.models)
+        world = map_with_tentative_points(self.ring_of(state), placed, models=self.models)
         if not len(world):
             raise NothingExplained(NO_WALL)
         if self.traversals is not None:

@@ -392,6 +392,7 @@ def test_a_log_without_walls_is_refused(nominal, log):
         ({"poses": "guess"}, "poses 'guess'; allowed is trust or estimate"),
         ({"odometry": 0.0}, "odometry 0; allowed"),
         ({"odometry": float("nan")}, "odometry nan; allowed"),
+        ({"odometry": 0.05}, "odometry 0.05 came with poses 'trust'; allowed is poses 'estimate'"),
         ({"temperature": 300.0}, "temperature 300 deg C; allowed is -60 to 85"),
         ({"temperature": float("nan")}, "temperature nan deg C; allowed"),
         ({"sigma": 0.0}, "sigma 0"),

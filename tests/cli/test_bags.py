@@ -80,10 +80,9 @@ def test_convert_writes_the_readings_of_a_turning_robot(tmp_path, capsys, at_res
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_command_reads_bags(tmp_path, kind, capsys, at_rest):
+def test_every_command_reads_bags(tmp_path, capsys, at_rest):
     """convert, map, slam and check give the result of the converted log, and that of the same run at rest."""
-    bag, ring = spinning_bag(tmp_path / "run", kind, seconds=SECONDS)
+    bag, ring = spinning_bag(tmp_path / "run", "sqlite", seconds=SECONDS)
     csv = tmp_path / "run.csv"
     assert call("convert", bag, csv) == 0
     assert load_log(csv) == load_log(bag)
@@ -97,6 +96,21 @@ def test_every_command_reads_bags(tmp_path, kind, capsys, at_rest):
     for name in ("csv", "rest"):
         for how in ("", " by slam"):
             np.testing.assert_allclose(errors[name + how], errors["bag" + how], atol=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "sqlite"])
+def test_bags_of_each_kind_hold_the_same_log(tmp_path, kind, capsys):
+    """Commands load all logs by one function: a bag with an equal log gives an equal map."""
+    bag, ring = spinning_bag(tmp_path / "run", kind, seconds=SECONDS)
+    other, _ = spinning_bag(tmp_path / "sqlite", "sqlite", seconds=SECONDS)
+    csv = tmp_path / "run.csv"
+    assert call("convert", bag, csv) == 0
+    assert load_log(csv) == load_log(bag) == load_log(other)
+    capsys.readouterr()
+    _, err = mapped(bag, ring, tmp_path / "map.geojson", capsys)
+    assert "20 scans" in err.splitlines()[-1]
+    assert findings(bag, ring, tmp_path / "check.json", capsys) == []
 
 
 @pytest.mark.parametrize("kind", ["sqlite", *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[::2])])

@@ -85,6 +85,7 @@ MISTAKES = {
     "temperature of the moon": (f"{OUT} --temperature 120", {}, ["--temperature", "120", "85"]),
     "temperature that is no number": (f"{OUT} --temperature warm", {}, ["--temperature", "warm"]),
     "odometry of 0": (f"{OUT} --odometry 0", {}, ["--odometry", "0"]),
+    "odometry of trusted poses": (f"{OUT} --odometry 0.05", {}, ["odometry 0.05", "trust", "estimate"]),
     "sigma of 0": (f"{OUT} --sigma 0", {}, ["--sigma", "0"]),
     "sigma without end": (f"{OUT} --sigma inf", {}, ["--sigma", "inf"]),
     "window of nothing": (f"{OUT} --window 0", {}, ["--window", "0"]),

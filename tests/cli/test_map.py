@@ -419,7 +419,7 @@ def test_ctrl_c_leaves_no_partial_result(here, capsys, monkeypatch, faw_ring):
         raise KeyboardInterrupt
 
     models = list(local.local_models(faw_ring, load_log("log.csv")[:2]))
-    monkeypatch.setattr(local, "local_models", interrupted_after(models))
+    monkeypatch.setattr("jaxsonar.mapping.build_map.local_models", interrupted_after(models))
     monkeypatch.setattr(reference, "reference_map", stopped)
     before = contents(here)
     assert call(*MAP.split(), "--figure", "a.svg", "--grid", "a.yaml") == 1

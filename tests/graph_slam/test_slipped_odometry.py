@@ -12,9 +12,9 @@ from jaxsonar.graph_slam.slam import slam
 from jaxsonar.graph_slam.slipped_odometry import SlippedOdometryNoise, repair_heading_slips
 from jaxsonar.registration.heading_slips import HeadingSlip, slip_transform
 
-TRUE = trajectory(240)
+TRUE = trajectory(160)
 SPARSE = replace(RING, beam=np.full(RING.count, np.radians(20.0)))
-ROW, ANGLE = 110, np.radians(25.0)
+ROW, ANGLE = 75, np.radians(25.0)
 
 
 def slipped(pose):

@@ -427,3 +427,17 @@ def test_random_rooms_are_recognizable(seed):
     hits = on_walls(world, room.walls, across=0.08, angle=math.radians(8), beyond=0.4)
     assert hits[:, audible].any(axis=0).mean() >= 0.6
     assert hits.any(axis=1).mean() >= 0.6
+
+
+def test_progress_counts_scans_and_the_observed_evidence_gives_the_map(office_log):
+    steps, observed = [], []
+    world = build_map(
+        RING,
+        office_log,
+        on_observed=lambda *found: observed.append(found),
+        progress=lambda stage, done, total: steps.append((stage, done, total)),
+    )
+    ((models, evidence),) = observed
+    assert len(models) == len(office_log)
+    assert steps[: len(models)] == [("local models", k + 1, len(office_log)) for k in range(len(models))]
+    np.testing.assert_array_equal(assemble_map(evidence).segments, world.segments)

@@ -88,7 +88,14 @@ def test_readings_at_rest_and_repeated_ones_are_left_out(ring):
     fresh = fresh_readings(replace(ring, neighbors=0), log)
     np.testing.assert_array_equal(fresh.range, [1.0, 1.1, 1.2, 1.3, 1.4])
     assert len(fresh) == count
-    np.testing.assert_allclose(distance_travelled(log), np.minimum(0.05 * np.arange(count), 0.25))
+    np.testing.assert_allclose(distance_travelled(log.pose), np.minimum(0.05 * np.arange(count), 0.25))
+
+
+def test_the_distance_travelled_leads_past_scans_without_a_pose():
+    pose = np.column_stack([[0.0, 3.0, np.nan, 3.0, np.nan], [0.0, 4.0, 0.0, 6.0, 0.0], np.zeros(5)])
+    np.testing.assert_allclose(distance_travelled(pose), [0.0, 5.0, 5.0, 7.0, 7.0])
+    assert distance_travelled(np.full((2, 3), np.nan)).tolist() == [0.0, 0.0]
+    assert len(distance_travelled(np.zeros((0, 3)))) == 0
 
 
 def test_every_renewed_reading_of_sensors_that_fire_in_turn_is_kept(ring):

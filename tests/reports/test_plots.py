@@ -16,7 +16,8 @@ from jaxsonar import LocalModel, Log, Ring, Room, Scan, SonarError, local_model,
 from jaxsonar.evaluation.laser_polygonal_model import PolygonalModel
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.occupancy.occupancy_grid import FREE, OCCUPIED, UNKNOWN
-from jaxsonar.reports import plot_map, plot_scan, plot_style
+from jaxsonar.reports import plot_grid, plot_map, plot_scan, plot_style
+from jaxsonar.reports.plot_grid import GridPanel
 from jaxsonar.simulation.office import load_office
 
 BUMPER = bumper_ring([70.0, 60.0, 60.0, 50.0], name="bumper")
@@ -131,8 +132,13 @@ DRAW = {
     "laser scan": lambda case: plot_map.laser_figure(
         PolygonalModel(case.room.walls, case.room.walls + 0.2, case.room.walls[:, 0]), case.room.walls[:, 1]
     ),
-    "grid": lambda case: plot_map.grid_figure(GRID, resolution=0.1, origin=(-1.0, 2.0)),
-    "grid and map": lambda case: plot_map.grid_figure(GRID, resolution=0.1, origin=(-1.0, 2.0), world=a_map(case)),
+    "grid": lambda case: plot_grid.grid_figure(GridPanel("Grid", GRID, 0.1, (-1.0, 2.0))),
+    "grid in the room": lambda case: plot_grid.grid_figure(
+        GridPanel("Grid", GRID, 0.1, (-1.0, 2.0)), room=case.room, poses=np.array([[0.5, 0.2, 0.0]])
+    ),
+    "grids": lambda case: plot_grid.grid_comparison_figure(
+        [GridPanel("A", GRID, 0.1, (-1.0, 2.0)), GridPanel("B", GRID, 0.2, (0.0, 0.0))], room=case.room
+    ),
 }
 
 
@@ -297,17 +303,28 @@ def test_a_thousand_segments_are_few_elements(rng, tmp_path):
     assert (tmp_path / "a.svg").stat().st_size < 3e6
 
 
-def test_the_grid_is_aligned_with_the_map():
+def test_the_grid_lies_where_its_cells_are():
     """Row 0 is the top row, so the lower left cell is the first one of the last row."""
     image = np.full((3, 5), FREE, np.uint8)
     image[2, 0] = OCCUPIED
-    figure = plot_map.grid_figure(image, resolution=0.5, origin=(10.0, -4.0))
+    figure = plot_grid.grid_figure(GridPanel("Grid", image, 0.5, (10.0, -4.0)))
     (shown,) = figure.axes[0].images
     assert shown.get_extent() == [10.0, 12.5, -4.0, -2.5]
     pixels = np.asarray(drawn(figure).buffer_rgba())[::-1, :, 0]
-    for x, y, grey in ((10.25, -3.75, OCCUPIED), (10.25, -2.75, FREE), (12.25, -3.75, FREE)):
+    for x, y, grey in ((10.25, -3.75, OCCUPIED), (10.25, -2.75, FREE), (12.25, -3.75, FREE), (9.9, -3.0, UNKNOWN)):
         column, row = figure.axes[0].transData.transform((x, y)).astype(int)
         assert pixels[row, column] == pytest.approx(255 * grey / FREE, abs=1)
+
+
+def test_several_grids_are_shown_whole_and_at_one_scale():
+    room = Room(np.array([[[-3.0, -1.0], [4.0, 2.5]]]))
+    panels = [GridPanel(name, GRID, 0.1, (-1.0, 2.0)) for name in "AB"]
+    figure = plot_grid.grid_comparison_figure([*panels, GridPanel("C", GRID, 0.5, (5.0, -2.0))], room=room)
+    assert [axes.get_title() for axes in figure.axes] == ["A", "B", "C"]
+    left, right = np.array([axes.get_xlim() for axes in figure.axes]).T
+    assert np.ptp(left) == np.ptp(right) == 0
+    assert left[0] < -3.0
+    assert right[0] > 5.0 + 0.5 * GRID.shape[1]
 
 
 # Files
@@ -339,7 +356,7 @@ def test_svg_is_xml_and_the_same_twice(figure, tmp_path):
         "aggregate in the room",
         "modeling in the room",
         "map with all",
-        "grid and map",
+        "grids",
     ],
 )
 def test_every_svg_is_the_same_twice(tmp_path, name):

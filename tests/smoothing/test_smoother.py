@@ -1,22 +1,15 @@
 """Smoothing: consistent poses and walls of the office from its ranges, undetermined directions, invalid input."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from support.wandering_robot import RING as NARROW
-from support.wandering_robot import log_of, ranges, trajectory
 
 from jaxsonar import Log, Room, SonarError, simulate
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.simulation.office import load_office
-from jaxsonar.simulation.wheel_odometry import simulate_odometry
 from jaxsonar.smoothing.smooth_log import Smoothed, smooth
 
 SIGMA = 0.005
-
-SPARSE = replace(NARROW, beam=np.full(NARROW.count, np.radians(45.0)))
 
 
 def drift(poses, rng, place=0.02, heading=0.0175):
@@ -133,21 +126,3 @@ def test_invalid_input_is_refused(recording, change, message):
     ring, log, _ = recording
     with pytest.raises(SonarError, match=message):
         smooth(ring, log, **({"poses": log.pose} | change))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.001, 0.03])
-def test_the_noise_of_the_ranges_is_estimated_with_windows(sigma):
-    """A scan has hardly more echoes than its pose has unknowns; the odometry contributes."""
-    pose = trajectory(100)
-    log = log_of(ranges(pose, sigma=sigma, seed=3, ring=SPARSE), pose)
-    odometry = simulate_odometry(pose, distance=0.01, turn=float(np.radians(0.5)), seed=4)
-    found = smooth(SPARSE, log, odometry, odometry=odometry, window=1.5)
-    assert found.sigma == pytest.approx(sigma, rel=0.25)
-
-
-def test_a_noise_that_was_given_is_not_a_result():
-    pose = trajectory(30)
-    log = log_of(ranges(pose, sigma=0.002, seed=3, ring=SPARSE), pose)
-    assert smooth(SPARSE, log, pose, odometry=pose, window=1.5, sigma=0.005).sigma is None
-    assert smooth(SPARSE, log, pose, odometry=pose, window=1.5).sigma == pytest.approx(0.002, rel=0.4)

@@ -12,8 +12,9 @@ from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.simulation.wheel_odometry import simulate_odometry
 from jaxsonar.smoothing.smooth_log import smooth
 
-TRUE = trajectory(200)
+TRUE = trajectory(120)
 SPARSE = replace(RING, beam=np.full(RING.count, np.radians(24.0)))
+WIDE = replace(RING, beam=np.full(RING.count, np.radians(45.0)))
 
 
 def uneven(reported, rng, *, relief=0.02, tail=0.1):
@@ -69,6 +70,23 @@ def test_odometry_that_walls_cannot_improve_is_kept():
     assert 0 <= found.heading_gain < 0.2
     assert found.keeps_odometry
     np.testing.assert_array_equal(found.poses, TRUE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sigma", [0.001, 0.03])
+def test_the_noise_of_the_ranges_is_estimated(sigma):
+    """A scan has hardly more echoes than its pose has unknowns; the odometry contributes."""
+    pose = TRUE[:100]
+    odometry = simulate_odometry(pose, distance=0.01, turn=float(np.radians(0.5)), seed=4)
+    log = log_of(ranges(pose, sigma=sigma, seed=3, ring=WIDE), odometry)
+    found = smooth(WIDE, log, odometry, odometry=odometry, window=1.5)
+    assert found.sigma == pytest.approx(sigma, rel=0.25)
+
+
+def test_a_noise_that_was_given_is_not_a_result():
+    pose = TRUE[:30]
+    log = log_of(ranges(pose, sigma=0.002, seed=3, ring=WIDE), pose)
+    assert smooth(WIDE, log, pose, odometry=pose, window=1.5, sigma=0.005).sigma is None
 
 
 def test_without_any_wall_nothing_is_called_a_result():
