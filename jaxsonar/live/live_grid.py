@@ -102,12 +102,15 @@ class LiveGrid:
         self._pending += scans
 
     @property
+    def is_full(self) -> bool:
+        """Whether an update should start now, because many scans are pending."""
+        return len(self._pending) >= SETTINGS.max_pending
+
+    @property
     def is_due(self) -> bool:
-        """Whether an update should start now."""
-        if len(self._pending) >= SETTINGS.max_pending:
-            return True
+        """Whether an update should start with the next map."""
         is_running = self._update is not None and not self._update.done()
-        return bool(self._pending) and not is_running and time.monotonic() >= self._due
+        return self.is_full or (bool(self._pending) and not is_running and time.monotonic() >= self._due)
 
     def start_update(self, world: GlobalMap) -> None:
         """Start an update in the background; waits for a running one.

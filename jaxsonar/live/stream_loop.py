@@ -29,7 +29,10 @@ class StreamSettings:
     """Timing and capacities of a stream. All values are chosen by hand."""
 
     map_interval: float = 2.0
-    """Seconds between two writes of the map."""
+    """Seconds between two writes of the map, at least."""
+    map_pause: float = 5.0
+    """Pause between two computations of the map, in durations of the last one: scans do not wait for most of the time,
+    however large the map is."""
     warm_up_capacity: int = 8192
     """Capacity of the queue during compilation, scans: 12 min of the paper's ring, about 30 MB."""
     poll_interval: float = 0.2
@@ -177,18 +180,19 @@ class StreamLoop:
             self._view.show(live_scans[-1])
 
     def _update_outputs(self) -> None:
-        """Write and show what is due, if there are new scans."""
-        has_map = self._map_filename is not None or self._view is not None
-        map_is_due = has_map and time.monotonic() >= self._next_map
-        grid_is_due = self._grid is not None and self._grid.is_due
-        if (map_is_due and self.status.scans != self._mapped_scans) or grid_is_due:
-            world = self._live.map()
-            if map_is_due:
-                self._write_map(world)
-            if self._grid is not None and grid_is_due:
-                self._grid.start_update(world)
-        if map_is_due:
-            self._next_map = time.monotonic() + self._map_interval
+        """Write and show map and grid if they are due, and there are new scans."""
+        start, grid = time.monotonic(), self._grid
+        is_due = start >= self._next_map and self.status.scans != self._mapped_scans
+        if not (is_due or (grid is not None and grid.is_full)):
+            return
+        if grid is None and self._map_filename is None and self._view is None:
+            return
+        world = self._live.map()
+        self._write_map(world)
+        if grid is not None and grid.is_due:
+            grid.start_update(world)
+        now = time.monotonic()
+        self._next_map = now + max(self._map_interval, SETTINGS.map_pause * (now - start))
 
     def _finish_outputs(self) -> None:
         """Write the last map, trajectory and grid."""

@@ -126,7 +126,8 @@ def test_updates_pause_and_failures_reach_the_stream(scans, tmp_path):
     add(live, grid, scans[:1])
     assert not grid.is_due, "the interval is long"
     add(live, grid, scans[1:2] * SETTINGS.max_pending)
-    assert grid.is_due, "memory is bounded"
+    assert grid.is_full, "memory is bounded"
+    assert grid.is_due
     grid = LiveGrid(live, tmp_path / "no" / "m.yaml", interval=0.0)
     add(live, grid, scans[:1])
     assert grid.is_due
