@@ -9,6 +9,7 @@ Modules, in the order of the data:
 - ``robust_fit``: one reflector fitted to echoes. ``ml_detection`` with ``ml_detection_*``: all reflectors of a scan.
 - ``data_association``, ``iterated_ekf``, ``bundle_adjustment``: echoes and landmarks, poses and ring parameters.
 - ``focus_measure``, ``beam_pattern``: ring parameters without landmarks, and the detection cones of the sensors.
+- ``occupancy_evidence``: cells that echoes come from, cells that were seen through, and grids after Bayes.
 - ``planar_geometry``: vectors, poses and lines. ``shape_buckets``: sizes of padded arrays.
 
 Kernels that have a slow NumPy oracle in ``tests/support/oracles.py`` name it in their docstrings.

@@ -27,12 +27,14 @@ from .hough_accumulator import HoughSettings
 from .hough_voting import PackedEchoes, RingArcs, map_scans, tangent_lines
 from .measurement_model import PLANE, plane_echo, point_echo
 from .ml_detection_likelihood import (
+    alignment_ratio,
     clutter_log_density,
+    plane_log_prior,
     plane_missed_log_likelihood,
+    point_log_prior,
     point_missed_log_likelihood,
     refine,
 )
-from .ml_detection_prior import alignment_ratio, plane_log_prior, point_log_prior
 from .ml_detection_settings import DetectionSettings
 from .ml_detection_state import Hypotheses, ScanData, SceneEstimate, Selection, count, determinant
 from .planar_geometry import fold_line, segment_endpoints, wrap_angle

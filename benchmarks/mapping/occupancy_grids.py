@@ -90,20 +90,17 @@ def grids(scene: Scene) -> Iterator[tuple[str, Row]]:
     for method, name in BAYESIAN.items():
         bayesian = occupancy(scene.ring, scene.log, method=method)
         yield name, score(scene, bayesian, free=likely_free(bayesian, method))
-    lines = np.zeros(grid.occupied.shape, bool)
-    cell = known.cells(grid.resolution) - grid.corner
-    cell = cell[((cell >= 0) & (cell < lines.shape[::-1])).all(axis=1)]
-    lines[cell[:, 1], cell[:, 0]] = True
+    lines = np.zeros_like(grid.occupied)
+    column, row = (known.cells(grid.resolution) - np.array(grid.corner, int)).T
+    inside = (column >= 0) & (row >= 0) & (column < lines.shape[1]) & (row < lines.shape[0])
+    lines[row[inside], column[inside]] = True
     yield LINES, score(scene, grid, occupied=lines, free=np.zeros_like(lines))
 
 
 def likely_free(grid: OccupancyGrid, method: GridMethod) -> np.ndarray:
-    """Free cells as the related work has them: those that are probably not occupied, whatever was proven."""
-    if method == "em":
-        probability = (grid.evidence + 0.5) / (grid.evidence + 1 + SETTINGS.em.missed * grid.looks)
-    else:
-        probability = 1 / (1 + np.exp(-grid.evidence))
-    return (probability < SETTINGS.free_threshold) & ~grid.occupied
+    """Free cells as the related work has them: looked through, with more evidence against an obstacle than for one."""
+    least = SETTINGS.em.occupied / 2 if method == "em" else 0.0
+    return (grid.looks >= 1) & (grid.evidence < least) & ~grid.occupied
 
 
 def score(scene: Scene, grid: OccupancyGrid, **cells: np.ndarray) -> Row:
@@ -121,7 +118,8 @@ def score(scene: Scene, grid: OccupancyGrid, **cells: np.ndarray) -> Row:
 def floor(room: Room) -> shapely.Polygon:
     """The outline of a room: the largest closed face of its walls."""
     faces = shapely.polygonize([shapely.LineString(wall) for wall in room.walls]).geoms
-    return max((shapely.Polygon(face.exterior) for face in faces), key=lambda face: face.area)
+    polygons = [shapely.Polygon(face.exterior) for face in faces if isinstance(face, shapely.Polygon)]
+    return max(polygons, key=lambda face: face.area)
 
 
 def train(seed: int) -> dict[GridMethod, tuple[float, BayesSettings]]:

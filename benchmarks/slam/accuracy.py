@@ -83,7 +83,8 @@ def run_one_scan(scene: Scene, seed: int) -> Trajectory:
 
     sd = np.array([INITIAL_SD[0], INITIAL_SD[0], INITIAL_SD[1]])
     start = scene.poses[0] + sd * np.random.default_rng(seed).standard_normal(3)
-    return localize(scene.ring, map_from_room(scene.room), scene.log(seed), start=start.tolist()).trajectory
+    plan, exact = map_from_room(scene.room), (1e-4, 1e-4)
+    return localize(scene.ring, plan, scene.log(seed), start=start.tolist(), map_sd=exact).trajectory
 
 
 def outcome(scene: Scene, variant: str, crb: Bound, *, seed: int = 0) -> Outcome:

@@ -1,6 +1,7 @@
 """The options of occupancy grids, and the grid of a log, for all commands that write one."""
 
 import argparse
+import os
 from typing import TYPE_CHECKING
 
 from jaxsonar.cli.arguments import filename_ending_in
@@ -34,7 +35,7 @@ def add_grid_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def grid_outputs(options: argparse.Namespace) -> dict[str, object]:
+def grid_outputs(options: argparse.Namespace) -> "dict[str, str | os.PathLike[str] | None]":
     """The files of the grid, for ``check_outputs``.
 
     Raises:

@@ -11,6 +11,9 @@ from jaxsonar.cli.console import ascii_name, errors_in, print_status, stage_stat
 from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 
+NAV2_SUFFIXES = (".yaml", ".yml", ".posegraph", ".data", ".pgm", ".png")
+"""Files of Nav2 and slam_toolbox, of which the YAML file is read."""
+
 SUMMARY = "Localize the robot in a known map."
 
 
@@ -18,7 +21,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar localize``."""
     add_log_arguments(parser, help=f"a short drive: {LOG_HELP}")
     parser.add_argument(
-        "--map", type=filename, required=True, metavar="MAP", help="the known map, or a floor plan: GeoJSON"
+        "--map",
+        type=filename,
+        required=True,
+        metavar="MAP",
+        help="the known map: a map or a floor plan (GeoJSON), or a map of Nav2, as slam_toolbox saves it (.yaml)",
     )
     add_slam_arguments(parser)
     parser.add_argument(
@@ -39,9 +46,8 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.fileio.atomic_files import check_outputs
     from jaxsonar.localization.localize import localize as run_localize
 
-    check_outputs(
-        {"--trajectory": options.trajectory, "--figure": options.figure}, [options.log, options.ring, options.map]
-    )
+    inputs = [options.log, options.ring, options.map, *_images_of(options.map)]
+    check_outputs({"--trajectory": options.trajectory, "--figure": options.figure}, inputs)
     messages = InputMessages(strict=options.strict)
     world = _load_known_map(options.map, messages)
     ring, log = load_inputs(options, messages=messages)
@@ -81,13 +87,15 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _load_known_map(map_filename: str, messages: InputMessages) -> "GlobalMap":
-    """Load a map, or a floor plan as a map; warn of probable mistakes in the plan."""
+    """Load a map, a floor plan, or a map of Nav2; warn of probable mistakes in a plan."""
     from jaxsonar.fileio.atomic_files import shown
     from jaxsonar.floor_plans.room_geojson import load_room
     from jaxsonar.hardware.errors import SonarError
     from jaxsonar.mapping.map_from_room import map_from_room
     from jaxsonar.mapping.map_geojson import load_map
 
+    if map_filename.lower().endswith(NAV2_SUFFIXES):
+        return _load_nav2_map(map_filename)
     try:
         world = load_map(map_filename)
     except SonarError as not_a_map:
@@ -99,6 +107,33 @@ def _load_known_map(map_filename: str, messages: InputMessages) -> "GlobalMap":
         world = map_from_room(room)
     if not len(world):
         raise SonarError(f"{shown(map_filename)}: no wall; allowed is a map with walls")
+    return world
+
+
+def _images_of(map_filename: str) -> list[str]:
+    """The image of a map of Nav2, which no output may replace."""
+    if not map_filename.lower().endswith(NAV2_SUFFIXES):
+        return []
+    from jaxsonar.occupancy.nav2_reader import image_filename
+
+    return [str(image_filename(map_filename))]
+
+
+def _load_nav2_map(map_filename: str) -> "GlobalMap":
+    """Load the walls of a map of Nav2's map_server."""
+    from jaxsonar.fileio.atomic_files import shown
+    from jaxsonar.hardware.errors import SonarError
+    from jaxsonar.mapping.map_from_grid import map_from_grid
+    from jaxsonar.occupancy.nav2_reader import check_occupancy, load_nav2
+
+    grid = load_nav2(map_filename)
+    try:
+        check_occupancy(grid)
+        world = map_from_grid(grid.occupied, grid.free, resolution=grid.resolution, origin=grid.origin)
+        if not len(world):
+            raise SonarError("no wall beside free cells; allowed is a map with straight walls of 0.25 m or more")
+    except SonarError as error:
+        raise SonarError(f"{shown(map_filename)}: {error}") from None
     return world
 
 

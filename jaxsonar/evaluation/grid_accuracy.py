@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxsonar.geometry.segments import lengths, sample_segments
 from jaxsonar.occupancy.occupancy_grid import OccupancyGrid
@@ -58,13 +58,13 @@ def grid_accuracy(
     samples, _ = sample_segments(walls, (lengths(walls) / _STEP).astype(int) + 2)
     row, column = np.nonzero(occupied)
     center = (np.stack([column, row], axis=-1) + grid.corner + 0.5) * grid.resolution
-    near, _ = cKDTree(np.concatenate([samples, poles])).query(center)
-    reached = samples[cKDTree(heard).query(samples)[0] <= HEARD] if len(heard) else samples[:0]
+    near, _ = KDTree(np.concatenate([samples, poles])).query(center)
+    reached = samples[KDTree(heard).query(samples)[0] <= HEARD] if len(heard) else samples[:0]
     truth = (np.unique(np.floor(reached / grid.resolution), axis=0) + 0.5) * grid.resolution
-    found = cKDTree(center).query(truth)[0] <= TOLERANCE if len(center) else np.zeros(len(truth), bool)
-    cell = np.floor(samples / grid.resolution).astype(int) - grid.corner
-    inside = ((cell >= 0) & (cell < free.shape[::-1])).all(axis=1)
-    in_free = free[cell[inside, 1], cell[inside, 0]].sum() / max(len(samples), 1)
+    found = KDTree(center).query(truth)[0] <= TOLERANCE if len(center) else np.zeros(len(truth), bool)
+    column, row = (np.floor(samples / grid.resolution) - grid.corner).T.astype(int)
+    inside = (column >= 0) & (row >= 0) & (column < free.shape[1]) & (row < free.shape[0])
+    in_free = free[row[inside], column[inside]].sum() / max(len(samples), 1)
     return GridAccuracy(
         float(np.mean(near <= TOLERANCE)) if len(center) else 0.0,
         float(np.mean(found)) if len(truth) else 0.0,

@@ -1,63 +1,78 @@
-"""Multi-hypothesis tracking in a known map: pose hypotheses from features, each tracked through the scans by ranges."""
+"""Multi-hypothesis tracking in a known map: all pose hypotheses are tracked through the scans by their ranges."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxsonar import kernels
 from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.estimation.odometry_noise import OdometryNoise, step_variance
 from jaxsonar.geometry.se2 import compose, diagonal_covariance, propagate, relative, subtract_poses, wrap_pose
-from jaxsonar.graph_slam.frontend import SubmapState, update
+from jaxsonar.geometry.segments import crossings
+from jaxsonar.kernels.sensor_array import transform_path
+from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
+from jaxsonar.localization.hypothesis_generation import matching_poses, similar_poses
 from jaxsonar.localization.known_map import KnownMap
-from jaxsonar.localization.settings import SETTINGS
-from jaxsonar.registration.features import scan_features
-from jaxsonar.registration.pose_hypotheses import pose_hypotheses, thin_poses
-from jaxsonar.registration.pose_likelihood import pose_log_likelihood, refine_poses
+from jaxsonar.localization.place_probabilities import relative_log_likelihood
+from jaxsonar.localization.scan_update import ScanArrays, ScanUpdate, update_hypotheses
+from jaxsonar.localization.settings import SETTINGS, UPDATE_SETTINGS, MapTrust
 from jaxsonar.scans.firing_poses import path_poses
+from jaxsonar.scans.flat_echoes import corrected_echoes
+from jaxsonar.scans.measured_paths import measured_paths
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 
 
-class TrackedHypothesis(NamedTuple):
-    """A pose hypothesis and its track through the scans so far (Kalman filter)."""
+class PoseTracks(NamedTuple):
+    """Pose hypotheses and their tracks through the scans so far, one row each."""
 
-    pose: Float[np.ndarray, "3"]
-    """world_from_robot of the latest scan; of the first scan before any update."""
-    covariance: Float[np.ndarray, "3 3"]
-    poses: tuple[Float[np.ndarray, "3"], ...] = ()
-    """Filtered poses of all scans so far."""
-    covariances: tuple[Float[np.ndarray, "3 3"], ...] = ()
-    log_likelihood: float = 0.0
-    """Log-likelihood ratio of the ranges against echoes from anywhere, nats."""
-    echoes: int = 0
-    explained: int = 0
+    pose: Float[np.ndarray, "hypotheses 3"]
+    """world_from_robot of the latest scan; of the first one before any update."""
+    covariance: Float[np.ndarray, "hypotheses 3 3"]
+    evidence: Float[np.ndarray, "hypotheses landmarks"]
+    """Sum of the evidence of each landmark of the map, nats."""
+    explained: Float[np.ndarray, " hypotheses"]
     """Number of echoes that the map explains."""
-    is_start: bool = False
+    is_start: Bool[np.ndarray, " hypotheses"]
     """Whether it is the start pose that was given."""
+    poses: Float[np.ndarray, "hypotheses scans 3"]
+    """Filtered poses of all scans so far."""
+    covariances: Float[np.ndarray, "hypotheses scans 3 3"]
+    """Their covariances."""
+    scan_evidence: Float[np.ndarray, "hypotheses scans"]
+    """Evidence of each of these scans: log-likelihood ratio of its echoes against unknown reflectors, nats."""
+
+    @classmethod
+    def at(
+        cls, pose: Float[np.ndarray, "hypotheses 3"], covariance: Float[np.ndarray, "hypotheses 3 3"], landmarks: int
+    ) -> "PoseTracks":
+        """Hypotheses before the first scan, in a map with this many landmarks."""
+        count = len(pose)
+        tracks = np.zeros((count, 0, 3)), np.zeros((count, 0, 3, 3)), np.zeros((count, 0))
+        nothing, table = np.zeros(count), np.zeros((count, landmarks))
+        return cls(pose, covariance, table, nothing, np.zeros(count, dtype=bool), *tracks)
+
+    def take(self, rows: Int[np.ndarray, " rows"] | Bool[np.ndarray, " hypotheses"]) -> "PoseTracks":
+        """Select some of the hypotheses."""
+        return PoseTracks(*(column[rows] for column in self))
+
+    def join(self, other: "PoseTracks") -> "PoseTracks":
+        """These hypotheses and others after the same scans."""
+        return PoseTracks(*(np.concatenate([mine, its]) for mine, its in zip(self, other, strict=True)))
 
     @property
-    def explained_fraction(self) -> float:
-        """Fraction of the echoes that the map explains."""
-        return self.explained / max(self.echoes, 1)
-
-    @property
-    def is_determined(self) -> bool:
-        """Whether the covariance of the latest pose is small in all directions."""
+    def is_determined(self) -> Bool[np.ndarray, " hypotheses"]:
+        """Whether the covariance of the pose was small in all directions at one of the scans."""
         position, heading = SETTINGS.max_pose_sd
-        variance = np.linalg.eigvalsh(self.covariance[:2, :2])[-1]
-        return bool(variance < position**2 and self.covariance[2, 2] < heading**2)
-
-    def is_same(self, other: "TrackedHypothesis") -> bool:
-        """Whether two hypotheses are statistically the same."""
-        off = subtract_poses(self.pose, other.pose)
-        if np.hypot(off[0], off[1]) > SETTINGS.same_pose[0] or abs(off[2]) > SETTINGS.same_pose[1]:
-            return False
-        covariance = self.covariance + other.covariance + diagonal_covariance(SETTINGS.same_pose_sd)
-        return bool(off @ np.linalg.solve(covariance, off) < SETTINGS.same_pose_chi2)
+        variance = np.linalg.eigvalsh(self.covariances[:, :, :2, :2])[..., -1]
+        is_small = (variance < position**2) & (self.covariances[:, :, 2, 2] < heading**2)
+        return np.asarray(is_small.any(axis=1))
 
 
 @dataclass(frozen=True)
@@ -72,11 +87,8 @@ class HypothesisTracker:
     """NaN where a scan has none."""
     sigma: float | None
     odometry_noise: OdometryNoise
-
-    @cached_property
-    def path_pose(self) -> Float[np.ndarray, "scans paths 3"] | None:
-        """scan_from_robot when each path was measured; None: all at the pose of the scan."""
-        return path_poses(self.ring, self.log)
+    trust: MapTrust
+    """How far the map is trusted."""
 
     @property
     def rows(self) -> Int[np.ndarray, " rows"]:
@@ -89,167 +101,264 @@ class HypothesisTracker:
         known = [model.sigma for model in self.models if model.sigma > 0]
         return self.sigma or (float(np.median(known)) if known else SETTINGS.default_sigma)
 
-    def initial_hypotheses(self, start: Float[np.ndarray, "3"] | None) -> list[TrackedHypothesis]:
-        """Hypotheses for the pose of the first scan: a given start pose, and poses at which features match the map."""
-        covariance = diagonal_covariance(SETTINGS.hypothesis_sd)
-        found = [TrackedHypothesis(pose, covariance) for pose in self._matching_poses(start)]
-        if start is None:
-            return found
-        return [TrackedHypothesis(start, diagonal_covariance(SETTINGS.start_sd), is_start=True), *found]
+    @cached_property
+    def scans(self) -> list[ScanArrays]:
+        """The echoes of the scans in ``rows``."""
+        ring, moved = self.ring, path_poses(self.ring, self.log)
+        measured = measured_paths(ring, self.log)
+        direct = np.flatnonzero(ring.paths[:, 0] == ring.paths[:, 1])
+        step = np.median(self._moved) if len(self._moved) else np.inf
+        views = float(np.clip(SETTINGS.shared_length / max(step, 1e-3), 1.0, SETTINGS.max_shared_views))
+        echoes = [corrected_echoes(ring, self.log[int(row)]) for row in self.rows]
+        size = next_power_of_two(max(len(path) for path, _ in echoes), least=SETTINGS.min_echoes)
+        full_wall = float(np.asarray(ring.exact_paths.width).sum() / (2 * np.pi))
+        full_echoes = max(UPDATE_SETTINGS.full_wall_share * full_wall, UPDATE_SETTINGS.min_full_echoes)
+        found = []
+        for row, (path, ranges) in zip(self.rows, echoes, strict=True):
+            first = np.full(len(ring.paths), np.inf)
+            np.minimum.at(first, path, ranges)
+            paths = ring.exact_paths
+            if moved is not None:
+                with jax.enable_x64(True):
+                    paths = jax.tree.map(np.asarray, jax.vmap(transform_path)(paths, jnp.asarray(moved[row])))
+            found.append(
+                ScanArrays(
+                    paths=_take(paths, pad_rows(path, size)),
+                    ranges=pad_rows(ranges, size),
+                    is_echo=np.arange(size) < len(path),
+                    direct=_take(paths, direct),
+                    first=first[direct],
+                    measured=np.asarray(measured[row][direct]),
+                    sigma=np.float64(self.range_sd),
+                    max_range=np.float64(ring.max_range),
+                    full_echoes=np.float64(full_echoes),
+                    map_views=np.float64(views),
+                )
+            )
+        return found
 
-    def _matching_poses(self, start: Float[np.ndarray, "3"] | None) -> list[Float[np.ndarray, "3"]]:
-        """Poses of the first scan at which features of the first scans match the map, the most likely first."""
-        known, rows = self.known_map.features, self.rows[: SETTINGS.first_scans]
-        first = self.odometry[rows[0]]
-        richest = sorted(rows, key=lambda row: -(len(self.models[row].lines) + len(self.models[row].points)))
-        scans = {
-            row: scan_features(self.models[row], noise_scale=SETTINGS.noise_scale)
-            for row in richest[: SETTINGS.scoring_scans]
-        }
-        # 1. Hypotheses of the scans with the most features, as poses of the first scan.
-        information = np.linalg.inv(diagonal_covariance(SETTINGS.hypothesis_sd))
-        candidates = []
-        for row in richest[: SETTINGS.hypothesis_scans]:
-            scan, back = scans[row], relative(self.odometry[row], first)
-            if len(scan.theta) + len(scan.point) < 2:
-                continue
-            # Two features determine a pose; one wall alone does not.
-            poses = pose_hypotheses(scan, known, np.zeros(3))[1 + len(scan.theta) * len(known.theta) :]
-            if start is not None:
-                poses = poses[_is_near(compose(poses, back), start)]
-            if not len(poses):
-                continue
-            poses = thin_poses(poses, SETTINGS.hypothesis_cell)
-            batches = np.array_split(poses, -(-len(poses) // 4096))
-            score = np.concatenate([pose_log_likelihood(known, scan, some).log_likelihood for some in batches])
-            best = poses[np.argsort(-score, kind="stable")[: 4 * SETTINGS.max_hypotheses]]
-            steps = SETTINGS.refinement_steps
-            best = refine_poses(known, scan, best, information, prior_mean=best, steps=steps)
-            candidates.append(compose(best, back))
-        if not candidates:
-            return []
-        # 2. Scores by all of these scans, with their odometry; the best that differ from each other.
-        poses = thin_poses(np.concatenate(candidates), SETTINGS.hypothesis_cell)
-        score = np.zeros(len(poses))
-        for row, scan in scans.items():
-            moved = compose(poses, relative(first, self.odometry[row]))
-            score = score + pose_log_likelihood(known, scan, moved).log_likelihood
-        kept: list[Float[np.ndarray, 3]] = []
-        position, heading = SETTINGS.same_pose
-        for k in np.argsort(-score, kind="stable"):
-            off = [subtract_poses(poses[k], one) for one in kept]
-            if all(np.hypot(*one[:2]) > position / 2 or abs(one[2]) > heading / 2 for one in off):
-                kept.append(poses[k])
-            if len(kept) == SETTINGS.max_hypotheses:
-                break
-        return kept
+    @cached_property
+    def echo_counts(self) -> Int[np.ndarray, " rows"]:
+        """Number of echoes of the scans in ``rows``."""
+        return np.array([int(scan.is_echo.sum()) for scan in self.scans])
 
-    def track_first_scans(
-        self, hypotheses: Sequence[TrackedHypothesis], progress: Callable[[str, int, int], None]
-    ) -> list[TrackedHypothesis]:
-        """Track hypotheses through the first scans, the most likely first; those far behind are dropped early."""
-        count = min(SETTINGS.first_scans, len(self.rows))
-        alive, dropped = list(hypotheses), []
-        for number in range(count):
-            alive = sorted((self.step(one, number) for one in alive), key=lambda one: -one.log_likelihood)
-            alive = _merged(alive)
-            best = alive[0].log_likelihood if alive else 0.0
-            least = best - SETTINGS.pruning[0] - SETTINGS.pruning[1] * max(best, 0.0)
-            # A dropped hypothesis would have kept its ratio to the best one.
-            behind = [one for one in alive if one.log_likelihood < least]
-            dropped += [(one, max(one.log_likelihood, 0.0) / max(best, 1e-9)) for one in behind]
-            alive = [one for one in alive if one.log_likelihood >= least]
-            progress("hypotheses", number + 1, count)
-        best = alive[0].log_likelihood if alive else 0.0
-        extrapolated = [one._replace(log_likelihood=best * ratio) for one, ratio in dropped]
-        return [*alive, *sorted(extrapolated, key=lambda one: -one.log_likelihood)]
+    @cached_property
+    def _moved(self) -> Float[np.ndarray, " steps"]:
+        """Motion between consecutive scans in ``rows``, metres; a turn by one radian counts as ``turn_length``."""
+        step = relative(self.odometry[self.rows[:-1]], self.odometry[self.rows[1:]])
+        return np.hypot(step[:, 0], step[:, 1]) + SETTINGS.turn_length * np.abs(step[:, 2])
 
-    def weigh_by_start(
-        self, hypotheses: Sequence[TrackedHypothesis], start: Float[np.ndarray, "3"]
-    ) -> list[TrackedHypothesis]:
-        """Add the log-prior of a start pose, the most likely first.
+    @cached_property
+    def scan_weights(self) -> Float[np.ndarray, " rows"]:
+        """Part of an independent stretch of the trajectory that each scan in ``rows`` is.
 
-        Undetermined hypotheses are left out, but for the start pose itself: its track contains them.
+        Scans on a stretch that is passed several times share it. Together all scans are at least one stretch.
         """
-        position, heading = SETTINGS.start_sd
-        sd, weighed = np.array([position, position, heading]), []
-        for one in hypotheses:
-            if one.is_start or one.is_determined:
-                off = subtract_poses(self.smooth(one)[0][0], start)
-                log_prior = -float(np.square(off / sd).sum()) / 2
-                weighed.append(one._replace(log_likelihood=one.log_likelihood + log_prior))
-        return sorted(weighed, key=lambda one: -one.log_likelihood)
+        position, moved = self.odometry[self.rows, :2], np.append(0.0, self._moved)
+        is_near = np.linalg.norm(position[:, None] - position, axis=-1) < self.trust.stretch / 2
+        weight = moved / np.maximum(is_near @ moved, self.trust.stretch)
+        weight[0] = max(1.0 - weight.sum(), 0.0)
+        return weight
 
-    def step(self, hypothesis: TrackedHypothesis, number: int) -> TrackedHypothesis:
-        """Predict by odometry and update by the ranges of the scan with this number in ``rows``."""
-        row, sigma = int(self.rows[number]), self.range_sd
-        pose, covariance = hypothesis.pose, hypothesis.covariance
-        if number:
-            pose, covariance = self._predict(pose, covariance, number)
-        belief = self.known_map.belief_at(pose, covariance, self.ring.max_range)
-        scan = self.log[row]
-        prior = SubmapState(belief, np.full(len(belief.landmarks.kind), 2, np.int64))
-        found = update(
-            self.ring,
-            prior,
-            scan,
-            self.models[row],
-            row=row,
-            sigma=sigma,
-            path_pose=None if self.path_pose is None else self.path_pose[row],
-            add_landmarks=False,
+    def initial_hypotheses(
+        self, start: Float[np.ndarray, "3"] | None, progress: Callable[[str, int, int], None]
+    ) -> PoseTracks:
+        """Hypotheses for the pose of the first scan.
+
+        They are a given start pose, and poses at which features of the first scans match the map. If the pose is
+        searched everywhere, scans farther along the trajectory contribute too, tracked back to the first one.
+        """
+        rows, size = self.rows, len(self.known_map.arrays.covariance)
+        found = self._at(
+            matching_poses(self.known_map.features, self.models, self.odometry, rows[: SETTINGS.first_scans], start)
         )
-        pose, covariance = wrap_pose(found.pose), found.pose_covariance
-        # Log-likelihood ratio of an explained echo against one from anywhere.
-        gain = float(np.log(self.ring.max_range / (sigma * np.sqrt(2 * np.pi))))
-        nats = SETTINGS.echo_weight * (gain * found.explained - found.normalized_squares / 2)
-        return TrackedHypothesis(
-            pose,
-            covariance,
-            (*hypothesis.poses, pose),
-            (*hypothesis.covariances, covariance),
-            hypothesis.log_likelihood + nats,
-            hypothesis.echoes + scan.echo_count,
-            hypothesis.explained + found.explained,
-            hypothesis.is_start,
+        if start is not None:
+            given = PoseTracks.at(start[None], diagonal_covariance(SETTINGS.start_sd)[None], size)
+            return given._replace(is_start=np.ones(1, dtype=bool)).join(found)
+        later = np.arange(SETTINGS.first_scans, len(rows) - 1, SETTINGS.first_scans)
+        later = (
+            later[np.unique(np.linspace(0, len(later) - 1, SETTINGS.later_groups).round().astype(int))]
+            if len(later)
+            else later
         )
+        for done, number in enumerate(later):
+            progress("hypotheses", done, len(later))
+            group = rows[number : number + SETTINGS.first_scans]
+            poses = matching_poses(self.known_map.features, self.models, self.odometry, group, None)
+            some = self._at(poses[: SETTINGS.later_hypotheses])
+            if len(some.pose):
+                back = self.track(some, np.arange(number, -1, -1))
+                found = found.join(self._at(list(back.pose)))
+        return found
+
+    def similar_hypotheses(self, hypotheses: PoseTracks) -> PoseTracks:
+        """Hypotheses for the pose of the first scan at which the map looks as it does along the track of the best one.
+
+        The features of single scans may miss one of several places that look alike; what a whole track sees does not.
+        """
+        seen = self.known_map.seen_features(hypotheses.evidence[0], hypotheses.poses[0, :, :2])
+        if len(seen.theta) + len(seen.point) < 2:
+            return self._at([])
+        first = self.smooth(hypotheses.poses[0], hypotheses.covariances[0])[0][0]
+        return self._at(similar_poses(self.known_map.features, seen, first)[: SETTINGS.similar_hypotheses])
+
+    def _at(self, poses: Sequence[Float[np.ndarray, "3"]]) -> PoseTracks:
+        covariance = np.tile(diagonal_covariance(SETTINGS.hypothesis_sd), (len(poses), 1, 1))
+        return PoseTracks.at(
+            np.array(poses, dtype=np.float64).reshape(-1, 3), covariance, len(self.known_map.arrays.covariance)
+        )
+
+    def track(
+        self,
+        hypotheses: PoseTracks,
+        numbers: Int[np.ndarray, " steps"],
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> PoseTracks:
+        """Track hypotheses through scans, forward or backward; the most likely first. Those far behind are dropped.
+
+        Args:
+            hypotheses: for the pose of the first of the scans.
+            numbers: of the scans in ``rows``, consecutive.
+            progress: called with a stage and (scans done, scans).
+        """
+        for k, number in enumerate(numbers):
+            if not len(hypotheses.pose):
+                return hypotheses
+            hypotheses = self.step(hypotheses, int(number), int(numbers[k - 1]) if k else None)
+            if (k + 1) % SETTINGS.pruning_scans == 0 or k + 1 == len(numbers):
+                hypotheses = self.best_of(hypotheses, numbers[: k + 1])
+            if progress:
+                progress("hypotheses", k + 1, len(numbers))
+        return hypotheses
+
+    def step(self, hypotheses: PoseTracks, number: int, previous: int | None) -> PoseTracks:
+        """Predict by odometry from the scan ``previous`` (None: no motion), and update by the scan ``number``."""
+        pose, covariance = hypotheses.pose, hypotheses.covariance
+        if previous is not None:
+            pose, covariance = self._predict_all(pose, covariance, previous, number)
+        found = self._update_all(pose, covariance, number, UPDATE_SETTINGS.iterations[previous is not None])
+        poses, covariances = np.asarray(found.poses), np.asarray(found.covariances)
+        evidence = hypotheses.evidence.copy()
+        np.add.at(evidence, (np.arange(len(pose))[:, None], found.landmark), found.evidence)
+        of_scan = found.evidence.sum(axis=1)
+        if previous is not None:
+            of_scan = of_scan - SETTINGS.crossing_nats * self._crosses(hypotheses.pose, poses)
+        return PoseTracks(
+            poses,
+            covariances,
+            evidence,
+            hypotheses.explained + found.explained,
+            hypotheses.is_start,
+            np.concatenate([hypotheses.poses, poses[:, None]], axis=1),
+            np.concatenate([hypotheses.covariances, covariances[:, None]], axis=1),
+            np.concatenate([hypotheses.scan_evidence, of_scan[:, None]], axis=1),
+        )
+
+    def log_likelihoods(
+        self, hypotheses: PoseTracks, numbers: Int[np.ndarray, " steps"]
+    ) -> tuple[Float[np.ndarray, " hypotheses"], float]:
+        """Log-likelihoods of hypotheses that were tracked through these scans, and of none of them, nats.
+
+        See ``place_probabilities.relative_log_likelihood``.
+        """
+        none = SETTINGS.chance_nats * self.echo_counts[numbers]
+        both = np.concatenate([hypotheses.scan_evidence, none[None]])
+        found = relative_log_likelihood(both, self.scan_weights[numbers], self.trust)
+        return found[:-1], float(found[-1])
+
+    def best_of(self, hypotheses: PoseTracks, numbers: Int[np.ndarray, " steps"]) -> PoseTracks:
+        """The distinct hypotheses whose odds against the best one may still change, the most likely first.
+
+        A given start pose is kept, and preferred to others that are the same, because it assumes least.
+        """
+        score, _ = self.log_likelihoods(hypotheses, numbers)
+        order = np.lexsort((-score, ~hypotheses.is_start))
+        kept = order[_distinct(hypotheses.take(order))]
+        kept = kept[(score[kept] >= score.max(initial=-np.inf) - SETTINGS.pruning) | hypotheses.is_start[kept]]
+        kept = kept[np.argsort(-score[kept], kind="stable")[: SETTINGS.max_tracked]]
+        return hypotheses.take(kept)
+
+    def _update_all(
+        self,
+        pose: Float[np.ndarray, "hypotheses 3"],
+        covariance: Float[np.ndarray, "hypotheses 3 3"],
+        number: int,
+        iterations: int,
+    ) -> ScanUpdate:
+        """``update_hypotheses`` in batches of one size, so that it is compiled once for all numbers of hypotheses."""
+        size, parts = SETTINGS.batch, []
+        with jax.enable_x64(True):
+            for begin in range(0, len(pose), size):
+                count = min(size, len(pose) - begin)
+                padded = np.tile(np.eye(3), (size, 1, 1))
+                padded[:count] = covariance[begin : begin + count]
+                part = pad_rows(pose[begin : begin + count], size)
+                found = update_hypotheses(part, padded, self.known_map.arrays, self.scans[number], np.int64(iterations))
+                parts.append([np.asarray(column)[:count] for column in found])
+        return ScanUpdate(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def _crosses(
+        self, start: Float[np.ndarray, "hypotheses 3"], end: Float[np.ndarray, "hypotheses 3"]
+    ) -> Bool[np.ndarray, " hypotheses"]:
+        """Whether the robot passes through a wall between two scans."""
+        way, wall = crossings(np.stack([start[:, :2], end[:, :2]], axis=1), self.known_map.segments)
+        length = np.linalg.norm(np.diff(self.known_map.segments, axis=1)[:, 0], axis=-1)
+        margin = SETTINGS.crossing_margin / length
+        return ((way > 0) & (way < 1) & (wall > margin) & (wall < 1 - margin)).any(axis=1)
 
     def smooth(
-        self, hypothesis: TrackedHypothesis
+        self, poses: Float[np.ndarray, "scans 3"], covariances: Float[np.ndarray, "scans 3 3"]
     ) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:
         """Smoothed poses of a track and their covariances (Rauch, Tung and Striebel 1965)."""
-        poses, covariances = np.array(hypothesis.poses), np.array(hypothesis.covariances)
+        poses, covariances = poses.copy(), covariances.copy()
         for k in reversed(range(len(poses) - 1)):
             # The joint covariance of the predicted pose and the pose before it.
-            predicted, joint = self._predict(poses[k], np.tile(covariances[k], (2, 2)), k + 1)
+            predicted, joint = self._predict(poses[k], np.tile(covariances[k], (2, 2)), k, k + 1)
             gain = np.linalg.solve(joint[:3, :3], joint[:3, 3:]).T
             poses[k] = wrap_pose(poses[k] + gain @ subtract_poses(poses[k + 1], predicted))
             covariances[k] += gain @ (covariances[k + 1] - joint[:3, :3]) @ gain.T
         return poses, covariances
 
     def _predict(
-        self, pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "unknowns unknowns"], number: int
+        self, pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "unknowns unknowns"], before: int, after: int
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "unknowns unknowns"]]:
         """Move a pose, with what it is correlated with, by the odometry between two consecutive rows."""
-        step = relative(self.odometry[self.rows[number - 1]], self.odometry[self.rows[number]])
+        step = relative(self.odometry[self.rows[before]], self.odometry[self.rows[after]])
         return propagate(pose, covariance, step, np.diag(step_variance(self.odometry_noise, step)))
 
+    def _predict_all(
+        self,
+        pose: Float[np.ndarray, "hypotheses 3"],
+        covariance: Float[np.ndarray, "hypotheses 3 3"],
+        before: int,
+        after: int,
+    ) -> tuple[Float[np.ndarray, "hypotheses 3"], Float[np.ndarray, "hypotheses 3 3"]]:
+        """``_predict`` for all hypotheses."""
+        step = relative(self.odometry[self.rows[before]], self.odometry[self.rows[after]])
+        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        by_pose, by_step = np.tile(np.eye(3), (2, len(pose), 1, 1))
+        by_step[:, 0, 0], by_step[:, 0, 1], by_step[:, 1, 0], by_step[:, 1, 1] = cos, -sin, sin, cos
+        moved = compose(pose, step)
+        by_pose[:, 0, 2], by_pose[:, 1, 2] = pose[:, 1] - moved[:, 1], moved[:, 0] - pose[:, 0]
+        noise = np.diag(step_variance(self.odometry_noise, step))
+        return moved, by_pose @ covariance @ by_pose.swapaxes(1, 2) + by_step @ noise @ by_step.swapaxes(1, 2)
 
-def _merged(hypotheses: Sequence[TrackedHypothesis]) -> list[TrackedHypothesis]:
-    """The first of those that are the same; a given start pose is preferred, because it assumes least."""
-    kept: list[TrackedHypothesis] = []
-    for one in hypotheses:
-        twin = next((k for k, other in enumerate(kept) if one.is_same(other)), None)
-        if twin is None:
-            kept.append(one)
-        elif one.is_start:
-            kept[twin] = one
-    return kept
+
+def _take(paths: kernels.EchoPaths, rows: Int[np.ndarray, " rows"]) -> kernels.EchoPaths:
+    """Some of the paths, as NumPy arrays."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[rows], paths)
 
 
-def _is_near(poses: Float[np.ndarray, "poses 3"], start: Float[np.ndarray, "3"]) -> np.ndarray:
-    """Which poses are within the gate of a start pose."""
-    off = subtract_poses(poses, start)
-    position, heading = SETTINGS.start_sd
-    near = np.hypot(off[:, 0], off[:, 1]) < SETTINGS.start_gate * position
-    return near & (np.abs(off[:, 2]) < SETTINGS.start_gate * heading)
+def _distinct(hypotheses: PoseTracks) -> Int[np.ndarray, " kept"]:
+    """Rows of the first of those that are statistically the same."""
+    pose, covariance = hypotheses.pose, hypotheses.covariance
+    off = subtract_poses(pose[:, None], pose[None])
+    alike = (np.hypot(off[..., 0], off[..., 1]) < SETTINGS.same_pose[0]) & (np.abs(off[..., 2]) < SETTINGS.same_pose[1])
+    both = covariance[:, None] + covariance + diagonal_covariance(SETTINGS.same_pose_sd)
+    squared = np.einsum("abi,abi->ab", off, np.linalg.solve(both, off[..., None])[..., 0])
+    alike &= squared < SETTINGS.same_pose_chi2
+    kept: list[int] = []
+    for k in range(len(pose)):
+        if not alike[k, kept].any():
+            kept.append(k)
+    return np.array(kept, dtype=np.int64)

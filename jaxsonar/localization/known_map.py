@@ -8,10 +8,12 @@ from jaxtyping import Bool, Float
 
 from jaxsonar import kernels
 from jaxsonar.estimation.landmark_map import map_landmarks
-from jaxsonar.geometry.landmarks import concatenate_landmarks, landmarks_from_points
+from jaxsonar.geometry.landmarks import concatenate_landmarks, landmarks_from_points, pad_landmarks, wall_segments
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
-from jaxsonar.geometry.segments import perpendicular_intersections
-from jaxsonar.localization.settings import SETTINGS
+from jaxsonar.geometry.segments import perpendicular_intersections, point_to_segments
+from jaxsonar.kernels.shape_buckets import next_power_of_two, pad_rows
+from jaxsonar.localization.scan_update import MapArrays
+from jaxsonar.localization.settings import SETTINGS, MapTrust
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.registration.features import Features, landmark_features
 
@@ -24,54 +26,58 @@ class KnownMap:
     """Walls are anchored in their middle."""
     covariance: Float[np.ndarray, "landmarks 2 2"]
     """Of the parameters of each landmark."""
+    opening: Float[np.ndarray, "landmarks 2 2"]
+    """Directions of the two walls of a corner that was added where walls meet; 0 for all other landmarks."""
 
     @classmethod
-    def of(cls, world: GlobalMap) -> "KnownMap":
-        """Landmarks of a map; a map without points, such as a floor plan, gets corners where its walls meet."""
-        wall_covariance = _wall_covariances(world)
+    def of(cls, world: GlobalMap, map_sd: tuple[float, float] | None = None) -> "KnownMap":
+        """Landmarks of a map; a map without points gets corners where its walls meet, a floor plan also edges.
+
+        Args:
+            world: the map.
+            map_sd: least standard deviations of its walls: across (m), direction (rad); None: those of a floor plan if
+                it is one, else those of the map.
+        """
+        if map_sd is None:
+            map_sd = SETTINGS.plan_sd if is_floor_plan(world) else SETTINGS.min_map_sd
+        wall_covariance = _wall_covariances(world, map_sd)
         default = np.eye(2) * SETTINGS.default_map_sd[0] ** 2
         point_covariance = np.where(np.isfinite(world.point_cov), world.point_cov, default)
         landmarks = map_landmarks(world)
+        opening = np.zeros((len(landmarks.kind), 2, 2))
         if not world.point_kinds:
-            corners, point_covariance = _wall_corners(world, wall_covariance)
+            corners, point_covariance, directions = _wall_corners(world, wall_covariance)
             kind = np.full(len(corners), kernels.CORNER)
             landmarks = concatenate_landmarks([landmarks, landmarks_from_points(kind, corners)])
-        return cls(landmarks, np.concatenate([wall_covariance, point_covariance]))
+            opening = np.concatenate([opening, directions])
+        if is_floor_plan(world):
+            ends = _free_ends(world)
+            landmarks = concatenate_landmarks(
+                [landmarks, landmarks_from_points(np.full(len(ends), kernels.EDGE), ends)]
+            )
+            opening = np.concatenate([opening, np.zeros((len(ends), 2, 2))])
+            end_covariance = np.tile(np.eye(2) * map_sd[0] ** 2, (len(ends), 1, 1))
+            point_covariance = np.concatenate([point_covariance, end_covariance])
+        return cls(landmarks, np.concatenate([wall_covariance, point_covariance]), opening)
 
     @property
     def is_wall(self) -> Bool[np.ndarray, " landmarks"]:
         """Which landmarks are walls."""
         return np.asarray(self.landmarks.kind) == kernels.PLANE
 
-    def belief_at(
-        self, pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"], max_range: float
-    ) -> kernels.Belief:
-        """Joint belief of a pose and the landmarks that may be detected from it; normals point away from the robot.
+    @cached_property
+    def arrays(self) -> MapArrays:
+        """The map for ``update_hypotheses``, padded so that maps of similar sizes share one compiled program."""
+        size = next_power_of_two(len(self.covariance), least=SETTINGS.min_landmarks)
+        covariance = np.tile(np.eye(2), (size, 1, 1))
+        covariance[: len(self.covariance)] = self.covariance
+        landmarks = pad_landmarks(self.landmarks, size)
+        return MapArrays(landmarks, covariance, pad_rows(self.opening, size))
 
-        Args:
-            pose: world_from_robot, metres and radians.
-            covariance: its covariance.
-            max_range: range of the sensors, metres.
-        """
-        anchor, theta = np.asarray(self.landmarks.anchor), np.asarray(self.landmarks.parameters)[:, 1]
-        half, wall = np.asarray(self.landmarks.extent)[:, 1], self.is_wall
-        offset = anchor - pose[:2]
-        along, across = (offset * tangent_of(theta)).sum(axis=-1), (offset * unit(theta)).sum(axis=-1)
-        beyond = np.maximum(np.abs(along) - half, 0.0)
-        distance = np.where(wall, np.hypot(across, beyond), np.linalg.norm(offset, axis=-1))
-        uncertainty = 3 * np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-        in_reach = distance < max_range + uncertainty
-        rows = np.flatnonzero(in_reach & (~wall | (beyond < SETTINGS.wall_extension + uncertainty)))
-        rows = rows[np.argsort(distance[rows], kind="stable")][: SETTINGS.max_landmarks]
-        joint = np.zeros((3 + 2 * len(rows), 3 + 2 * len(rows)))
-        joint[:3, :3] = covariance
-        for k, row in enumerate(rows):
-            joint[3 + 2 * k : 5 + 2 * k, 3 + 2 * k : 5 + 2 * k] = self.covariance[row]
-        # The other side of a wall: the normal and the distance along it are reversed.
-        parameters = np.asarray(self.landmarks.parameters)[rows]
-        reversed_ = np.stack([-parameters[:, 0], wrap_angle(parameters[:, 1] + np.pi)], axis=-1)
-        parameters = np.where((wall & (across < 0))[rows, None], reversed_, parameters)
-        return kernels.Belief(pose, self.landmarks.take(rows).with_parameters(parameters), joint)
+    @cached_property
+    def segments(self) -> Float[np.ndarray, "walls 2 2"]:
+        """Endpoints of the walls, metres."""
+        return wall_segments(self.landmarks.take(np.flatnonzero(self.is_wall)))
 
     @cached_property
     def features(self) -> Features:
@@ -88,11 +94,56 @@ class KnownMap:
             scans=np.tile(one.scans, 2),
         )
 
+    def seen_features(self, evidence: Float[np.ndarray, " rows"], positions: Float[np.ndarray, "scans 2"]) -> Features:
+        """The walls and points with the most evidence, each wall from the side from which it was seen.
 
-def _wall_covariances(world: GlobalMap) -> Float[np.ndarray, "walls 2 2"]:
+        Args:
+            evidence: of each landmark, in the rows of ``arrays``.
+            positions: of the robot.
+        """
+        evidence = evidence[: len(self.covariance)]
+        order = np.argsort(-evidence, kind="stable")
+        walls = [row for row in order if self.is_wall[row] and evidence[row] > 0][: SETTINGS.seen_walls]
+        points = [row for row in order if not self.is_wall[row] and evidence[row] > 0][: SETTINGS.seen_points]
+        rows = np.array([*walls, *points], dtype=np.int64)
+        scans = np.full(len(rows), SETTINGS.wall_scans)
+        seen = landmark_features(self.landmarks.take(rows), self.covariance[rows], scans)
+        # Normals point away from the robot where it was nearest to the wall.
+        offset = positions[:, None] - seen.reference
+        nearest = offset[np.linalg.norm(offset, axis=-1).argmin(axis=0), np.arange(len(walls))]
+        is_behind = (nearest * seen.normal).sum(-1) > seen.offset
+        return seen._replace(
+            theta=np.where(is_behind, wrap_angle(seen.theta + np.pi), seen.theta),
+            offset=np.where(is_behind, -seen.offset, seen.offset),
+            extent=np.where(is_behind[:, None], -seen.extent[:, ::-1], seen.extent),
+        )
+
+
+def _free_ends(world: GlobalMap) -> Float[np.ndarray, "ends 2"]:
+    """Ends of walls that touch no other wall, such as those beside the gap of a door: they diffract sound."""
+    ends = world.segments.reshape(-1, 2)
+    distance = point_to_segments(ends, world.segments)
+    distance[np.arange(len(ends)), np.arange(len(ends)) // 2] = np.inf
+    return ends[distance.min(axis=1, initial=np.inf) > SETTINGS.corner_gap]
+
+
+def is_floor_plan(world: GlobalMap) -> bool:
+    """Whether a map is a drawing: it has no points, and its walls count as exact (``map_from_room``)."""
+    return not world.point_kinds and bool((world.sigma_rho < SETTINGS.exact_sd).all())
+
+
+def trust_in(world: GlobalMap) -> MapTrust:
+    """How far a map is trusted: as a floor plan, as a map of another sensor (no scan observed it), or of echoes."""
+    if is_floor_plan(world):
+        return SETTINGS.plan_trust
+    observed = any(len(scans) > 0 for scans in (*world.scans, *world.point_scans))
+    return SETTINGS.map_trust if observed else SETTINGS.laser_trust
+
+
+def _wall_covariances(world: GlobalMap, least: tuple[float, float]) -> Float[np.ndarray, "walls 2 2"]:
     """Covariances of (distance at the middle, theta): that distance is better known than that from the origin."""
     arm = (world.segments.mean(axis=1) * tangent_of(world.theta)).sum(axis=-1)
-    (default_across, default_turn), (min_across, min_turn) = SETTINGS.default_map_sd, SETTINGS.min_map_sd
+    (default_across, default_turn), (min_across, min_turn) = SETTINGS.default_map_sd, least
     turn = np.where(np.isfinite(world.sigma_theta), world.sigma_theta, default_turn)
     across = np.where(np.isfinite(world.sigma_rho), world.sigma_rho**2 - (arm * turn) ** 2, default_across**2)
     # Echoes along the wall determine both: a smaller difference is a rounding error.
@@ -105,8 +156,8 @@ def _wall_covariances(world: GlobalMap) -> Float[np.ndarray, "walls 2 2"]:
 
 def _wall_corners(
     world: GlobalMap, wall_covariance: Float[np.ndarray, "walls 2 2"]
-) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 2"]]:
-    """Points where walls meet at right angles, and their covariances."""
+) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 2"], Float[np.ndarray, "points 2 2"]]:
+    """Points where walls meet at right angles, their covariances, and the directions of their walls."""
     crossing = perpendicular_intersections(world.theta, world.segments, max_skew=SETTINGS.corner_angle)
     middle, covariances = world.segments.mean(axis=1), []
     # At a right angle the distance between the ends is the hypotenuse of their distances from the intersection.
@@ -117,4 +168,7 @@ def _wall_corners(
         across = wall_covariance[pair, 0, 0] + along**2 * wall_covariance[pair, 1, 1]
         inverse = np.linalg.inv(unit(world.theta[pair]))
         covariances.append(inverse @ np.diag(across) @ inverse.T)
-    return crossing.point[meet], np.array(covariances).reshape(-1, 2, 2)
+    pairs = np.stack([crossing.first[meet], crossing.second[meet]], axis=-1)
+    away = middle[pairs] - crossing.point[meet][:, None]
+    directions = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-12)
+    return crossing.point[meet], np.array(covariances).reshape(-1, 2, 2), directions

@@ -1,7 +1,8 @@
 """Localization in a known map, from a rough start pose or without any (global localization).
 
-Every pose at which walls and corners of a scan match the map is a hypothesis; each is tracked through the first scans
-by the ranges of the echoes. Where places look alike more than one remains, and no pose is returned.
+Every pose at which walls and corners of a scan match the map is a hypothesis; each is tracked through the scans by the
+ranges of the echoes, as long as its odds allow. Where places look alike more than one remains: their probabilities are
+returned, and no trajectory.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import logsumexp
 
 from jaxsonar.detection.extract import local_models
 from jaxsonar.detection.local_model import LocalModel
@@ -18,10 +18,12 @@ from jaxsonar.detection.settings import check_sigma
 from jaxsonar.estimation.estimation_log import estimation_log
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.estimation.trajectory import Trajectory, stamps_of
+from jaxsonar.geometry.se2 import subtract_poses
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.localization.hypothesis_tracking import HypothesisTracker
-from jaxsonar.localization.known_map import KnownMap
-from jaxsonar.localization.settings import SETTINGS, AcceptanceSettings
+from jaxsonar.localization.hypothesis_tracking import HypothesisTracker, PoseTracks
+from jaxsonar.localization.known_map import KnownMap, trust_in
+from jaxsonar.localization.place_probabilities import place_probabilities
+from jaxsonar.localization.settings import SETTINGS
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.registration.sequential_registration import register_scans
 from jaxsonar.scans.measured_directions import measured_directions
@@ -35,9 +37,11 @@ class PoseHypothesis(NamedTuple):
     pose: Float[np.ndarray, "3"]
     """world_from_robot, metres and radians."""
     log_likelihood: float
-    """Log-likelihood ratio of the first scans against echoes from anywhere, nats."""
+    """Log-likelihood relative to the best fit of every scan, nats (``place_probabilities``)."""
     explained: float
-    """Fraction of their echoes that the map explains."""
+    """Fraction of the echoes of all scans that the map explains."""
+    probability: float
+    """Probability of the place; the rest to 1 of all places is the probability of none of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +77,7 @@ def localize(
     start: Sequence[float] | None = None,
     sigma: float | None = None,
     odometry_noise: OdometryNoise | None = None,
+    map_sd: tuple[float, float] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Localized:
     """Poses of scans in a known map.
@@ -85,12 +90,14 @@ def localize(
         start: approximate pose of the first scan, world_from_robot: x, y (m), theta (rad); anywhere if left out.
         sigma: standard deviation of the ranges, metres; estimated if left out.
         odometry_noise: noise model of the odometry.
+        map_sd: least standard deviations of the walls of the map: across (m), direction (rad); those of the map if left
+            out, and 2 cm and 0.3 deg for a floor plan.
         progress: called with a stage and (scans done, scans).
 
     Raises:
         SonarError: no scan, a map without walls, arguments out of range, no scan that can be registered.
     """
-    _check(world, log, start, sigma)
+    _check(world, log, start, sigma, map_sd)
     progress = progress or (lambda stage, done, total: None)
     log = estimation_log(log)
     # 1. Local models, and odometry between the scans.
@@ -99,36 +106,60 @@ def localize(
         models.append(model)
         progress("local models", len(models), len(log))
     odometry, noise = _odometry(ring, log, models), odometry_noise or OdometryNoise()
-    tracker = HypothesisTracker(ring, KnownMap.of(world), log, models, odometry, sigma, noise)
+    # Near a start pose, structure seldom repeats itself.
+    trust = trust_in(world) if start is None else SETTINGS.map_trust
+    tracker = HypothesisTracker(ring, KnownMap.of(world, map_sd), log, models, odometry, sigma, noise, trust)
     if not len(tracker.rows):
         raise SonarError("localize: no scan could be registered to another; allowed are scans with odometry, or nearby")
-    # 2. Hypotheses for the pose of the first scan, tracked through the first scans.
+    # 2. Hypotheses for the pose of the first scan, tracked through all scans.
     first = None if start is None else np.array(start, dtype=np.float64)
-    tracks = tracker.track_first_scans(tracker.initial_hypotheses(first), progress)
+    numbers = np.arange(len(tracker.rows))
+    tracks = tracker.track(tracker.initial_hypotheses(first, progress), numbers, progress)
+    if len(tracks.pose) and first is None:
+        similar = tracker.track(tracker.similar_hypotheses(tracks), numbers, progress)
+        tracks = tracker.best_of(tracks.join(similar), numbers)
+    # 3. Probabilities of the places; is one of them certain?
+    smoothed = [tracker.smooth(*track) for track in zip(tracks.poses, tracks.covariances, strict=True)]
+    score, none = tracker.log_likelihoods(tracks, numbers)
     if first is not None:
-        tracks = tracker.weigh_by_start(tracks, first)
-    # 3. Is the best one the only one that is possible?
+        score = score + _log_prior(np.array([poses[0] for poses, _ in smoothed]), first, tracks)
+    probability = place_probabilities(score, none)
+    share = tracks.explained / max(int(tracker.echo_counts.sum()), 1)
+    order = np.argsort(-score, kind="stable")
     hypotheses = tuple(
-        PoseHypothesis(tracker.smooth(one)[0][0], one.log_likelihood, one.explained_fraction) for one in tracks
+        PoseHypothesis(smoothed[k][0][0], float(score[k]), float(share[k]), float(probability[k]))
+        for k in order
+        if np.isfinite(score[k])
     )
-    acceptance = SETTINGS.global_acceptance if first is None else SETTINGS.local_acceptance
-    is_certain, reason = _judge(hypotheses, len(tracker.rows), acceptance)
-    if is_certain and first is None and not tracks[0].is_determined:
+    is_certain, reason = _judge(hypotheses, len(numbers), is_local=first is not None)
+    if is_certain and first is None and not tracks.is_determined[order[0]]:
         is_certain = False
-        reason = f"{len(tracker.rows)} scans: a direction of the pose is not determined; a longer path may help"
-    # 4. Track it through all other scans, and smooth.
+        reason = f"{len(numbers)} scans: a direction of the pose is not determined; a longer path may help"
+    # 4. The poses of its track.
     poses, covariance = np.full((len(log), 3), np.nan), np.full((len(log), 3, 3), np.nan)
     if is_certain:
-        track = tracks[0]
-        for number in range(len(track.poses), len(tracker.rows)):
-            track = tracker.step(track, number)
-            progress("localizing", number + 1, len(tracker.rows))
-        poses[tracker.rows], covariance[tracker.rows] = tracker.smooth(track)
+        poses[tracker.rows], covariance[tracker.rows] = smoothed[order[0]]
     return Localized(poses, covariance, stamps_of(log), hypotheses, is_certain, reason)
 
 
-def _check(world: GlobalMap, log: Log, start: Sequence[float] | None, sigma: float | None) -> None:
+def _log_prior(
+    poses: Float[np.ndarray, "hypotheses 3"], start: Float[np.ndarray, "3"], tracks: PoseTracks
+) -> Float[np.ndarray, " hypotheses"]:
+    """Log-prior of poses of the first scan by a start pose, nats.
+
+    It is -inf for those that are not determined, but for the start pose itself: its track contains them.
+    """
+    position, heading = SETTINGS.start_sd
+    off = subtract_poses(poses, start) / np.array([position, position, heading])
+    return np.where(tracks.is_start | tracks.is_determined, -np.square(off).sum(axis=1) / 2, -np.inf)
+
+
+def _check(
+    world: GlobalMap, log: Log, start: Sequence[float] | None, sigma: float | None, map_sd: tuple[float, float] | None
+) -> None:
     check_sigma(sigma)
+    if map_sd is not None and not (len(map_sd) == 2 and all(0 < sd < 10 for sd in map_sd)):
+        raise SonarError(f"localize: map_sd {tuple(map_sd)}; allowed are two standard deviations above 0 (m, rad)")
     if not len(log):
         raise SonarError("localize: no scan in the log; allowed is a log with one or more")
     if not len(world) + len(world.points):
@@ -154,27 +185,39 @@ def _odometry(ring: Ring, log: Log, models: Sequence[LocalModel]) -> Float[np.nd
     return alone
 
 
-def _judge(hypotheses: Sequence[PoseHypothesis], scans: int, acceptance: AcceptanceSettings) -> tuple[bool, str]:
-    """Whether the first hypothesis is the only possible one, and the result in words."""
+def _judge(hypotheses: Sequence[PoseHypothesis], scans: int, *, is_local: bool) -> tuple[bool, str]:
+    """Whether the first hypothesis is certain, and the result in words: a heading, and a line for each place."""
     of = f"{scans} scan{'' if scans == 1 else 's'}"
     # 1. Does the map explain the echoes?
-    least = acceptance.min_explained
+    least = SETTINGS.min_explained[is_local]
     if not hypotheses or hypotheses[0].explained < least:
         share = f": at the best pose {100 * hypotheses[0].explained:.0f} % of the echoes fit" if hypotheses else ""
         return False, f"{of}: no place in the map fits{share}; needed are {100 * least:.0f} %"
-    # 2. Does the best hypothesis beat all others together?
-    best, others = hypotheses[0], [one.log_likelihood for one in hypotheses[1:]]
-    ratio = best.log_likelihood - float(np.asarray(logsumexp(others))) if others else np.inf
-    margin = acceptance.margin + acceptance.margin_fraction * max(best.log_likelihood, 0.0)
-    if ratio < margin:
-        alike = [one for one in hypotheses if one.log_likelihood > best.log_likelihood - margin]
-        alike = alike if len(alike) > 1 else list(hypotheses[:2])
-        shown = "; ".join(f"{p.pose[0]:.2f}, {p.pose[1]:.2f} m, {np.degrees(p.pose[2]):.0f} deg" for p in alike[:4])
-        more = f"; {len(alike) - 4} more" if len(alike) > 4 else ""
-        return False, f"{of}: ambiguous, {len(alike)} places look alike: {shown}{more}; a longer path may help"
-    rivals = f"log-likelihood ratio to all other poses: {ratio:.0f} nats" if others else "no other pose fits"
-    x, y, theta = best.pose
-    return True, (
-        f"{of}: the first is at {x:.3f}, {y:.3f} m, {np.degrees(theta):.2f} deg; {rivals}; "
-        f"{100 * best.explained:.0f} % of the echoes fit"
-    )
+    # 2. Is it the only place that is possible?
+    best = hypotheses[0]
+    fit = f"{100 * best.explained:.0f} % of the echoes fit"
+    if best.probability >= SETTINGS.certain:
+        x, y, theta = best.pose
+        return True, (
+            f"{of}: the first is at {x:.3f}, {y:.3f} m, {np.degrees(theta):.2f} deg; "
+            f"probability {_percent(best.probability)}; {fit}"
+        )
+    alike = [one for one in hypotheses if one.probability > SETTINGS.shown_probability][: SETTINGS.shown_places]
+    none = 1 - sum(one.probability for one in hypotheses)
+    if none > best.probability or not alike:
+        return False, f"{of}: no place in the map fits: at the best pose {fit}, hardly more than by chance"
+    if len(alike) == 1:
+        heading = f"{of}: uncertain, {_percent(none)} for no place of the map"
+    else:
+        heading = f"{of}: ambiguous, {len(alike)} places look alike"
+    lines = [
+        f"{_percent(one.probability)}: {one.pose[0]:.2f}, {one.pose[1]:.2f} m, {np.degrees(one.pose[2]):.0f} deg; "
+        f"{100 * one.explained:.0f} % of the echoes fit"
+        for one in alike
+    ]
+    return False, "\n".join([f"{heading}; a longer path may help", *lines])
+
+
+def _percent(probability: float) -> str:
+    """A probability in percent that is never rounded to certainty."""
+    return f"{min(100 * probability, 99.9):.1f} %"

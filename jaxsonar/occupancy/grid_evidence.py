@@ -129,7 +129,7 @@ class GridEvidence:
         Raises:
             SonarError: poses too far apart for a grid; a sensor number that the ring does not have.
         """
-        posed = np.isfinite(log.pose).all(axis=-1)
+        posed = np.asarray(np.isfinite(log.pose).all(axis=-1))
         self.skipped += int((~posed).sum())
         rows = np.flatnonzero(posed)
         if not len(rows):

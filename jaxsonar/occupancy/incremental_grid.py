@@ -110,7 +110,7 @@ def occupancy(
 def _facing_readings(ring: Ring, log: Log) -> FacingReadings:
     """The direct readings of a log; scans without a pose are skipped."""
     sensors, readings = TransducerArrays.of(ring), DirectReadings.of(ring, log)
-    posed = np.isfinite(log.pose).all(axis=-1)
+    posed = np.asarray(np.isfinite(log.pose).all(axis=-1))
     used = readings.measured & posed[:, None]
     robot, sensor, first = readings.robot[used], np.nonzero(used)[1], readings.first_echo[used]
     return FacingReadings(

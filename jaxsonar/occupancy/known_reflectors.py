@@ -152,7 +152,7 @@ def explained_by_reflectors(
         ray = target - position[:, None, end]
         off_axis = np.abs(wrap_angle(np.arctan2(ray[..., 1], ray[..., 0]) - heading[:, end, None]))
         seen &= off_axis <= half_width[:, end, None] + _WALLS.beyond_cone
-    return (match & seen).any(axis=1)
+    return np.asarray((match & seen).any(axis=1))
 
 
 def direction_of(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, " walls"]:

@@ -2,10 +2,10 @@
 
 import json
 import os
+from io import BytesIO
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -91,6 +91,8 @@ def _pgm(image: UInt8[np.ndarray, "rows columns"]) -> bytes:
 
 
 def _png(image: UInt8[np.ndarray, "rows columns 2"]) -> bytes:
-    done, data = cv2.imencode(".png", image[..., [0, 0, 0, 1]])
-    assert done, "PNG cannot be encoded"
-    return data.tobytes()
+    from matplotlib.image import imsave
+
+    file = BytesIO()
+    imsave(file, np.ascontiguousarray(image[..., [0, 0, 0, 1]]), format="png")
+    return file.getvalue()

@@ -86,29 +86,30 @@ def assemble_grid(
         return OccupancyGrid(
             resolution, (0, 0), none, none, none > 0, none > 0, none, none.astype(int), evidence.scans, evidence.skipped
         )
-    parameters = parameters or getattr(SETTINGS, evidence.method)
-    found, viewpoints = _obstacle_evidence(evidence, profile, parameters)
+    model: BayesSettings = parameters or getattr(SETTINGS, evidence.method)
+    found, viewpoints = _obstacle_evidence(evidence, profile, model)
     robot = evidence.footprint > 0
     walls = area.mask(profile.parts.cells(resolution)) & ~robot
-    obstacle = (found > parameters.occupied) & ~robot
+    obstacle = (found > model.occupied) & ~robot
     if evidence.method == "counts":
         obstacle &= viewpoints >= SETTINGS.min_viewpoints
     occupied = walls | obstacle
     # Free: the likely directions of walls are excluded. Walls may go on, unseen, along their extensions.
     share, uniform = _direction_shares(profile.parts.walls)
-    needed = SETTINGS.free.min_excluded + SETTINGS.free.irregular * uniform
+    needed = SETTINGS.free.min_excluded + SETTINGS.free.irregular * (uniform - SETTINGS.free.uniform)
     free = _excluded_share(evidence.passes, share) >= needed
     between = hidden_walls(profile.parts, _small_obstacles(obstacle, evidence), readings, resolution=resolution)
     hidden = area.mask(KnownReflectors.of_walls(np.concatenate([profile.extensions, between])).cells(resolution))
-    beside = ndimage.binary_dilation(occupied | hidden, np.ones((3, 3)))
-    unclear = found > SETTINGS.free.max_evidence * parameters.occupied
+    beside = np.asarray(ndimage.binary_dilation(occupied | hidden, np.ones((3, 3))), bool)
+    unclear = found > SETTINGS.free.max_evidence * model.occupied
     # Thin needles of free cells are single readings: no robot fits there.
-    free = ndimage.binary_opening(free & ~beside & ~unclear | robot, np.ones((3, 3)))
-    free = (free | robot) & ~occupied
+    wide = np.asarray(ndimage.binary_opening(free & ~beside & ~unclear | robot, np.ones((3, 3))), bool)
+    free = (wide | robot) & ~occupied
     # Free cells that are not connected to where the robot drove are errors, or lie behind an unmapped wall.
-    region, _ = ndimage.label(free)
+    region = np.zeros(free.shape, np.int32)
+    ndimage.label(free, output=region)
     free &= np.isin(region, np.unique(region[robot & free]))
-    probability = _probability(evidence, parameters, found, occupied, free)
+    probability = _probability(evidence, model, found, occupied, free)
     return _cropped(evidence, found, probability, occupied, free)
 
 
@@ -158,8 +159,9 @@ def _small_obstacles(
     obstacle: Bool[np.ndarray, "rows columns"], evidence: GridEvidence
 ) -> Float[np.ndarray, "obstacles 2"]:
     """Centers of obstacles of few cells, metres."""
-    region, count = ndimage.label(obstacle, np.ones((3, 3)))
-    number = np.arange(1, count + 1)
+    region = np.zeros(obstacle.shape, np.int32)
+    ndimage.label(obstacle, np.ones((3, 3)), output=region)
+    number = np.arange(1, region.max(initial=0) + 1)
     number = number[ndimage.sum_labels(obstacle, region, number) <= SETTINGS.reflectors.small_obstacle]
     center = np.array(ndimage.center_of_mass(obstacle, region, number)).reshape(-1, 2)[:, ::-1]
     return (center + evidence.area.corner + 0.5) * evidence.resolution
@@ -244,8 +246,21 @@ def _cropped(
     row, column = np.nonzero(~np.isnan(probability))
     rows, columns = (slice(int(k.min()), int(k.max()) + 1) for k in (row, column))
     corner = evidence.area.corner[0] + columns.start, evidence.area.corner[1] + rows.start
-    layers = (found, probability, occupied, free, evidence.looks / 16, evidence.footprint)
-    layers = [np.ascontiguousarray(layer[rows, columns]) for layer in layers]
-    for layer in layers:
-        layer.setflags(write=False)
-    return OccupancyGrid(evidence.resolution, corner, *layers, evidence.scans, evidence.skipped)
+
+    def part(layer: np.ndarray) -> np.ndarray:
+        cropped = layer[rows, columns].copy()
+        cropped.setflags(write=False)
+        return cropped
+
+    return OccupancyGrid(
+        resolution=evidence.resolution,
+        corner=corner,
+        evidence=part(found),
+        probability=part(probability),
+        occupied=part(occupied),
+        free=part(free),
+        looks=part(evidence.looks / 16),
+        footprint=part(evidence.footprint),
+        scans=evidence.scans,
+        skipped=evidence.skipped,
+    )

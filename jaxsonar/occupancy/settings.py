@@ -56,7 +56,7 @@ class ReflectorSettings:
 
 
 @dataclass(frozen=True)
-class FreeSpaceSettings:
+class FreeCellSettings:
     """Which cells are free."""
 
     certain: float = 0.6
@@ -104,7 +104,7 @@ class OccupancySettings:
     """Exposure by an echo from the cell's own distance, in looks."""
     reflectors: ReflectorSettings = field(default_factory=ReflectorSettings)
     """Known walls and points."""
-    free: FreeSpaceSettings = field(default_factory=FreeSpaceSettings)
+    free: FreeCellSettings = field(default_factory=FreeCellSettings)
     """Free cells."""
     min_weight: float = 0.1
     """Least weight of a cell on an arc that counts as a viewpoint."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.geometry.segments import crossings, lengths, point_to_segments
@@ -35,12 +35,26 @@ class FacingReadings(NamedTuple):
     def concatenate(cls, parts: Sequence["FacingReadings"], max_range: float) -> "FacingReadings":
         """All readings of several collections, possibly of none."""
         empty = cls(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 2)), max_range)
-        columns = zip(*(part[:-1] for part in (empty, *parts)), strict=True)
-        return cls(*(np.concatenate(column) for column in columns), max_range)
+        some = (empty, *parts)
+        return cls(
+            np.concatenate([part.position for part in some]),
+            np.concatenate([part.heading for part in some]),
+            np.concatenate([part.certain for part in some]),
+            np.concatenate([part.first_echo for part in some]),
+            np.concatenate([part.driven for part in some]),
+            max_range,
+        )
 
     def latest(self, count: int) -> "FacingReadings":
         """The latest readings and positions, at most this many of each."""
-        return FacingReadings(*(column[-count:] for column in self[:-1]), self.max_range)
+        return FacingReadings(
+            self.position[-count:],
+            self.heading[-count:],
+            self.certain[-count:],
+            self.first_echo[-count:],
+            self.driven[-count:],
+            self.max_range,
+        )
 
 
 class WallProfile(NamedTuple):
@@ -250,7 +264,7 @@ def hidden_walls(
     ends = np.concatenate([known.points, known.walls.reshape(-1, 2), obstacles])
     if not len(ends):
         return np.zeros((0, 2, 2))
-    segments = ends[cKDTree(ends).query_pairs(_WALLS.max_hidden, output_type="ndarray")]
+    segments = ends[KDTree(ends).query_pairs(_WALLS.max_hidden, output_type="ndarray")]
     segments = segments[lengths(segments) >= 2 * resolution]
     if not len(segments):
         return segments

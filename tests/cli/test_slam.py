@@ -13,6 +13,9 @@ from jaxsonar import load_log, save_log
 from jaxsonar.estimation.trajectory import Trajectory, load_trajectory, save_trajectory, stamps_of
 from jaxsonar.mapping.build_map import build_map
 from jaxsonar.mapping.map_geojson import load_map, save_map
+from jaxsonar.occupancy.incremental_grid import occupancy
+from jaxsonar.occupancy.known_reflectors import KnownReflectors
+from jaxsonar.occupancy.nav2_map import save_nav2
 
 ODOMETRY = f"{100 * ODOMETRY_NOISE.position_per_meter:g},{np.degrees(ODOMETRY_NOISE.heading_per_meter):g}"
 COUNT = 14
@@ -27,6 +30,7 @@ def made(tmp_path_factory):
     save_trajectory(Trajectory(stamps_of(some), truth()[:COUNT]), folder / "truth.tum")
     save_map(build_map(RING, replace(log(seed=2), pose=truth())), folder / "known.geojson")
     files = "-o map.geojson --trajectory poses.tum --figure run.svg --json run.json --truth truth.tum"
+    files += " --log corrected.csv --grid grid.yaml"
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert call("slam", "log.csv", "--ring", "faw", *files.split(), "--odometry", ODOMETRY) == 0
@@ -59,6 +63,20 @@ def test_slam_writes_all_requested_files(here):
 
 
 @pytest.mark.slow
+def test_the_corrected_log_has_the_estimated_poses_and_gives_the_grid(here):
+    corrected, given = load_log(here / "corrected.csv"), load_log(here / "log.csv")
+    np.testing.assert_allclose(corrected.pose, load_trajectory(here / "poses.tum").poses, atol=1e-8)
+    assert replace(corrected, pose=given.pose) == given
+    known = KnownReflectors.of_map(load_map(here / "map.geojson"))
+    save_nav2(occupancy(RING, corrected, walls=known), here / "again.yaml")
+    cells = [(here / name).read_bytes().split(b"\n", 3) for name in ("again.pgm", "grid.pgm")]
+    assert cells[0][:3] == cells[1][:3]
+    again, first = (np.frombuffer(cell[3], np.uint8) for cell in cells)
+    assert np.mean(again != first) < 0.01  # the map of the file has rounded numbers
+    assert {0, 205, 254} == set(first.tolist())
+
+
+@pytest.mark.slow
 def test_errors_are_printed_and_the_trajectory_may_go_to_standard_output(here, capsys):
     arguments = ("--odometry", ODOMETRY, "--no-smoothing", "--truth", "truth.tum", "--trajectory", "-")
     assert call("slam", "log.csv", "--ring", "faw", "-o", "again.geojson", *arguments) == 0
@@ -82,6 +100,13 @@ BAD = {
     "slam log.csv --ring faw -o out.geojson --truth other.tum": "--truth",
     "slam log.csv --ring faw -o out.geojson --figure run.xyz": "--figure",
     "slam log.csv --ring faw": "-o",
+    "slam log.csv --ring faw -o out.geojson --log log.csv": "log.csv",
+    "slam log.csv --ring faw -o out.geojson --log out.txt": "--log",
+    "slam log.csv --ring faw -o out.geojson --grid-mode scale": "--grid-mode came without --grid",
+    "slam log.csv --ring faw -o out.geojson --grid out.png": "--grid",
+    "map log.csv --ring faw -o out.geojson --grid-method em": "--grid-method came without --grid",
+    "map log.csv --ring faw -o out.geojson --grid out.yaml --grid-method votes": "--grid-method",
+    "map log.csv --ring faw -o out.geojson --grid out.yaml --grid-mode scale --figure out.png": "out.png",
     "slam nowhere.csv --ring faw -o out.geojson --window 1": "odometry",
     "localize log.csv --ring faw --map no.geojson --trajectory out.tum": "no.geojson",
     "localize log.csv --ring faw --map known.geojson --trajectory known.geojson": "known.geojson",
@@ -168,8 +193,10 @@ def test_localize_reports_an_uncertain_pose(here, capsys):
     files = ("--map", "alike.geojson", "--trajectory", "where.tum")
     assert call("localize", "alike.csv", "--ring", "faw", *files) == 1
     said = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
-    assert len(said) == 1
+    assert len(said) == 3
     assert "ambiguous, 2 places look alike" in said[0]
+    chance = [float(line.split(" %")[0]) for line in said[1:]]
+    assert 40 < chance[1] <= chance[0] < 60
     assert not (here / "where.tum").exists()
 
 

@@ -9,7 +9,9 @@ import pytest
 from jaxsonar import Log, Ring, Room, SonarError, simulate
 from jaxsonar.geometry.se2 import compose, inverse, transform_points, wrap_angle
 from jaxsonar.localization.localize import Localized, localize
+from jaxsonar.localization.scan_update import update_hypotheses
 from jaxsonar.mapping.global_map import GlobalMap
+from jaxsonar.mapping.map_from_room import map_from_room
 from jaxsonar.simulation.office import load_office
 
 RING = Ring.circular()
@@ -95,6 +97,9 @@ def test_a_rectangle_is_ambiguous():
     for place, truth in zip(sorted(found.hypotheses[:2], key=lambda one: one.pose[0]), (poses[0], other), strict=True):
         np.testing.assert_allclose(place.pose[:2], truth[:2], atol=0.01)
         assert abs(wrap_angle(float(place.pose[2] - truth[2]))) < np.radians(1)
+    # They are equally probable.
+    assert all(0.4 < place.probability < 0.6 for place in found.hypotheses[:2])
+    assert sum(place.probability for place in found.hypotheses) <= 1
     assert all(f"{place.pose[0]:.2f}, {place.pose[1]:.2f} m" in found.reason for place in found.hypotheses[:2])
     # A start pose resolves the ambiguity.
     assert_correct(localize(RING, world_of(walls), given, start=[0.9, 0.6, 0.1], sigma=SIGMA), poses)
@@ -119,6 +124,53 @@ def test_a_place_outside_the_map_is_not_found(world):
     assert "no place" in found.reason or "ambiguous" in found.reason
 
 
+def building(box):
+    """Two rooms that are alike and a lower one, side by side, with doors; a piece of furniture, if drawn."""
+    walls = [
+        [[0, 0], [9.2, 0]],
+        [[0, 0], [0, 2.6]],
+        [[0, 2.6], [6.4, 2.6]],
+        [[6.4, 2.2], [9.2, 2.2]],
+        [[9.2, 0], [9.2, 2.2]],
+    ]
+    for x in (3.2, 6.4):
+        for side in (x - 0.05, x + 0.05):
+            walls += [[[side, 0], [side, 0.7]], [[side, 1.6], [side, 2.6]]]
+    if box:
+        walls += [[[4.4, 2.3], [5.0, 2.3]], [[4.4, 2.3], [4.4, 2.6]], [[5.0, 2.3], [5.0, 2.6]]]
+    return np.array(walls, dtype=float)
+
+
+@pytest.mark.slow
+def test_a_plan_is_ambiguous_until_the_drive_leaves_the_rooms_that_are_alike():
+    """The whole drive is used, and the plan is not exact: a wall is off by 2 cm, and furniture is not drawn."""
+    true = building(box=True)
+    true[:, :, 0] += np.where(true[:, :, 0] > 5.5, 0.02, 0.0)
+    x = np.linspace(1.0, 8.2, 26)
+    poses = np.column_stack([x, 1.15 + 0.25 * np.cos(1.96 * x), 0.3 * np.sin(3 * x)])
+    given = simulate(RING, Room(true), poses, sigma=0.003, dropout=0.1, seed=4).as_log(RING, poses)
+    given = replace(given, pose=compose(np.array([3.0, 1.0, 2.0]), poses))
+    plan = map_from_room(Room(building(box=False)))
+    # A few scans of the first room fit both.
+    found = localize(RING, plan, given[:6])
+    assert not found.is_certain
+    # The whole drive fits one place.
+    found = localize(RING, plan, given)
+    assert found.is_certain, found.reason
+    assert found.hypotheses[0].probability > 0.99
+    apart = errors_of(found, poses)
+    assert np.median(np.hypot(apart[:, 0], apart[:, 1])) < 0.08
+    assert np.median(np.abs(apart[:, 2])) < np.radians(1.5)
+
+
+def test_an_update_is_compiled_once():
+    """Numbers of hypotheses, echoes and landmarks compile nothing again."""
+    before = update_hypotheses._cache_size()
+    for rows, walls in ((3, 9), (1, 7)):
+        localize(RING, world_of(office().room.walls[:walls]), log()[:rows], start=[0.1, 0.0, 0.0], sigma=SIGMA)
+    assert update_hypotheses._cache_size() <= before + 1
+
+
 def test_invalid_arguments_are_errors(world):
     nothing = world_of(np.zeros((0, 2, 2)))
     none = np.zeros(0, int)
@@ -131,3 +183,5 @@ def test_invalid_arguments_are_errors(world):
             localize(RING, world, log()[:1], start=start)
     with pytest.raises(SonarError, match="sigma"):
         localize(RING, world, log()[:1], sigma=-1.0)
+    with pytest.raises(SonarError, match="map_sd"):
+        localize(RING, world, log()[:1], map_sd=(0.0, 0.1))

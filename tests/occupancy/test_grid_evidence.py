@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.firings import explicit, fire_in_turn, repeat_readings
-from support.grids import assert_same_evidence, evidence_of, layers
+from support.grid_layers import assert_same_evidence, evidence_of, layers
 from support.rooms import loop
 
 from jaxsonar import Log, Ring, simulate

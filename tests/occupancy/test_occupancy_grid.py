@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import shapely
-from support.grids import assert_same_grid, grid_of_parts
+from support.grid_layers import assert_same_grid, grid_of_parts
 
 from jaxsonar import Log, Ring, random_pose, random_room, simulate
 from jaxsonar.floor_plans.room import Room

@@ -2,6 +2,7 @@
 
 FIGURES = (
     "1-ring", "2-reference", "3-arcs", "4-lines", "4-accumulator", "5-modeling", "6-segments", "7-map", "8-grid",
+    "9-grids",
 )  # fmt: skip
 FILES = {
     *(f"{name}.{suffix}" for name in FIGURES for suffix in ("svg", "png")),

@@ -1,69 +1,41 @@
-"""Evidence and grids in one frame of cells, for comparison."""
+"""Occupancy grids of known rooms, and their files as map_saver writes them."""
 
 import numpy as np
 
-from jaxsonar.occupancy.grid_evidence import GridEvidence
-from jaxsonar.occupancy.incremental_grid import IncrementalGrid
-from jaxsonar.occupancy.known_reflectors import KnownReflectors
-from jaxsonar.occupancy.occupancy_grid import NO_WALLS
-from jaxsonar.scans.single_firings import group_firings
+from jaxsonar.geometry.se2 import inverse, transform_points
 
 
-def evidence_of(ring, *logs, walls=NO_WALLS, method="counts"):
-    """Evidence of logs that are added one after the other."""
-    evidence = GridEvidence(ring, method=method)
-    for log in logs:
-        evidence.add(group_firings(log), KnownReflectors.of_walls(walls))
-    return evidence
+def rasterized(walls, resolution, origin, *, noise=0.0, gaps=0.0, seed=0):
+    """Occupied and free cells of a closed room as a laser maps it.
+
+    Occupied are the cells that samples of the walls hit, with noise, but for a fraction ``gaps``; the inside is free.
+    """
+    rng = np.random.default_rng(seed)
+    samples = []
+    for start, end in walls:
+        count = int(np.linalg.norm(end - start) / 0.01)
+        on = start + np.linspace(0, 1, count)[:, None] * (end - start)
+        on = on[rng.random(count) > gaps]
+        samples.append(on + rng.normal(0, noise, on.shape))
+    cells = np.floor(transform_points(inverse(origin), np.concatenate(samples)) / resolution).astype(int)
+    size = cells.max(axis=0) + 12
+    x, y = (part.ravel() for part in np.meshgrid(*(np.arange(n) + 0.5 for n in size)))
+    world = transform_points(origin, resolution * np.stack([x, y], axis=-1))
+    a, b = walls[:, 0], walls[:, 1]
+    # Even-odd rule.
+    above = (a[:, 1] > world[:, 1:]) != (b[:, 1] > world[:, 1:])
+    slope = np.divide(b[:, 0] - a[:, 0], b[:, 1] - a[:, 1], out=np.zeros(len(a)), where=b[:, 1] != a[:, 1])
+    inside = (above & (world[:, :1] < a[:, 0] + (world[:, 1:] - a[:, 1]) * slope)).sum(axis=1) % 2 == 1
+    occupied = np.zeros(size[::-1], dtype=bool)
+    occupied[cells[:, 1], cells[:, 0]] = True
+    return occupied, inside.reshape(occupied.shape) & ~occupied
 
 
-def layers(*evidences):
-    """Passes (scans of each direction), looks and footprint of several evidences, in one frame of cells."""
-    area = evidences[0].area
-    for evidence in evidences[1:]:
-        area = area.union(evidence.area)
-    found = []
-    for evidence in evidences:
-        here = area.window(evidence.area.corner, evidence.area.shape)
-        placed = []
-        for layer in (evidence.passes, evidence.looks, evidence.footprint):
-            whole = np.zeros((*layer.shape[:-2], *area.shape), int)
-            whole[..., *here] = layer
-            placed.append(whole)
-        found.append(placed)
-    return found
-
-
-def arcs_of(evidence):
-    """The arcs as sorted rows."""
-    arcs = evidence.arcs
-    rows = np.column_stack([arcs.path, arcs.pose, arcs.distance, arcs.echoes])
-    return rows[np.lexsort(rows.T)]
-
-
-def assert_same_evidence(one, other, *, footprint=True):
-    """Equal to the bit."""
-    for name, a, b in zip(("passes", "looks", "footprint"), *layers(one, other), strict=True):
-        if name != "footprint" or footprint:
-            np.testing.assert_array_equal(a, b, err_msg=name)
-    np.testing.assert_allclose(arcs_of(one), arcs_of(other), atol=1e-12)
-
-
-def grid_of_parts(ring, parts, *, walls=NO_WALLS, method="counts"):
-    """The grid of logs that are added one after the other."""
-    growing = IncrementalGrid(ring, method=method)
-    for part in parts:
-        growing.add(part)
-    return growing.update(walls)
-
-
-def assert_same_grid(one, other):
-    """Equal to the bit."""
-    assert (one.resolution, one.corner, one.scans, one.skipped) == (
-        other.resolution,
-        other.corner,
-        other.scans,
-        other.skipped,
-    )
-    for name in ("evidence", "probability", "occupied", "free", "looks", "footprint"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+def save_map_server(folder, occupied, free, resolution, origin):
+    """Write MAP.yaml and MAP.pgm as map_saver does; returns the YAML file."""
+    image = np.where(occupied, 0, np.where(free, 254, 205)).astype(np.uint8)[::-1]
+    (folder / "map.pgm").write_bytes(b"P5\n%d %d\n255\n" % image.shape[::-1] + image.tobytes())
+    values = f"resolution: {resolution}\norigin: [{origin[0]}, {origin[1]}, {origin[2]}]\n"
+    thresholds = "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    (folder / "map.yaml").write_text("image: map.pgm\nmode: trinary\n" + values + thresholds)
+    return folder / "map.yaml"
