@@ -1,4 +1,4 @@
-"""``jaxsonar stream``: lines and a growing map from a device, live."""
+"""``jaxsonar stream``: lines, a growing map and an occupancy grid from a device, live."""
 
 import argparse
 import os
@@ -25,6 +25,7 @@ from jaxsonar.cli.arguments import (
     odometry_noise,
 )
 from jaxsonar.cli.console import check_sigma_is_used, print_status, stopped_by_signals
+from jaxsonar.cli.grid_output import add_grid_arguments, grid_outputs
 from jaxsonar.cli.inputs import InputMessages, add_strict, load_checked_ring
 
 TERMINAL_INTERVAL, LOG_INTERVAL = 1.0, 10.0
@@ -50,8 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--map", type=filename_ending_in(".geojson", ".json"), metavar="MAP", help="GeoJSON, written every 2 s"
     )
+    add_grid_arguments(parser)
     parser.add_argument(
-        "--slam", action="store_true", help="treat the device's poses as odometry, and estimate the robot's poses"
+        "--slam",
+        action="store_true",
+        help="treat the device's poses as odometry, and estimate the robot's poses; map and grid follow when they are "
+        "corrected",
     )
     parser.add_argument(
         "--trajectory",
@@ -94,6 +99,7 @@ def run(options: argparse.Namespace) -> int:
     from jaxsonar.fileio.atomic_files import check_outputs, shown
     from jaxsonar.fileio.compilation_cache import use_compilation_cache
     from jaxsonar.hardware.transport_base import NotOpenedError, parse_url
+    from jaxsonar.live.grid_files import second_image_filename
     from jaxsonar.live.stream import stream as stream_scans
 
     check_sigma_is_used(options.sigma, options.method)
@@ -103,9 +109,13 @@ def run(options: argparse.Namespace) -> int:
         raise SonarError("--trajectory or --odometry came without --slam; allowed are they with --slam")
     if options.no_echo and replayed is None:
         raise SonarError("--no-echo came with a device; allowed is it with file:LOG")
+    grid_mode = options.grid_mode or "trinary"
+    second_image = options.grid and second_image_filename(options.grid, mode=grid_mode)
     outputs = {
         "--record": options.record,
         "--map": options.map,
+        **grid_outputs(options),
+        "--grid's second image": second_image,
         "--rrd": options.rrd,
         "--trajectory": options.trajectory,
     }
@@ -133,6 +143,9 @@ def run(options: argparse.Namespace) -> int:
                 sigma=options.sigma,
                 record=options.record,
                 map_filename=options.map,
+                grid=options.grid,
+                grid_method=options.grid_method or "counts",
+                grid_mode=grid_mode,
                 odometry_noise=odometry_noise(options.odometry) if options.slam else None,
                 trajectory=options.trajectory,
                 scans=options.scans,
@@ -167,6 +180,8 @@ def run(options: argparse.Namespace) -> int:
         _exit_now(2)
     if not status.warm:
         _exit_now(int(bool(reason)))
+    if status.no_grid and not reason:
+        raise SonarError(f"--grid {shown(options.grid)}: {status.no_grid}")
     return int(bool(reason))
 
 

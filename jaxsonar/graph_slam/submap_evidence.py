@@ -69,7 +69,7 @@ class SubmapEvidence:
         for number, scans in enumerate(self.scans):
             if not scans:
                 continue
-            world_from_submap = compose(self.tracker_state.world_from_first, self.tracker_state.graph.poses[number])
+            world_from_submap = self._world_from_submap(number)
             cached = self.cache.get(number)
             is_current = cached is not None and cached.scan_count == len(scans)
             if cached is None or not is_current or _is_stale(world_from_submap, cached.world_from_submap):
@@ -78,13 +78,31 @@ class SubmapEvidence:
             union = cached.evidence if union is None else union.union(cached.evidence)
         return union
 
-    def _gather(self, ring: Ring, number: int, world_from_submap: Float[np.ndarray, "3"]) -> MapEvidence:
-        """Evidence of one submap."""
-        submaps, pairs = self.tracker_state.graph.submaps, self.scans[number]
+    def poses(self) -> Float[np.ndarray, "scans 3"]:
+        """Current estimates of world_from_robot of all scans, metres and radians."""
+        numbers = [number for number, scans in enumerate(self.scans) if scans]
+        parts = [self._poses_of(number, self._world_from_submap(number)) for number in numbers]
+        return np.concatenate([np.zeros((0, 3)), *parts])
+
+    def scans_at_current_poses(self) -> list[Scan]:
+        """All scans with their current poses."""
+        scans = [scan for pairs in self.scans for scan, _ in pairs]
+        return [replace(scan, pose=pose) for scan, pose in zip(scans, self.poses(), strict=True)]
+
+    def _world_from_submap(self, number: int) -> Float[np.ndarray, "3"]:
+        return compose(self.tracker_state.world_from_first, self.tracker_state.graph.poses[number])
+
+    def _poses_of(self, number: int, world_from_submap: Float[np.ndarray, "3"]) -> Float[np.ndarray, "scans 3"]:
+        """Poses of the scans of one submap."""
+        submaps = self.tracker_state.graph.submaps
         poses = submaps[number].poses if number < len(submaps) else np.array(self.tracker_state.submap.poses)
         # A submap starts with the last scan of the submap before, which has that scan already.
-        world_from_robot = compose(world_from_submap, poses[-len(pairs) :])
-        scans = [replace(scan, pose=pose) for (scan, _), pose in zip(pairs, world_from_robot, strict=True)]
+        return compose(world_from_submap, poses[-len(self.scans[number]) :])
+
+    def _gather(self, ring: Ring, number: int, world_from_submap: Float[np.ndarray, "3"]) -> MapEvidence:
+        """Evidence of one submap."""
+        pairs, poses = self.scans[number], self._poses_of(number, world_from_submap)
+        scans = [replace(scan, pose=pose) for (scan, _), pose in zip(pairs, poses, strict=True)]
         return gather_evidence(ring, Log.from_scans(scans), [model for _, model in pairs])
 
 

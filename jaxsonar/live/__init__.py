@@ -9,6 +9,7 @@ Design decisions:
   is a scan of a ring of another shape: the same compiled programs with other arrays. A scan has the pose and the stamp
   of its first firing group.
 - Paths of a firing group that did not arrive were not measured; they are evidence neither for nor against a wall.
-- Lines are computed at once; the map is updated when no scan waits.
+- Lines are computed at once; the map is updated when no scan waits. An occupancy grid is updated in a thread of its
+  own, because an update takes seconds and may compile.
 - The compiler runs in the background while the first scans are recorded and queued.
 """

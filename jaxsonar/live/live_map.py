@@ -206,6 +206,18 @@ class LiveMap:
         poses, covariances = self._mapper.trajectory(self._state)
         return Trajectory(np.array(self._stamps), poses, covariances)
 
+    def poses(self) -> Float[np.ndarray, "scans 3"]:
+        """The current estimates of all poses: x, y (m), theta (rad). Only with ``odometry_noise``."""
+        assert self._state is not None
+        assert self._state.submap_evidence is not None
+        return self._state.submap_evidence.poses()
+
+    def scans_at_current_poses(self) -> list[Scan]:
+        """All scans with the current estimates of their poses. Only with ``odometry_noise``."""
+        assert self._state is not None
+        assert self._state.submap_evidence is not None
+        return self._state.submap_evidence.scans_at_current_poses()
+
     def _path_pose(self, scan: Scan) -> Float[np.ndarray, "paths 3"] | None:
         """Pose of the robot when each path was measured, relative to its pose at the first firing; None if it stood."""
         if scan.odometry is None or np.ptp(scan.odometry[:, 1:], axis=0).max() < SETTINGS.standing_threshold:

@@ -52,6 +52,8 @@ class Status:
     """The latest link event; empty while the link works."""
     warm: bool = False
     """Everything is compiled."""
+    no_grid: str = ""
+    """The reason why no grid was written at the end; empty if one was, or none was requested."""
     ending: bool = False
     """The stream was stopped during compilation; queued scans are still to be processed for the map."""
 

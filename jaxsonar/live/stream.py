@@ -1,4 +1,4 @@
-"""``stream``: from a device to lines and a map, live."""
+"""``stream``: from a device to lines, a map and an occupancy grid, live."""
 
 import os
 import sys
@@ -13,10 +13,13 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.reader_thread import ReaderThread
 from jaxsonar.hardware.scan_assembler import RawScan
 from jaxsonar.hardware.transport_base import LinkEvent, open_source, parse_url, register_transport
+from jaxsonar.live.live_grid import LiveGrid
 from jaxsonar.live.live_map import LiveMap, LiveScan
 from jaxsonar.live.replay import file_opener
 from jaxsonar.live.status import Status
 from jaxsonar.live.stream_loop import SETTINGS, StreamLoop, Viewer
+from jaxsonar.occupancy.grid_evidence import GridMethod
+from jaxsonar.occupancy.nav2_map import Nav2Mode
 from jaxsonar.recordings.input_options import InputOptions
 from jaxsonar.scans.raw_scans import group_paths
 from jaxsonar.scans.recording_journal import open_log_recorder
@@ -33,6 +36,9 @@ def stream(
     record: str | os.PathLike[str] | None = None,
     map_filename: str | os.PathLike[str] | None = None,
     map_interval: float = SETTINGS.map_interval,
+    grid: str | os.PathLike[str] | None = None,
+    grid_method: GridMethod = "counts",
+    grid_mode: Nav2Mode = "trinary",
     odometry_noise: OdometryNoise | None = None,
     trajectory: str | os.PathLike[str] | None = None,
     scans: int | None = None,
@@ -56,7 +62,11 @@ def stream(
         record: file for a recording of everything received, ``.csv``, ``.parquet`` or ``.mcap``; see
             ``open_log_recorder``.
         map_filename: GeoJSON file of the map, written atomically at intervals and at the end.
-        map_interval: seconds between two writes of the map.
+        map_interval: seconds between two writes of the map, and at least between two writes of the grid.
+        grid: YAML file of an occupancy grid for Nav2, its image beside it (``GridFiles``); written at intervals and at
+            the end, but not without an echo and a pose (``Status.no_grid``).
+        grid_method: how echoes become obstacles, see ``occupancy``.
+        grid_mode: how map_server reads the image of the grid, see ``save_nav2``.
         odometry_noise: noise of the device's poses. If given, they are odometry, and the poses of the robot are
             estimated (``slam``). By default the device's poses are exact.
         trajectory: TUM file of the estimated poses, written at the end; needs ``odometry_noise``.
@@ -84,7 +94,7 @@ def stream(
             "stream: a trajectory came without odometry_noise; allowed is a trajectory where poses are estimated"
         )
     # 1. The live map, and the reader: device -> recording -> queue.
-    mapping = bool(map_filename) or view is not None
+    mapping = bool(map_filename) or grid is not None or view is not None
 
     def on_warning(text: str) -> None:
         if on_event is not None:
@@ -99,6 +109,9 @@ def stream(
         odometry_noise=odometry_noise,
         on_warning=on_warning,
     )
+    live_grid = None
+    if grid is not None:
+        live_grid = LiveGrid(live, grid, interval=map_interval, method=grid_method, mode=grid_mode)
     queue = DropOldestQueue[RawScan](SETTINGS.warm_up_capacity, size_of=lambda scan: len(scan.echoes))
     stop = threading.Event() if stop is None else stop
     reader = _open_reader(
@@ -111,6 +124,7 @@ def stream(
         queue,
         map_filename=map_filename,
         map_interval=map_interval,
+        grid=live_grid,
         trajectory=trajectory,
         view=view,
         on_scan=on_scan,
@@ -124,7 +138,7 @@ def stream(
             if loop.wait_until_compiled(stop):
                 loop.process_scans(stop)
         finally:
-            # 5. Stop reading, process the rest of the queue, write map and trajectory.
+            # 5. Stop reading, process the rest of the queue, write map, grid and trajectory.
             reader.stop()
             loop.finish()
     if on_status is not None:

@@ -1,10 +1,10 @@
-"""The loop of a stream: compile in the background, process scan by scan, write the map now and then."""
+"""The loop of a stream: compile in the background, process scan by scan, write map and grid now and then."""
 
 import os
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, wait
+from concurrent.futures import wait
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -15,6 +15,8 @@ from jaxsonar.fileio.atomic_files import shown
 from jaxsonar.hardware.drop_oldest_queue import CAPACITY, DropOldestQueue
 from jaxsonar.hardware.reader_thread import ReaderThread
 from jaxsonar.hardware.scan_assembler import RawScan
+from jaxsonar.live.background_work import run_in_background
+from jaxsonar.live.live_grid import LiveGrid
 from jaxsonar.live.live_map import SETTINGS as LIVE_MAP_SETTINGS
 from jaxsonar.live.live_map import LiveMap, LiveScan
 from jaxsonar.live.status import Status
@@ -27,7 +29,10 @@ class StreamSettings:
     """Timing and capacities of a stream. All values are chosen by hand."""
 
     map_interval: float = 2.0
-    """Seconds between two writes of the map."""
+    """Seconds between two writes of the map, at least."""
+    map_pause: float = 5.0
+    """Pause between two computations of the map, in durations of the last one: scans do not wait for most of the time,
+    however large the map is."""
     warm_up_capacity: int = 8192
     """Capacity of the queue during compilation, scans: 12 min of the paper's ring, about 30 MB."""
     poll_interval: float = 0.2
@@ -70,6 +75,7 @@ class StreamLoop:
         *,
         map_filename: str | os.PathLike[str] | None,
         map_interval: float,
+        grid: LiveGrid | None,
         trajectory: str | os.PathLike[str] | None,
         view: Viewer | None,
         on_scan: Callable[[LiveScan], None] | None,
@@ -79,6 +85,7 @@ class StreamLoop:
         self.status = Status()
         self._live, self._reader, self._queue = live, reader, queue
         self._map_filename, self._map_interval, self._trajectory = map_filename, map_interval, trajectory
+        self._grid = grid
         self._view, self._on_scan, self._on_status = view, on_scan, on_status
         self._latencies = np.full(SETTINGS.latency_history, np.nan)
         self._timed_scans = 0
@@ -88,7 +95,13 @@ class StreamLoop:
         self._mapped_scans = -1
         self._rate_samples: list[tuple[float, int]] = []
         self._reported_at = 0.0
-        self._compilation = _run_in_background(live.warm_up)
+        self._compilation = run_in_background(self._warm_up, name="jaxsonar warm-up")
+
+    def _warm_up(self) -> None:
+        """Compile everything."""
+        self._live.warm_up()
+        if self._grid is not None:
+            self._grid.warm_up()
 
     def wait_until_compiled(self, stop: threading.Event) -> bool:
         """Wait for the compilation. False if ``stop`` was set, or the stream ended without a scan, before."""
@@ -110,12 +123,11 @@ class StreamLoop:
                 self._queue.capacity = CAPACITY
             if not len(self._queue) or self._live.pending >= batch:
                 self._live.update_map()
-            if time.monotonic() >= self._next_map:
-                self._update_outputs()
+            self._update_outputs()
             self._report()
 
     def finish(self) -> None:
-        """Process the scans in the queue and write the last map and the trajectory.
+        """Process the scans in the queue and write the last map, grid and trajectory.
 
         If only a recording was requested, the scans are discarded and the compilation is not waited for.
 
@@ -123,7 +135,7 @@ class StreamLoop:
             BaseException: the error of the reading thread, after everything received before it is written.
         """
         if not self._compilation.done():
-            outputs = (self._map_filename, self._view, self._on_scan, self._trajectory)
+            outputs = (self._map_filename, self._grid, self._view, self._on_scan, self._trajectory)
             if all(output is None for output in outputs):
                 self._update_status()
                 while not self._queue.ended:
@@ -140,9 +152,7 @@ class StreamLoop:
                 self._process(self._queue.get(0.0, max_items=LIVE_MAP_SETTINGS.max_batch))
             except BaseException as failure:  # of the reader; scans received before it are still written
                 error = failure
-        self._update_outputs(last=True)
-        if self._trajectory is not None:
-            save_trajectory(self._live.trajectory(), self._trajectory)
+        self._finish_outputs()
         self._update_status()
         if self._view is not None:
             self._view.close()
@@ -164,20 +174,42 @@ class StreamLoop:
                 self._timed_scans += 1
             if self._on_scan is not None:
                 self._on_scan(live)
+        if self._grid is not None:
+            self._grid.add([live.scan for live in live_scans])
         if self._view is not None:
             self._view.show(live_scans[-1])
 
-    def _update_outputs(self, *, last: bool = False) -> None:
-        """Write and show the map, if there are new scans."""
-        if self._map_filename is None and self._view is None:
+    def _update_outputs(self) -> None:
+        """Write and show map and grid if they are due, and there are new scans."""
+        start, grid = time.monotonic(), self._grid
+        is_due = start >= self._next_map and self.status.scans != self._mapped_scans
+        if not (is_due or (grid is not None and grid.is_full)):
             return
-        if self.status.scans != self._mapped_scans or last:
-            world, self._mapped_scans = self._live.map(), self.status.scans
-            if self._map_filename is not None:
-                save_map(world, self._map_filename)
-            if self._view is not None:
-                self._view.show_map(world)
-        self._next_map = time.monotonic() + self._map_interval
+        if grid is None and self._map_filename is None and self._view is None:
+            return
+        world = self._live.map()
+        self._write_map(world)
+        if grid is not None and grid.is_due:
+            grid.start_update(world)
+        now = time.monotonic()
+        self._next_map = now + max(self._map_interval, SETTINGS.map_pause * (now - start))
+
+    def _finish_outputs(self) -> None:
+        """Write the last map, trajectory and grid."""
+        if self._map_filename is not None or self._view is not None:
+            self._write_map(self._live.map())
+        if self._trajectory is not None:
+            save_trajectory(self._live.trajectory(), self._trajectory)
+        if self._grid is not None:
+            self._grid.finish(self._live.map())
+            self.status.no_grid = self._grid.empty
+
+    def _write_map(self, world: GlobalMap) -> None:
+        self._mapped_scans = self.status.scans
+        if self._map_filename is not None:
+            save_map(world, self._map_filename)
+        if self._view is not None:
+            self._view.show_map(world)
 
     def _report(self) -> None:
         """Call ``on_status``, at most every ``status_interval``."""
@@ -201,17 +233,3 @@ class StreamLoop:
         if self._timed_scans:
             latencies = self._latencies[: self._timed_scans]
             status.p50, status.p99 = np.percentile(latencies, [50, 99]).tolist()
-
-
-def _run_in_background(work: Callable[[], None]) -> Future[None]:
-    """Run a function in a daemon thread. The process can exit before it returns; a compilation cannot be cancelled."""
-    future: Future[None] = Future()
-
-    def run() -> None:
-        try:
-            future.set_result(work())
-        except BaseException as failure:
-            future.set_exception(failure)
-
-    threading.Thread(target=run, name="jaxsonar warm-up", daemon=True).start()
-    return future

@@ -41,7 +41,13 @@ def check_grid(grid: OccupancyGrid) -> None:
         raise SonarError(f"{why} came, the grid is empty; needed is a scan with a pose")
 
 
-def save_nav2(grid: OccupancyGrid, filename: str | os.PathLike[str], *, mode: Nav2Mode = "trinary") -> None:
+def save_nav2(
+    grid: OccupancyGrid,
+    filename: str | os.PathLike[str],
+    *,
+    mode: Nav2Mode = "trinary",
+    image_file: Path | None = None,
+) -> None:
     """Write a grid for Nav2's map_server: MAP.yaml, and the image beside it.
 
     Trinary: MAP.pgm, as map_saver writes it. Scale: MAP.png, in which cells that are neither free nor occupied are as
@@ -51,11 +57,12 @@ def save_nav2(grid: OccupancyGrid, filename: str | os.PathLike[str], *, mode: Na
         grid: a grid with at least one cell.
         filename: the YAML file, .yaml or .yml.
         mode: how map_server reads the image.
+        image_file: in the same folder; by default ``grid_image_filename``.
 
     Raises:
         SonarError: another suffix, a grid without cells, or a file that cannot be written.
     """
-    image_file = grid_image_filename(filename, mode=mode)
+    image_file = image_file or grid_image_filename(filename, mode=mode)
     try:
         check_grid(grid)
     except SonarError as error:

@@ -1,6 +1,6 @@
 """Which parts of known walls exist, and where walls may stand that no sensor has faced."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -98,36 +98,37 @@ def look_through(
         beyond: length of the extensions, metres.
         resolution: length of a part, metres.
     """
-    position, heading, certain, first_echo, driven, max_range = readings
     length, before = lengths(segments), int(np.ceil(beyond / resolution))
     bins = np.ceil(length / resolution).astype(int) + 2 * before
     confirmed, refuted = (np.zeros((len(segments), bins.max()), np.int64) for _ in range(2))
     tangent = (segments[:, 1] - segments[:, 0]) / length[:, None]
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
-    points = known.reflecting_points()
-    rows = max(1, 500_000 // (len(segments) + len(points)))
-    for begin in range(0, len(position), rows):
-        here = slice(begin, begin + rows)
-        offset = position[here, None] - segments[:, 0]
-        height, along = (offset * normal).sum(-1), (offset * tangent).sum(-1)
-        toward = np.arctan2(-normal[:, 1], -normal[:, 0]) + np.where(height < 0, np.pi, 0)
-        off_axis = np.abs(wrap_angle(toward - heading[here, None]))
+    points, max_range = known.reflecting_points(), readings.max_range
+    for here, reading, wall, height in _facing_pairs(segments, normal, readings, beyond=beyond):
+        along = ((here.position[reading] - segments[wall, 0]) * tangent[wall]).sum(-1)
         cell = np.floor(along / resolution).astype(int) + before
-        facing = (off_axis <= certain[here, None]) & (np.abs(height) < max_range) & (cell >= 0) & (cell < bins)
-        reading, wall = np.nonzero(facing & (first_echo[here, None] > np.abs(height) - _WALLS.explained))
-        if not len(reading):
+        on_segment = np.flatnonzero((cell >= 0) & (cell < bins[wall]))
+        if not len(on_segment):
             continue
+        reading, wall, height, cell = (column[on_segment] for column in (reading, wall, height, cell))
         # Another wall in between hides the part.
-        start = position[here][reading]
-        foot = start - height[reading, wall][:, None] * normal[wall]
-        hidden = _is_hidden(start, foot, segments[wall], known.walls)
-        reading, wall, start = reading[~hidden], wall[~hidden], start[~hidden]
-        later = first_echo[here][reading] - np.abs(height[reading, wall])
-        half_width = certain[here][reading] / SETTINGS.free.certain
-        fit = _point_residual(start, heading[here][reading], half_width, first_echo[here][reading], points)
+        start = here.position[reading]
+        foot = start - height[:, None] * normal[wall]
+        near = known.near(start.min(axis=0) - max_range, start.max(axis=0) + max_range)
+        shown = ~_is_hidden(start, foot, segments[wall], near.walls)
+        reading, wall, height, cell, start = (column[shown] for column in (reading, wall, height, cell, start))
+        later = here.first_echo[reading] - np.abs(height)
+        half_width = here.certain[reading] / SETTINGS.free.certain
+        close = (points >= start.min(axis=0, initial=np.inf) - max_range) & (
+            points <= start.max(axis=0, initial=-np.inf) + max_range
+        )
+        fit = _point_residual(
+            start, here.heading[reading], half_width, here.first_echo[reading], points[close.all(axis=1)]
+        )
         passed = (later > _WALLS.explained) | (later > _WALLS.distinct) & (fit < later)
         for counts, some in ((refuted, passed), (confirmed, ~passed)):
-            np.add.at(counts, (wall[some], cell[reading[some], wall[some]]), 1)
+            np.add.at(counts, (wall[some], cell[some]), 1)
+    driven = readings.driven
     for wall in range(len(segments)):  # where the robot drove, there is no wall
         offset = driven - segments[wall, 0]
         near = np.abs(offset @ normal[wall]) <= resolution
@@ -139,6 +140,57 @@ def look_through(
         np.apply_along_axis(np.convolve, 1, counts, kernel, "same") for counts in (refuted, confirmed)
     )
     return LookedThrough((refuted >= _WALLS.min_looks) & (refuted > 2 * confirmed), before, bins)
+
+
+def _facing_pairs(
+    segments: Float[np.ndarray, "segments 2 2"],
+    normal: Float[np.ndarray, "segments 2"],
+    readings: FacingReadings,
+    *,
+    beyond: float,
+) -> Iterator[tuple[FacingReadings, Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]]:
+    """Readings that face the lines of segments, and hear nothing nearer, one part of the floor after the other.
+
+    Args:
+        segments: world frame, metres.
+        normal: of each.
+        readings: of all scans.
+        beyond: length of the extensions of the segments, metres.
+
+    Yields:
+        Readings of about the same place and direction; rows of these readings and of the segments; heights of the
+        readings above the segments' lines, in the direction of the normals, metres.
+    """
+    low, high = segments.min(axis=1) - beyond, segments.max(axis=1) + beyond
+    limit = np.minimum(readings.max_range, readings.first_echo + _WALLS.explained)
+    sector = np.floor(readings.heading % (2 * np.pi) / (np.pi / 4))
+    key = np.column_stack([np.floor(readings.position / (readings.max_range / 2)), sector]).astype(int)
+    order = np.lexsort(key.T)
+    new = np.flatnonzero((np.diff(key[order], axis=0) != 0).any(axis=1)) + 1
+    for rows in np.split(order, new) if len(order) else []:
+        position, heading, certain = readings.position[rows], readings.heading[rows], readings.certain[rows]
+        # Footpoints lie in the cones: in a box around them.
+        angle = heading[:, None] + certain[:, None] * np.linspace(-1, 1, 5)
+        rim = position[:, None] + limit[rows, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        cones = np.concatenate([position, rim.reshape(-1, 2)])
+        sagitta = float(limit[rows].max() * (1 - np.cos(certain.max() / 4)))
+        inside = (low <= cones.max(axis=0) + sagitta) & (high >= cones.min(axis=0) - sagitta)
+        near = np.flatnonzero(inside.all(axis=1))
+        if not len(near):
+            continue
+        first_echo = readings.first_echo[rows]
+        here = FacingReadings(position, heading, certain, first_echo, readings.driven, readings.max_range)
+        ray = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+        count = max(1, 4_000_000 // len(near))
+        for begin in range(0, len(rows), count):
+            part = slice(begin, begin + count)
+            height = position[part] @ normal[near].T - (segments[near, 0] * normal[near]).sum(-1)
+            ahead = ray[part] @ normal[near].T * np.where(height < 0, 1, -1)
+            reading, wall = np.nonzero(
+                (ahead >= np.cos(certain[part, None])) & (np.abs(height) < limit[rows[part], None])
+            )
+            if len(reading):
+                yield here, reading + begin, near[wall], height[reading, wall]
 
 
 def profile_walls(known: KnownReflectors, readings: FacingReadings, *, resolution: float) -> WallProfile:

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -166,6 +167,9 @@ def test_signals_stop_the_stream_during_compilation(mapping, device, command, tm
         ("stream", "file:{log}", "--ring", "faw", "--record", "nowhere/x.csv"),
         ("stream", "file:{log}", "--ring", "faw", "--record", "{log}"),
         ("stream", "file:{log}", "--ring", "faw", "--map", "x.svg"),
+        ("stream", "file:{log}", "--ring", "faw", "--grid", "x.pgm"),
+        ("stream", "file:{log}", "--ring", "faw", "--grid", "nowhere/x.yaml"),
+        ("stream", "file:{log}", "--ring", "faw", "--grid-mode", "scale"),
         ("stream", "file:{log}", "--ring", "faw", "--scans", "0"),
         ("stream", "file:{log}", "--ring", "faw", "--method", "hough", "--sigma", "0.01"),
         ("emulate", "{log}", "--ring", "faw", "--listen", "file:x"),
@@ -187,6 +191,25 @@ def test_invalid_calls_are_answered_in_one_line(arguments, log_file, capsys):
     assert out == ""
     assert told.count("\n") == 1
     assert "allowed" in told or "needed" in told, told
+
+
+@pytest.mark.slow
+def test_a_stream_writes_the_grid_of_its_recording(log, log_file, tmp_path, capsys):
+    """With and without a map; without poses one line and no file."""
+    call = ["--ring", "faw", "--method", "hough"]
+    record, grid = tmp_path / "rec.csv", tmp_path / "grid.yaml"
+    assert main(["stream", f"file:{log_file}?speed=0", *call, "--record", str(record), "--grid", str(grid)]) == 0
+    assert sorted(os.listdir(tmp_path)) == ["grid.pgm", "grid.yaml", "rec.csv"]
+    reference = tmp_path / "reference.yaml"
+    assert main(["map", str(record), *call, "-o", str(tmp_path / "m.geojson"), "--grid", str(reference)]) == 0
+    assert grid.with_suffix(".pgm").read_bytes() == reference.with_suffix(".pgm").read_bytes()
+    lost = tmp_path / "lost"
+    lost.mkdir()
+    save_log(replace(log, pose=np.full_like(log.pose, np.nan)), lost / "log.csv")
+    capsys.readouterr()
+    assert main(["stream", f"file:{lost / 'log.csv'}?speed=0", *call, "--grid", str(lost / "grid.yaml")]) == 2
+    assert os.listdir(lost) == ["log.csv"]
+    assert re.search("grid.yaml: 17 scans without a pose came, .*needed is", capsys.readouterr().err.splitlines()[-1])
 
 
 @pytest.mark.slow
