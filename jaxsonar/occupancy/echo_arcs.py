@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.kernels.shape_buckets import bucket_size, pad_rows
+from jaxsonar.kernels.shape_buckets import bucket_size, next_power_of_two, pad_rows
 from jaxsonar.occupancy.settings import SETTINGS
 from jaxsonar.sensors.ring import Ring
 
-_CHUNK = 2048
+_CHUNK, _SMALL_CHUNK = 2048, 256  # sizes of arrays, so that few programs are compiled
 
 
 class EchoArcs(NamedTuple):
@@ -103,7 +103,7 @@ def arc_table(
     for begin in range(0, len(order), _CHUNK):
         rows = order[begin : begin + _CHUNK]
         near = walls_near(walls, arcs.pose[rows, :2], 2 * ring.max_range)
-        size = bucket_size(len(rows), least=64)
+        size = _CHUNK if len(rows) > _SMALL_CHUNK else _SMALL_CHUNK
         found = kernels.arcs_of_echoes(
             paths,
             pad_rows(arcs.path[rows], size),
@@ -126,4 +126,4 @@ def walls_near(
     """Walls around places (metres), padded by walls without length to one of a few sizes."""
     low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
     near: Bool[np.ndarray, " walls"] = ((walls.max(axis=1) >= low) & (walls.min(axis=1) <= high)).all(axis=1)
-    return pad_rows(walls[near].astype(np.float32), bucket_size(int(near.sum()), least=8))
+    return pad_rows(walls[near].astype(np.float32), next_power_of_two(int(near.sum()), least=16))

@@ -124,7 +124,7 @@ def _obstacle_evidence(
     seen = table.weight.any(axis=1)
     cell, weight = table.cell[seen], table.weight[seen]
     echoes = np.minimum(arcs.echoes[seen], SETTINGS.max_echoes).astype(np.float32)
-    size, cells = bucket_size(len(cell), least=256), area.shape[0] * area.shape[1]
+    size, cells = bucket_size(len(cell), least=2048), area.shape[0] * area.shape[1]
     padded = next_power_of_two(cells, least=1 << 14)
     looks = evidence.looks.ravel() / 16
     columns = pad_rows(cell, size), pad_rows(weight, size), pad_rows(echoes, size)

@@ -45,6 +45,8 @@ class ReflectorSettings:
     """Cells on each side, along a wall, whose readings are taken together."""
     max_extension: float = 3.0
     """Length by which a wall may go on, unseen, beyond its ends, metres."""
+    hidden_neighbors: int = 6
+    """Number of nearest other edges with which an edge may form such a wall."""
     min_length: float = 0.2
     """Shorter parts of an extension are no walls, metres."""
     max_hidden: float = 0.7
@@ -129,7 +131,7 @@ class OccupancySettings:
     """An arc counts as this many echoes at most: echoes from the same viewpoint are not independent."""
     max_readings: int = 500_000
     """Number of direct readings, the latest, that test walls and hidden walls: 20,000 scans of 24 sensors."""
-    max_arcs: int = 200_000
+    max_arcs: int = 100_000
     """Largest number of arcs that are kept for the expectation maximization."""
 
 

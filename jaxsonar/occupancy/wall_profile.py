@@ -264,7 +264,7 @@ def hidden_walls(
     ends = np.concatenate([known.points, known.walls.reshape(-1, 2), obstacles])
     if not len(ends):
         return np.zeros((0, 2, 2))
-    segments = ends[KDTree(ends).query_pairs(_WALLS.max_hidden, output_type="ndarray")]
+    segments = ends[_near_pairs(ends)]
     segments = segments[lengths(segments) >= 2 * resolution]
     if not len(segments):
         return segments
@@ -293,6 +293,15 @@ def _meeting_points(walls: Float[np.ndarray, "walls 2 2"], wall: int) -> tuple[f
         0.0 if gap[0] <= _WALLS.touches else float(before.max(initial=-np.inf)),
         length if gap[1] <= _WALLS.touches else float(after.min(initial=np.inf)),
     )
+
+
+def _near_pairs(points: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, "pairs 2"]:
+    """Pairs of points near each other, each with its nearest only, so that their number grows with the points."""
+    gap, other = KDTree(points).query(points, k=_WALLS.hidden_neighbors + 1, distance_upper_bound=_WALLS.max_hidden)
+    first, rank = np.nonzero(np.isfinite(gap))
+    second = other[first, rank]
+    pairs = np.unique(np.sort(np.stack([first, second], axis=-1), axis=1), axis=0)
+    return pairs[pairs[:, 0] != pairs[:, 1]]
 
 
 def _point_residual(
