@@ -97,6 +97,7 @@ from .measurement_model import reported_range as reported_range
 from .ml_detection import Detections as Detections
 from .ml_detection import detect_ml as detect_ml
 from .ml_detection_settings import DetectionSettings as DetectionSettings
+from .occupancy_evidence import CONE_MARGIN as CONE_MARGIN
 from .occupancy_evidence import DIRECTIONS as DIRECTIONS
 from .occupancy_evidence import ArcCells as ArcCells
 from .occupancy_evidence import SeenThrough as SeenThrough

@@ -24,6 +24,8 @@ from .sensor_array import EchoPaths, transform_path
 
 DIRECTIONS = 12
 """Number of directions of normals, modulo half a turn, that are told apart."""
+CONE_MARGIN = 0.05
+"""Angle beside a cone up to which cells may be touched by it, radians."""
 
 
 class ArcCells(eqx.Module):
@@ -192,7 +194,7 @@ def seen_through(
         distance = jnp.sqrt(ahead * ahead + left * left)
         # The tangent of half the angle off the axis is bounded in front of the sensor, and cheap.
         half_tangent = left / jnp.maximum(distance + ahead, 1e-6)
-        widest = jnp.tan(jnp.minimum(half_width + resolution, 0.55 * jnp.pi) / 2)
+        widest = jnp.tan(jnp.minimum(half_width + CONE_MARGIN, 0.55 * jnp.pi) / 2)
         edge = 2 * jnp.arctan(jnp.linspace(-1, 1, rays + 1) * widest)
         visible = visible_distance(pose[:2], pose[2] + edge, walls, jnp.asarray(1e6, pose.dtype))
         visible = jnp.minimum(visible[1:], visible[:-1])

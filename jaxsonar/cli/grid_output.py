@@ -20,7 +20,7 @@ def add_grid_arguments(parser: argparse.ArgumentParser) -> None:
         "--grid",
         type=filename_ending_in(".yaml", ".yml"),
         metavar="YAML",
-        help="occupancy grid for Nav2, with a .pgm beside",
+        help="occupancy grid for Nav2, with a .pgm or .png beside",
     )
     parser.add_argument(
         "--grid-method",

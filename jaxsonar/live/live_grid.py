@@ -142,7 +142,7 @@ class LiveGrid:
 
     def _updated(self, scans: Sequence[Scan], world: GlobalMap, ring: Ring) -> OccupancyGrid:
         """The grid with some more scans; ``ring`` has the present speed of sound."""
-        self._grid.ring = self._grid.evidence.ring = ring
+        self._grid.set_ring(ring)
         if scans:
             self._grid.add(Log.from_scans(scans))
         return self._grid.update(KnownReflectors.of_map(world))

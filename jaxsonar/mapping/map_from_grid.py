@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import convolve
+from scipy.ndimage import binary_dilation, convolve
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -38,6 +38,10 @@ class GridWallSettings:
     """A wall ends at a gap that is longer, metres; narrower than a door."""
     min_length_m: float = 0.25
     """Shorter walls are left out, metres."""
+    unknown_border: int = 2
+    """Free space counts as this many cells wider, where cells are unknown, ..."""
+    min_touching: float = 0.1
+    """... if a smaller fraction of the occupied cells touches free ones."""
     min_cells: int = 4
     """Least number of surface cells of a wall."""
     merge_angle: float = float(np.radians(4.0))
@@ -115,6 +119,10 @@ def _surface(
     A thin wall between free cells has two sides; its cells then occur once for each side.
     """
     reach = SETTINGS.normal_window
+    touching = occupied & (convolve(free.astype(np.int8), np.ones((3, 3), np.int8), mode="constant") > 0)
+    if touching.sum() < SETTINGS.min_touching * occupied.sum():
+        # Careful grids leave a border of unknown cells between free space and walls.
+        free = np.asarray(binary_dilation(free, iterations=SETTINGS.unknown_border, mask=~occupied), bool)
     near = convolve(free.astype(np.int8), np.ones((3, 3), np.int8), mode="constant") > 0
     rows, columns = np.nonzero(occupied & near)
     step = np.arange(-reach, reach + 1)

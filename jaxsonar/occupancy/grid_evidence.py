@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt16
+from jaxtyping import Bool, Float, Int, UInt16
 
 from jaxsonar import kernels
 from jaxsonar.geometry.se2 import compose, transform_points
@@ -40,6 +40,9 @@ class Area(NamedTuple):
         Raises:
             SonarError: too many cells.
         """
+        if (np.abs(places) > SETTINGS.max_coordinate).any():
+            far = f"{np.abs(places).max():g}"
+            raise SonarError(f"grid: a pose at {far} m came; allowed are up to {SETTINGS.max_coordinate:g} m")
         half = int(np.ceil(margin / resolution)) + 2
         low, high = (np.floor(end(places, axis=0) / resolution) for end in (np.min, np.max))
         size = high - low + 2 * half + 1
@@ -91,8 +94,10 @@ class GridEvidence:
             method: which echoes are kept.
 
         Raises:
-            SonarError: a resolution that is not from 1 mm to 10 m, or that is too fine for the ring's range.
+            SonarError: an unknown method; a resolution that is not from 1 mm to 10 m, or too fine for the ring's range.
         """
+        if method not in METHODS:
+            raise SonarError(f"grid: method {method!r}; allowed are {', '.join(METHODS)}")
         if not 1e-3 <= resolution <= 10:
             raise SonarError(f"grid: resolution {resolution:g} m; allowed is 0.001 to 10 m")
         if ring.max_range > SETTINGS.max_range_cells * resolution:
@@ -110,6 +115,10 @@ class GridEvidence:
         self.scans = self.skipped = 0
         """Scans in the grid, and scans that were left out because they have no pose."""
         self._arcs, self._new_arcs = EchoArcs.empty(), list[EchoArcs]()
+
+    def set_ring(self, ring: Ring) -> None:
+        """Use another ring from now on: the same sensors, with another speed of sound or calibration."""
+        self.ring, self.sensors = ring, TransducerArrays.of(ring)
 
     @property
     def arcs(self) -> EchoArcs:
@@ -130,18 +139,31 @@ class GridEvidence:
             SonarError: poses too far apart for a grid; a sensor number that the ring does not have.
         """
         posed = np.asarray(np.isfinite(log.pose).all(axis=-1))
+        readings = DirectReadings.of(self.ring, log)
+        self._reserve(log, posed, readings)
         self.skipped += int((~posed).sum())
         rows = np.flatnonzero(posed)
         if not len(rows):
             return
-        readings = DirectReadings.of(self.ring, log)
-        robot = readings.robot[rows][readings.measured[rows]]
-        places = np.concatenate([log.pose[rows, :2], robot[:, :2]])
-        self._grow(Area.around(places, self.sensors.max_distance, self.resolution))
         for begin in range(0, len(rows), _BATCH):
             self._see_through(readings, log.pose, rows[begin : begin + _BATCH], known)
         self._keep_echoes(log, posed, known)
         self.scans += len(rows)
+
+    def reserve(self, log: Log) -> None:
+        """Make room for the scans of a log, without adding them.
+
+        Raises:
+            SonarError: as ``add``; then nothing has changed.
+        """
+        posed = np.asarray(np.isfinite(log.pose).all(axis=-1))
+        self._reserve(log, posed, DirectReadings.of(self.ring, log))
+
+    def _reserve(self, log: Log, posed: Bool[np.ndarray, " scans"], readings: DirectReadings) -> None:
+        if posed.any():
+            robot = readings.robot[posed][readings.measured[posed]]
+            places = np.concatenate([log.pose[posed, :2], robot[:, :2]])
+            self._grow(Area.around(places, self.sensors.max_distance, self.resolution))
 
     def _grow(self, area: Area) -> None:
         """Make room for an area."""
@@ -226,7 +248,7 @@ class GridEvidence:
                 part = self.passes[k][here]
                 part += ((bits >> k) & 1).astype(np.uint16) & (part < np.iinfo(np.uint16).max)
 
-    def _keep_echoes(self, log: Log, posed: np.ndarray, known: KnownReflectors) -> None:
+    def _keep_echoes(self, log: Log, posed: Bool[np.ndarray, " scans"], known: KnownReflectors) -> None:
         """Keep the echoes that the method explains."""
         ring = self.ring
         flat, _ = FlatEchoes.from_log(ring, log)
@@ -274,14 +296,14 @@ def _cone_squares(
     size: int,
 ) -> tuple[Int[np.ndarray, "scans sensors 2"], int]:
     """First cells (column, row) of squares that hold the cones of sensors in a tile, and the side of the squares."""
-    angle = sensor_pose[..., 2:] + np.linspace(-1, 1, 9) * (half_width[:, None] + resolution)
+    angle = sensor_pose[..., 2:] + np.linspace(-1, 1, 9) * (half_width[:, None] + kernels.CONE_MARGIN)
     rim = max_range * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     # Between the sampled directions, the cone reaches a little farther than the chord.
-    sagitta = max_range * (1 - np.cos(float(half_width.max()) / 8)) + 2 * resolution
+    widest = float(half_width.max()) + kernels.CONE_MARGIN
+    sagitta = max_range * (1 - np.cos(widest / 8)) + 2 * resolution
     low = np.minimum(rim.min(axis=2), 0) - sagitta
-    high = np.maximum(rim.max(axis=2), 0) + sagitta
-    longest = 2 * max_range * np.sin(min(float(half_width.max()), np.pi / 2)) + 2 * sagitta
-    across = max(longest, max_range + 2 * sagitta) if half_width.max() < np.pi / 4 else float((high - low).max())
+    # In any direction, a cone is at most as long as its radius or its longest chord.
+    across = max_range * max(2 * np.sin(min(widest, np.pi / 2)), 1.0) + 2 * sagitta
     cone = min(size, -(-int(np.ceil(across / resolution) + 2) // 8) * 8)
     corner = np.floor((sensor_pose[..., :2] + low) / resolution).astype(np.int32)
     return np.clip(corner, 0, size - cone), cone

@@ -4,9 +4,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar.geometry.se2 import transform_points
+from jaxsonar.geometry.segments import lengths, sample_segments
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.occupancy.direct_readings import DirectReadings, TransducerArrays
-from jaxsonar.occupancy.grid_evidence import METHODS, GridEvidence, GridMethod
+from jaxsonar.occupancy.grid_evidence import GridEvidence, GridMethod
 from jaxsonar.occupancy.known_reflectors import KnownReflectors
 from jaxsonar.occupancy.occupancy_grid import NO_WALLS, OccupancyGrid, assemble_grid
 from jaxsonar.occupancy.settings import SETTINGS, BayesSettings
@@ -30,20 +31,34 @@ class IncrementalGrid:
         Raises:
             SonarError: a resolution out of range, or an unknown method.
         """
-        if method not in METHODS:
-            raise SonarError(f"grid: method {method!r}; allowed are {', '.join(METHODS)}")
         self.ring = ring
         self.evidence = GridEvidence(ring, resolution=resolution, method=method)
         self._pending: list[Log] = []
         self._readings: list[FacingReadings] = []
+        self._poses = np.zeros((0, 4))
+
+    def set_ring(self, ring: Ring) -> None:
+        """Use another ring for the scans that are added from now on, and for those that are pending."""
+        self.ring = ring
+        self.evidence.set_ring(ring)
 
     def add(self, log: Log) -> None:
         """Add scans; those without a pose are counted and skipped.
 
         They become part of the grid with the next ``update``, so that its walls can explain their echoes.
+
+        Raises:
+            SonarError: poses too far apart for a grid; a sensor number that the ring does not have. Then nothing of
+                the log is added.
         """
-        if len(log):
-            self._pending.append(group_firings(log))
+        if not len(log):
+            return
+        log = group_firings(log)
+        self.evidence.reserve(log)
+        self._pending.append(log)
+        posed = np.isfinite(log.pose).all(axis=-1)
+        poses = np.column_stack([log.stamp, log.pose])[posed]
+        self._poses = np.concatenate([self._poses, poses])[-SETTINGS.max_readings :]
 
     def update(
         self,
@@ -59,17 +74,18 @@ class IncrementalGrid:
             parameters: of the Bayesian model; those of the method in ``settings`` if omitted.
 
         Raises:
-            SonarError: poses too far apart for a grid; a wall that is not finite; a sensor number that the ring does
-                not have.
+            SonarError: a wall that is not finite.
         """
-        known = walls if isinstance(walls, KnownReflectors) else KnownReflectors.of_walls(_checked(walls))
+        given = walls.walls if isinstance(walls, KnownReflectors) else np.asarray(walls, np.float64)
+        _check(given)
+        known = walls if isinstance(walls, KnownReflectors) else KnownReflectors.of_walls(given)
         self._readings.extend(_facing_readings(self.ring, log) for log in self._pending)
         readings = FacingReadings.concatenate(self._readings, self.ring.max_range).latest(SETTINGS.max_readings)
         self._readings = [readings]
+        readings = readings._replace(driven=_way(self._poses, self.evidence.resolution))
         profile = profile_walls(known, readings, resolution=self.evidence.resolution)
-        for log in self._pending:
-            self.evidence.add(log, profile.parts)
-        self._pending = []
+        while self._pending:
+            self.evidence.add(self._pending.pop(0), profile.parts)
         return assemble_grid(self.evidence, profile, readings, parameters=parameters)
 
 
@@ -118,15 +134,30 @@ def _facing_readings(ring: Ring, log: Log) -> FacingReadings:
         sensors.heading[sensor] + robot[:, 2],
         SETTINGS.free.certain * sensors.half_width[sensor],
         np.where(np.isfinite(first), first, SETTINGS.free.reach * ring.max_range),
-        log.pose[posed, :2],
+        np.zeros((0, 2)),
         ring.max_range,
     )
 
 
-def _checked(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, "walls 2 2"]:
+def _way(poses: Float[np.ndarray, "poses 4"], resolution: float) -> Float[np.ndarray, "points 2"]:
+    """Points of the robot's way, half a cell apart between scans near each other.
+
+    Args:
+        poses: stamp (s), x, y (m), theta (rad), in any order; poses without a stamp are points of their own.
+        resolution: side of a cell, metres.
+    """
+    poses = poses[np.lexsort(poses.T[::-1])]
+    legs = np.stack([poses[:-1, 1:3], poses[1:, 1:3]], axis=1)
+    length = lengths(legs)
+    driven = (length > 0) & (length <= SETTINGS.max_step) & np.isfinite(poses[:-1, 0]) & np.isfinite(poses[1:, 0])
+    between, _ = sample_segments(legs[driven], (2 * length[driven] / resolution).astype(int) + 2)
+    return np.unique(np.concatenate([poses[:, 1:3], between]), axis=0)
+
+
+def _check(walls: Float[np.ndarray, "walls 2 2"]) -> None:
+    """Raise a SonarError for walls that are not finite, or too far away."""
     limit = SETTINGS.max_wall_coordinate
     bad = ~(np.abs(walls) <= limit).all(axis=(1, 2))
     if bad.any():
         k = int(np.argmax(bad))
         raise SonarError(f"grid: wall {k} is {walls[k].tolist()}; allowed are finite coordinates up to {limit:g} m")
-    return walls

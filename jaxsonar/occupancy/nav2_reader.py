@@ -19,8 +19,8 @@ from jaxsonar.occupancy.grid_images import read_image
 
 UNKNOWN = -1
 """Value of a cell that was not observed."""
-_DEFAULTS = {"mode": "trinary", "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.25}
-"""What map_server takes for missing keys."""
+_DEFAULTS = {"mode": "trinary"}
+"""What map_server takes for missing keys; it needs all others."""
 _MODES = ("trinary", "scale", "raw")
 _MOST_CELLS = 100_000_000
 _SERIALIZED = (".posegraph", ".data")
@@ -175,7 +175,9 @@ def _parse_yaml(content: bytes, filename: str | os.PathLike[str]) -> dict[str, o
     values: dict[str, object] = {}
     key = None
     for number, line in enumerate(text.splitlines(), start=1):
-        line = re.sub(r"(^|\s)#.*$", "", line).rstrip()
+        line = re.sub(
+            r"""^((?:"(?:[^"\\]|\\.)*"|'[^']*'|[^"'#]|(?<!\s)#)*?)(?:(?:(?<=\s)|^)#.*)?$""", r"\1", line
+        ).rstrip()
         if not line.strip() or line.strip() in ("---", "..."):
             continue
         item = re.match(r"^\s*-\s+(.*)$", line)
@@ -224,15 +226,16 @@ def _number(values: dict[str, object], key: str, low: float, high: float) -> flo
 
 def _mode(values: dict[str, object]) -> str:
     mode = values["mode"]
-    if mode not in _MODES:
+    if not isinstance(mode, str) or mode.lower() not in _MODES:
         raise SonarError(f"mode {mode!a:.40}; allowed are {', '.join(_MODES)}")
-    return str(mode)
+    return mode.lower()
 
 
 def _negate(values: dict[str, object]) -> bool:
-    negate = values["negate"]
+    negate = values.get("negate")
     if negate not in (0, 1):
-        raise SonarError(f"negate {negate!a:.40}; allowed are 0 and 1")
+        came = "no negate" if negate is None else f"negate {negate!a:.40}"
+        raise SonarError(f"{came}; allowed are 0 and 1")
     return bool(negate)
 
 

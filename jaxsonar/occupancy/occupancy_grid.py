@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from scipy import ndimage
 
 from jaxsonar import kernels
-from jaxsonar.geometry.se2 import tangent_of
 from jaxsonar.geometry.segments import lengths
 from jaxsonar.kernels.shape_buckets import bucket_size, next_power_of_two, pad_rows
 from jaxsonar.occupancy.echo_arcs import arc_table
@@ -88,7 +87,7 @@ def assemble_grid(
         )
     model: BayesSettings = parameters or getattr(SETTINGS, evidence.method)
     found, viewpoints = _obstacle_evidence(evidence, profile, model)
-    robot = evidence.footprint > 0
+    robot = (evidence.footprint > 0) | _swept(evidence, readings)
     walls = area.mask(profile.parts.cells(resolution)) & ~robot
     obstacle = (found > model.occupied) & ~robot
     if evidence.method == "counts":
@@ -155,6 +154,19 @@ def _obstacle_evidence(
     return np.asarray(found)[:cells].reshape(area.shape), counts.reshape(area.shape)
 
 
+def _swept(evidence: GridEvidence, readings: FacingReadings) -> Bool[np.ndarray, "rows columns"]:
+    """Cells that the robot drove over between two scans: the inscribed circle of its outline, along its way."""
+    way = evidence.area.mask(np.floor(readings.driven / evidence.resolution).astype(int))
+    outline = evidence.sensors.outline
+    # One cell less, because the points of the way are rounded to cells.
+    radius = float((-outline[:, 2]).min(initial=np.inf)) / evidence.resolution - 1 if len(outline) else 0.0
+    if not 1 <= radius < np.inf:
+        return way & (evidence.footprint > 0)
+    half = int(radius)
+    disk = np.hypot(*np.mgrid[-half : half + 1, -half : half + 1]) <= radius
+    return np.asarray(ndimage.binary_dilation(way, disk), bool)
+
+
 def _small_obstacles(
     obstacle: Bool[np.ndarray, "rows columns"], evidence: GridEvidence
 ) -> Float[np.ndarray, "obstacles 2"]:
@@ -172,22 +184,11 @@ def _excluded_share(
 ) -> Float[np.ndarray, "rows columns"]:
     """Share of the wall directions that readings exclude in each cell."""
     count = kernels.DIRECTIONS
-    looked = np.stack([_along_walls(layer, k * np.pi / count) for k, layer in enumerate(passes)])
     excluded = np.zeros(passes.shape[1:], np.float32)
     for k in range(count):
-        around = looked[k - 1] + looked[k] + looked[(k + 1) % count]
-        excluded += share[k] * (around >= SETTINGS.free.min_looks)
+        looks = sum((passes[n % count].astype(np.int32) for n in (k - 1, k, k + 1)), np.int32(0))
+        excluded += share[k] * (looks >= SETTINGS.free.min_looks)
     return excluded
-
-
-def _along_walls(layer: np.ndarray, theta: float) -> Int[np.ndarray, "rows columns"]:
-    """Sum over the cells along the walls whose normal has this direction."""
-    half = SETTINGS.free.spread
-    step = np.rint(np.arange(-half, half + 1)[:, None] * tangent_of(theta)).astype(int)
-    offsets = np.unique(step, axis=0)
-    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-    kernel[half + offsets[:, 1], half + offsets[:, 0]] = 1
-    return ndimage.correlate(np.minimum(layer, 255).astype(np.int32), kernel.astype(np.int32), mode="constant")
 
 
 def _direction_shares(walls: Float[np.ndarray, "walls 2 2"]) -> tuple[Float[np.ndarray, " directions"], float]:
@@ -227,7 +228,7 @@ def _probability(
     else:
         probability = 1 / (1 + np.exp(-np.clip(found, -30, 30)))
     # Keep a margin to the thresholds, because images have 256 grey values.
-    low, high, margin = SETTINGS.free_threshold, SETTINGS.occupied_threshold, 0.005
+    low, high, margin = SETTINGS.free_threshold, SETTINGS.occupied_threshold, SETTINGS.grey_margin
     undecided = np.clip(probability, low + margin, high - margin)
     probability = np.where(occupied, np.maximum(probability, high + margin), undecided)
     probability = np.where(free, np.minimum(probability, low - margin), probability)

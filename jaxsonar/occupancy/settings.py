@@ -63,16 +63,15 @@ class FreeCellSettings:
 
     certain: float = 0.6
     """Fraction of the cone in which a missing echo counts as free space. Toward the border a sensor hears only large
-    walls: a cone ends where the one-way gain is 6 dB lower, 12 dB in both ways; over the inner two thirds the loss is
-    5 dB."""
+    walls: a cone ends where the one-way gain is 6 dB lower, 12 dB in both ways. Chosen on simulated rooms and
+    confirmed on two recorded runs."""
     reach: float = 0.95
     """Fraction of the maximum range up to which silence clears cells."""
     range_margin: float = 0.04
     """Cells closer to the echo than this are not counted as free, metres; covers errors of ranges and poses."""
     min_looks: int = 2
-    """Scans that must have looked through a cell in a direction to exclude walls of this direction."""
-    spread: int = 0
-    """Cells on each side, along a wall, whose looks exclude it: walls are longer than a cell."""
+    """Looks through a cell that exclude walls of a direction. A scan counts once for this direction and once for each
+    of the two beside it."""
     min_excluded: float = 0.4
     """Share of the wall directions that must be excluded in a free cell; in a building of right angles, one of two."""
     irregular: float = 0.1
@@ -115,12 +114,18 @@ class OccupancySettings:
     grey of unknown cells would be read as free (navigation2, pull request 5278)."""
     occupied_threshold: float = 0.65
     """Probability above which it takes a cell as occupied."""
+    grey_margin: float = 0.005
+    """Distance of probabilities from these thresholds: images have 256 grey values."""
+    max_step: float = 0.5
+    """Distance between two scans up to which the robot drove along a straight line, metres."""
     min_viewpoints: int = 2
     """Number of viewpoints, 0.2 m apart, from which an obstacle must be observed."""
     viewpoint_cell: float = 0.2
     """Side of the cells that distinguish viewpoints, metres; they form a pattern of 4 x 4 that repeats."""
     max_wall_coordinate: float = 10_000.0
     """Largest coordinate of a known wall, metres."""
+    max_coordinate: float = 1e7
+    """Largest coordinate of a pose, metres: cells far out have no exact numbers."""
     max_range_cells: int = 400
     """Largest maximum range, in cells: 20 m at 0.05 m."""
     max_cells: int = 20_000_000

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 from scipy.spatial import KDTree
 
 from jaxsonar.geometry.se2 import wrap_angle
@@ -137,7 +138,7 @@ def look_through(
         refuted[wall, cell] += 1_000
     kernel = np.ones(2 * _WALLS.window + 1, np.int64)
     refuted, confirmed = (
-        np.apply_along_axis(np.convolve, 1, counts, kernel, "same") for counts in (refuted, confirmed)
+        ndimage.convolve1d(counts, kernel, axis=1, mode="constant") for counts in (refuted, confirmed)
     )
     return LookedThrough((refuted >= _WALLS.min_looks) & (refuted > 2 * confirmed), before, bins)
 

@@ -41,15 +41,18 @@ def test_the_pose_is_found_in_a_laser_map(here, capsys):
     assert (here / "where.svg").exists()
 
 
+RULES = b"negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+
+
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
         ("map.posegraph", b"\0\1", "map_saver_cli"),
         ("map.pgm", b"P5 1 1 255\n\0", "YAML"),
-        ("other.yaml", b"image: none.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n", "none.pgm"),
-        ("other.yaml", b"image: map.pgm\norigin: [0, 0, 0]\n", "resolution"),
-        ("free.yaml", b"image: free.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n", "free.yaml: no occupied cell"),
-        ("dots.yaml", b"image: dots.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n", "dots.yaml: no wall"),
+        ("other.yaml", b"image: none.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n" + RULES, "none.pgm"),
+        ("other.yaml", b"image: map.pgm\norigin: [0, 0, 0]\n" + RULES, "resolution"),
+        ("free.yaml", b"image: free.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n" + RULES, "free.yaml: no occupied cell"),
+        ("dots.yaml", b"image: dots.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n" + RULES, "dots.yaml: no wall"),
         ("list.yaml", json.dumps({"type": "FeatureCollection"}).encode(), "list.yaml"),
         ("gone.yaml", None, "gone.yaml"),
     ],

@@ -86,14 +86,15 @@ def test_a_larger_value_is_white(tmp_path):
 
 
 def test_forms_of_yaml(tmp_path):
-    """Quotes, comments, block lists, booleans, and defaults."""
-    (tmp_path / "my map.pgm").write_bytes(pgm(np.array([[0, 205, 254]], np.uint8)))
-    text = "---\n# saved\nimage: 'my map.pgm'\nresolution: 5.0e-2  # m\norigin:\n- -3.5\n- 2\n- 0\nnegate: false\n"
-    (tmp_path / "map.yaml").write_text(text)
-    found = load_nav2(tmp_path / "map.yaml")
-    # 205 counts as free with the default of map_server, 0.25.
-    np.testing.assert_array_equal(found.occupancy, [[100, 0, 0]])
-    np.testing.assert_array_equal(found.origin, [-3.5, 2, 0])
+    """Quotes, comments, block lists, booleans, capitals, and the mode that map_server takes if there is none."""
+    (tmp_path / "my #1 map.pgm").write_bytes(pgm(np.array([[0, 205, 254]], np.uint8)))
+    text = "---\n# saved\nimage: 'my #1 map.pgm'\nresolution: 5.0e-2  # m\norigin:\n- -3.5\n- 2\n- 0\nnegate: false\n"
+    text += "occupied_thresh: 0.65 # as saved\nfree_thresh: 0.196\n"
+    for mode in ("", "mode: Trinary\n"):
+        (tmp_path / "map.yaml").write_text(text + mode)
+        found = load_nav2(tmp_path / "map.yaml")
+        np.testing.assert_array_equal(found.occupancy, [[100, -1, 0]])
+        np.testing.assert_array_equal(found.origin, [-3.5, 2, 0])
 
 
 BAD = {
@@ -106,6 +107,8 @@ BAD = {
     "nan": ({"origin": "[1, .nan, 0]"}, "origin"),
     "mode": ({"mode": "speed"}, "trinary, scale, raw"),
     "negate": ({"negate": "2"}, "negate"),
+    "no negate": ({"negate": None}, "no negate"),
+    "no threshold": ({"free_thresh": None}, "no free_thresh"),
     "thresholds": ({"free_thresh": "0.7"}, "free_thresh"),
     "no pair": ({"what": None, "resolution": "0.05\nnonsense"}, "KEY: VALUE"),
 }

@@ -15,6 +15,7 @@ from jaxsonar.geometry.se2 import rotation
 from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import build_map
+from jaxsonar.mapping.map_from_grid import map_from_grid
 from jaxsonar.occupancy.incremental_grid import IncrementalGrid, occupancy
 from jaxsonar.occupancy.known_reflectors import KnownReflectors
 from jaxsonar.occupancy.nav2_map import grid_image_filename, save_nav2
@@ -446,3 +447,42 @@ def test_impossible_grids_are_refused_in_one_line(faw_ring):
         with pytest.raises(SonarError, match=words) as caught:
             call()
         assert "\n" not in str(caught.value)
+
+
+def test_a_log_that_cannot_be_added_changes_nothing(faw_ring):
+    growing, good = IncrementalGrid(faw_ring), silent(circle((0.0, 0.0), 0.4, 3))
+    growing.add(good)
+    with pytest.raises(SonarError, match="cells at most"):
+        growing.add(silent(np.array([[1e5, 0.0, 0.0]])))
+    with pytest.raises(SonarError, match="a pose at"):
+        growing.add(silent(np.array([[1e20, 0.0, 0.0]])))
+    assert_same_grid(growing.update(), grid_of_parts(faw_ring, [good]))
+
+
+def test_the_way_between_two_scans_is_free_and_crosses_no_wall():
+    ring = Ring.circular(count=8, radius=0.12, beam=0.5, neighbors=0)
+    poses = np.stack([np.arange(0.0, 2.1, 0.4), np.zeros(6), np.zeros(6)], axis=-1)
+    wall = np.array([[[0.6, -1.0], [0.6, 1.0]]])
+    nothing = np.zeros(0, int)
+    log = Log.from_echoes(nothing, nothing, nothing, np.zeros(0), stamp=np.arange(6.0), pose=poses)
+    grid = occupancy(ring, log, walls=wall)
+    points = centers(grid)
+    on_way = (np.abs(points[..., 1]) < 0.05) & (points[..., 0] > 0) & (points[..., 0] < 2.0)
+    assert (grid.classify()[on_way] == FREE).all()
+    assert not grid.occupied[(np.abs(points[..., 1]) < 0.06)[::-1]].any()
+    jump = Log.from_echoes(nothing, nothing, nothing, np.zeros(0), stamp=np.arange(2.0), pose=poses[[0, -1]])
+    grid = occupancy(ring, jump, walls=wall)
+    points = centers(grid)
+    assert not (grid.classify()[(points[..., 0] > 0.3) & (points[..., 0] < 1.6)] == FREE).any()
+
+
+def test_walls_of_a_grid_are_those_of_the_room(office, office_grid):
+    """A round trip: the walls of the saved grid, as ``localize`` reads them."""
+    found = map_from_grid(
+        office_grid.occupied, office_grid.free, resolution=0.05, origin=np.array([*office_grid.origin, 0.0])
+    )
+    assert len(found) >= 5
+    samples = found.segments[:, 0, None] + np.linspace(0, 1, 20)[:, None] * np.diff(found.segments, axis=1)
+    gap = point_to_segments(samples.reshape(-1, 2), office.room.walls).min(axis=1)
+    assert np.median(gap) < 0.03
+    assert found.length.sum() > 6
