@@ -300,7 +300,7 @@ def _near_pairs(points: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, "pairs
     """Pairs of points near each other, each with its nearest only, so that their number grows with the points."""
     gap, other = KDTree(points).query(points, k=_WALLS.hidden_neighbors + 1, distance_upper_bound=_WALLS.max_hidden)
     first, rank = np.nonzero(np.isfinite(gap))
-    second = other[first, rank]
+    second = np.asarray(other)[first, rank]
     pairs = np.unique(np.sort(np.stack([first, second], axis=-1), axis=1), axis=0)
     return pairs[pairs[:, 0] != pairs[:, 1]]
 
