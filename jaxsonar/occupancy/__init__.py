@@ -17,5 +17,6 @@ Design decisions:
 - **One reflector explains an echo.** The echoes that no known reflector explains are shared among the cells of their
   arcs by expectation maximization, so that a pole becomes a few cells, not an arc.
 - **Evidence adds up.** What was seen through is counted in integers, and arcs that say the same are merged, so that the
-  order of the scans does not matter and memory grows with the floor, not with the scans.
+  order of the scans does not matter and memory grows with the floor, not with the scans. A live grid differs a little
+  from that of the whole log: its scans were added with the walls that were known then.
 """

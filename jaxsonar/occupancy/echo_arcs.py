@@ -36,19 +36,20 @@ class EchoArcs(NamedTuple):
         """All arcs of several collections."""
         return cls(*(np.concatenate(columns) for columns in zip(cls.empty(), *parts, strict=True)))
 
-    def thinned(self, ring: Ring) -> "EchoArcs":
+    def thinned(self, limit: int) -> "EchoArcs":
         """One arc for all echoes of a path from about the same place, in the same direction and of the same range.
 
-        The order of the echoes does not matter. The cells grow until at most ``max_arcs`` remain.
+        The order of the echoes does not matter, unless there are more than ``limit`` arcs: then the cells of place,
+        direction and range grow until so many remain.
         """
         size = 1.0
         while True:
-            kept = self._merged(ring, size)
-            if len(kept.path) <= SETTINGS.max_arcs:
+            kept = self._merged(size)
+            if len(kept.path) <= limit:
                 return kept
             size *= 1.5
 
-    def _merged(self, ring: Ring, size: float) -> "EchoArcs":
+    def _merged(self, size: float) -> "EchoArcs":
         place, angle, step = (size * cell for cell in SETTINGS.arc_cell)
         key = np.column_stack(
             [self.path, np.floor(self.pose[:, :2] / place), np.floor(self.pose[:, 2] % (2 * np.pi) / angle)]
@@ -73,6 +74,12 @@ class ArcTable(NamedTuple):
     weight: Float[np.ndarray, "arcs entries"]
 
 
+def arc_points(ring: Ring, resolution: float) -> int:
+    """Number of points of an arc: at most a cell apart on the longest."""
+    width = float(np.asarray(ring.echo_paths.width).max())
+    return bucket_size(int(np.ceil(1.25 * ring.max_range * width / resolution)), least=16)
+
+
 def arc_table(
     ring: Ring,
     arcs: EchoArcs,
@@ -92,9 +99,7 @@ def arc_table(
         walls: known walls, which hide the cells behind them.
         resolution: side of a cell, metres.
     """
-    paths = ring.echo_paths
-    width = float(np.asarray(paths.width).max())
-    points = bucket_size(int(np.ceil(1.25 * ring.max_range * width / resolution)), least=16)
+    paths, points = ring.echo_paths, arc_points(ring, resolution)
     entries = 2 * points
     cell, weight = np.zeros((len(arcs.path), entries), np.int32), np.zeros((len(arcs.path), entries), np.float32)
     origin = np.array([*corner, 0]) * [resolution, resolution, 0.0]

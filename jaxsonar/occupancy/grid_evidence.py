@@ -11,7 +11,7 @@ from jaxsonar.geometry.se2 import compose, transform_points
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.kernels.shape_buckets import pad_rows
 from jaxsonar.occupancy.direct_readings import DirectReadings, TransducerArrays, footprint_cells
-from jaxsonar.occupancy.echo_arcs import EchoArcs, walls_near
+from jaxsonar.occupancy.echo_arcs import EchoArcs, arc_points, walls_near
 from jaxsonar.occupancy.known_reflectors import KnownReflectors, explained_by_reflectors
 from jaxsonar.occupancy.settings import SETTINGS
 from jaxsonar.scans.flat_echoes import FlatEchoes
@@ -82,7 +82,7 @@ class Area(NamedTuple):
 class GridEvidence:
     """Accumulates scans. Its size grows with the area of the floor, not with the number of scans.
 
-    The order of the scans does not matter.
+    The order of the scans does not matter, as long as the known reflectors are the same and the arcs are few.
     """
 
     def __init__(self, ring: Ring, *, resolution: float = 0.05, method: GridMethod = "counts"):
@@ -115,6 +115,7 @@ class GridEvidence:
         self.scans = self.skipped = 0
         """Scans in the grid, and scans that were left out because they have no pose."""
         self._arcs, self._new_arcs = EchoArcs.empty(), list[EchoArcs]()
+        self._max_arcs = min(SETTINGS.max_arcs, SETTINGS.max_arc_cells // (2 * arc_points(ring, resolution)))
 
     def set_ring(self, ring: Ring) -> None:
         """Use another ring from now on: the same sensors, with another speed of sound or calibration."""
@@ -124,7 +125,7 @@ class GridEvidence:
     def arcs(self) -> EchoArcs:
         """Echoes that are to be explained."""
         if self._new_arcs:
-            self._arcs = EchoArcs.concatenate([self._arcs, *self._new_arcs]).thinned(self.ring)
+            self._arcs = EchoArcs.concatenate([self._arcs, *self._new_arcs]).thinned(self._max_arcs)
             self._new_arcs = []
         return self._arcs
 
@@ -269,7 +270,7 @@ class GridEvidence:
         if self.method == "counts":
             arcs = self._unexplained(arcs, known)
         self._new_arcs.append(arcs)
-        if sum(len(part.path) for part in self._new_arcs) > SETTINGS.max_arcs:
+        if sum(len(part.path) for part in self._new_arcs) > self._max_arcs:
             _ = self.arcs  # thin them now
 
     def _unexplained(self, arcs: EchoArcs, known: KnownReflectors) -> EchoArcs:

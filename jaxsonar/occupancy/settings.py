@@ -128,8 +128,8 @@ class OccupancySettings:
     """Largest coordinate of a pose, metres: cells far out have no exact numbers."""
     max_range_cells: int = 400
     """Largest maximum range, in cells: 20 m at 0.05 m."""
-    max_cells: int = 20_000_000
-    """Largest grid, in cells: 220 m x 220 m at 0.05 m. More indicates a wrong pose or resolution."""
+    max_cells: int = 10_000_000
+    """Largest grid, in cells: 150 m x 150 m at 0.05 m, about 1 GB. More indicates a wrong pose or resolution."""
     arc_cell: tuple[float, float, float] = (0.1, float(np.radians(7.5)), 0.025)
     """Echoes of a path that agree in position (m), direction (rad) and range (m) up to these cells are one arc."""
     max_echoes: int = 2
@@ -137,7 +137,9 @@ class OccupancySettings:
     max_readings: int = 500_000
     """Number of direct readings, the latest, that test walls and hidden walls: 20,000 scans of 24 sensors."""
     max_arcs: int = 100_000
-    """Largest number of arcs that are kept for the expectation maximization."""
+    """Largest number of arcs that are kept, ..."""
+    max_arc_cells: int = 16_000_000
+    """... and of the cells on all of them: wide cones of long range have fewer arcs."""
 
 
 SETTINGS = OccupancySettings()

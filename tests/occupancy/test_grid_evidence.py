@@ -12,7 +12,7 @@ from support.rooms import loop
 
 from jaxsonar import Log, Ring, simulate
 from jaxsonar.floor_plans.room import Room
-from jaxsonar.occupancy import echo_arcs
+from jaxsonar.occupancy import grid_evidence
 from jaxsonar.occupancy.occupancy_grid import NO_WALLS
 
 RING = Ring.circular(count=12, beam=0.7, neighbors=1)
@@ -122,7 +122,7 @@ def test_memory_and_arcs_grow_with_the_floor_not_with_the_scans():
 def test_arcs_are_thinned_to_the_largest_number(monkeypatch):
     poses = driving(0.3 * np.arange(10))
     log = simulate(RING, ROOM, poses).as_log(RING, poses)
-    monkeypatch.setattr(echo_arcs, "SETTINGS", replace(echo_arcs.SETTINGS, max_arcs=50))
+    monkeypatch.setattr(grid_evidence, "SETTINGS", replace(grid_evidence.SETTINGS, max_arcs=50))
     evidence = evidence_of(RING, log, method="em")
     assert 10 < len(evidence.arcs.path) <= 50
     assert evidence.arcs.echoes.sum() == log.echo_count
