@@ -159,7 +159,7 @@ def seen_through(
     first_echo: Float[Array, "scans sensors"],
     walls: Float[Array, "scans walls 2 2"],
     *,
-    certain: Float[Array, ""],
+    certain: Float[Array, " sensors"],
     margin: Float[Array, ""],
     resolution: float,
     size: int,
@@ -176,7 +176,7 @@ def seen_through(
         half_width: half of the cones, radians, at most pi / 2.
         first_echo: range up to which each sensor heard nothing, metres; 0 for a sensor that did not measure.
         walls: known walls around each scan, in its tile, for ``visible_distance``.
-        certain: fraction of the cone in which a wall is heard for sure.
+        certain: half of the part of each cone in which a wall is heard for sure, radians.
         margin: cells closer than this to the first echo are left out, metres.
         resolution: side of a cell, metres.
         size: rows and columns of a tile.
@@ -185,7 +185,7 @@ def seen_through(
     """
     tolerance = resolution / 2**0.5
 
-    def one_cone(pose, corner, half_width, first_echo, walls):
+    def one_cone(pose, corner, half_width, inner, first_echo, walls):
         cells = jnp.arange(cone, dtype=pose.dtype) + 0.5
         x = (corner[0].astype(pose.dtype) + cells) * resolution - pose[0]
         y = (corner[1].astype(pose.dtype) + cells) * resolution - pose[1]
@@ -203,7 +203,6 @@ def seen_through(
         sine = left / (jnp.sin(half_width) * jnp.maximum(distance, 1e-6))
         looks = jnp.where(clear & (ahead > 0), jnp.maximum(1 - sine * sine, 0), 0)
         # Cells that the inner cone touches count, so that no ring of unknown cells remains around the robot.
-        inner = certain * half_width
         inside = jnp.abs(left) * jnp.cos(inner) - ahead * jnp.sin(inner) <= tolerance
         direction = direction_index(pose[2] + 2 * _arctan(half_tangent))
         return jnp.where(clear & inside, jnp.uint32(1) << direction.astype(jnp.uint32), 0), looks
@@ -211,8 +210,8 @@ def seen_through(
     def one_scan(scan):
         sensor_pose, corners, first_echo, walls = scan
 
-        bits, looks = jax.vmap(one_cone, in_axes=(0, 0, 0, 0, None))(
-            sensor_pose, corners, half_width, first_echo, walls
+        bits, looks = jax.vmap(one_cone, in_axes=(0, 0, 0, 0, 0, None))(
+            sensor_pose, corners, half_width, certain, first_echo, walls
         )
 
         def add(k, seen):

@@ -60,12 +60,17 @@ def grid_of(options: argparse.Namespace, ring: "Ring", log: "Log", world: "Globa
     """The grid that the options ask for; None without ``--grid``."""
     if options.grid is None:
         return None
+    from jaxsonar.occupancy.direct_readings import certain_angle
     from jaxsonar.occupancy.incremental_grid import occupancy
     from jaxsonar.occupancy.known_reflectors import KnownReflectors
     from jaxsonar.occupancy.nav2_map import check_grid
+    from jaxsonar.sensors.ring_toml import load_detection
 
+    detection = load_detection(options.ring)
+    certain = None if detection is None else certain_angle(*detection)
     with errors_in(f"--grid {options.grid}"):
-        grid = occupancy(ring, log, walls=KnownReflectors.of_map(world), method=options.grid_method or "counts")
+        known, method = KnownReflectors.of_map(world), options.grid_method or "counts"
+        grid = occupancy(ring, log, walls=known, method=method, certain=certain)
         check_grid(grid)
     return grid
 

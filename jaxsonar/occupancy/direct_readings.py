@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from jaxsonar.geometry.se2 import compose, rotation, transform_points
+from jaxsonar.occupancy.settings import SETTINGS
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -88,3 +89,21 @@ def footprint_cells(
         if len(cells):
             return cells
     return np.unique(np.floor(transform_points(pose, sensors.position) / resolution).astype(int), axis=0)
+
+
+def certain_angle(
+    off_axis: Float[np.ndarray, " edges"], expected: Int[np.ndarray, " bins"], heard: Int[np.ndarray, " bins"]
+) -> float | None:
+    """Angle off the axis up to which walls are heard for sure, by the detections of a calibration, radians.
+
+    None if too few walls were expected near the axis, or they were not heard.
+
+    Args:
+        off_axis: edges of bins of the angle between the axis and the normal of a wall, ascending from 0, radians.
+        expected: number of readings with a wall in each bin.
+        heard: number of those that heard it.
+    """
+    free = SETTINGS.free
+    sure = (expected >= free.min_expected) & (heard >= free.min_detection * expected)
+    count = int(np.argmin(np.append(sure, False)))
+    return float(off_axis[count]) if count else None

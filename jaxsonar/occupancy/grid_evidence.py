@@ -85,13 +85,16 @@ class GridEvidence:
     The order of the scans does not matter, as long as the known reflectors are the same and the arcs are few.
     """
 
-    def __init__(self, ring: Ring, *, resolution: float = 0.05, method: GridMethod = "counts"):
+    def __init__(
+        self, ring: Ring, *, resolution: float = 0.05, method: GridMethod = "counts", certain: float | None = None
+    ):
         """Without any scan.
 
         Args:
             ring: the sensors.
             resolution: side of a cell, metres.
             method: which echoes are kept.
+            certain: angle off the axis up to which walls are heard for sure, radians; a part of the cone if omitted.
 
         Raises:
             SonarError: an unknown method; a resolution that is not from 1 mm to 10 m, or too fine for the ring's range.
@@ -103,8 +106,8 @@ class GridEvidence:
         if ring.max_range > SETTINGS.max_range_cells * resolution:
             came = f"max_range {ring.max_range:g} m in cells of {resolution:g} m"
             raise SonarError(f"grid: {came}; allowed is at most {SETTINGS.max_range_cells} cells far")
-        self.ring, self.resolution, self.method = ring, resolution, method
-        self.sensors = TransducerArrays.of(ring)
+        self.resolution, self.method, self._certain = resolution, method, certain
+        self.set_ring(ring)
         self.area = Area((0, 0), (0, 0))
         self.passes: UInt16[np.ndarray, "directions rows columns"] = np.zeros((kernels.DIRECTIONS, 0, 0), np.uint16)
         """Scans that looked through each cell, by the direction of the walls that they would have heard."""
@@ -120,6 +123,9 @@ class GridEvidence:
     def set_ring(self, ring: Ring) -> None:
         """Use another ring from now on: the same sensors, with another speed of sound or calibration."""
         self.ring, self.sensors = ring, TransducerArrays.of(ring)
+        half_width = self.sensors.half_width
+        given = SETTINGS.free.certain * half_width if self._certain is None else np.full(len(half_width), self._certain)
+        self.certain = np.minimum(given, half_width)
 
     @property
     def arcs(self) -> EchoArcs:
@@ -224,7 +230,7 @@ class GridEvidence:
             half_width.astype(np.float32),
             pad_rows(first_echo.astype(np.float32), _BATCH),
             pad_rows(walls, _BATCH),
-            certain=np.float32(free.certain),
+            certain=self.certain.astype(np.float32),
             margin=np.float32(resolution / np.sqrt(2) + free.range_margin),
             resolution=resolution,
             size=size,

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.geometry.segments import lengths, sample_segments
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.occupancy.direct_readings import DirectReadings, TransducerArrays
+from jaxsonar.occupancy.direct_readings import DirectReadings
 from jaxsonar.occupancy.grid_evidence import GridEvidence, GridMethod
 from jaxsonar.occupancy.known_reflectors import KnownReflectors
 from jaxsonar.occupancy.occupancy_grid import NO_WALLS, OccupancyGrid, assemble_grid
@@ -20,19 +20,22 @@ from jaxsonar.sensors.ring import Ring
 class IncrementalGrid:
     """A grid that grows with the scans. Its memory grows with the area of the floor, not with the number of scans."""
 
-    def __init__(self, ring: Ring, *, resolution: float = 0.05, method: GridMethod = "counts"):
+    def __init__(
+        self, ring: Ring, *, resolution: float = 0.05, method: GridMethod = "counts", certain: float | None = None
+    ):
         """Without any scan.
 
         Args:
             ring: the sensors.
             resolution: side of a cell, metres.
             method: how echoes become obstacles, see ``occupancy``.
+            certain: angle off the axis up to which walls are heard for sure, radians; a part of the cone if omitted.
 
         Raises:
             SonarError: a resolution out of range, or an unknown method.
         """
         self.ring = ring
-        self.evidence = GridEvidence(ring, resolution=resolution, method=method)
+        self.evidence = GridEvidence(ring, resolution=resolution, method=method, certain=certain)
         self._pending: list[Log] = []
         self._readings: list[FacingReadings] = []
         self._poses = np.zeros((0, 4))
@@ -79,7 +82,7 @@ class IncrementalGrid:
         given = walls.walls if isinstance(walls, KnownReflectors) else np.asarray(walls, np.float64)
         _check(given)
         known = walls if isinstance(walls, KnownReflectors) else KnownReflectors.of_walls(given)
-        self._readings.extend(_facing_readings(self.ring, log) for log in self._pending)
+        self._readings.extend(_facing_readings(self.evidence, log) for log in self._pending)
         readings = FacingReadings.concatenate(self._readings, self.ring.max_range).latest(SETTINGS.max_readings)
         self._readings = [readings]
         readings = readings._replace(driven=_way(self._poses, self.evidence.resolution))
@@ -96,6 +99,7 @@ def occupancy(
     walls: Float[np.ndarray, "walls 2 2"] | KnownReflectors = NO_WALLS,
     resolution: float = 0.05,
     method: GridMethod = "counts",
+    certain: float | None = None,
 ) -> OccupancyGrid:
     """The occupancy grid of a log.
 
@@ -113,26 +117,29 @@ def occupancy(
             cells of its arc by expectation maximization. "em": the same with all echoes. "logodds": log-odds of
             independent cells from all direct and cross echoes. "wilkes": from all direct echoes (Wilkes et al.).
             "elfes": from the first direct echo of each sensor (Matthies and Elfes 1988).
+        certain: angle off the axis up to which walls are heard for sure, radians, for example that of a calibration
+            (``certain_angle``); a part of the cone if omitted.
 
     Raises:
         SonarError: poses too far apart, or cells too small, for a grid; a wall that is not finite; a sensor number that
             the ring does not have; an unknown method.
     """
-    grid = IncrementalGrid(ring, resolution=resolution, method=method)
+    grid = IncrementalGrid(ring, resolution=resolution, method=method, certain=certain)
     grid.add(log)
     return grid.update(walls)
 
 
-def _facing_readings(ring: Ring, log: Log) -> FacingReadings:
+def _facing_readings(evidence: GridEvidence, log: Log) -> FacingReadings:
     """The direct readings of a log; scans without a pose are skipped."""
-    sensors, readings = TransducerArrays.of(ring), DirectReadings.of(ring, log)
+    ring, sensors = evidence.ring, evidence.sensors
+    readings = DirectReadings.of(ring, log)
     posed = np.asarray(np.isfinite(log.pose).all(axis=-1))
     used = readings.measured & posed[:, None]
     robot, sensor, first = readings.robot[used], np.nonzero(used)[1], readings.first_echo[used]
     return FacingReadings(
         transform_points(robot, sensors.position[sensor]),
         sensors.heading[sensor] + robot[:, 2],
-        SETTINGS.free.certain * sensors.half_width[sensor],
+        evidence.certain[sensor],
         np.where(np.isfinite(first), first, SETTINGS.free.reach * ring.max_range),
         np.zeros((0, 2)),
         ring.max_range,

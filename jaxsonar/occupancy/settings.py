@@ -65,6 +65,10 @@ class FreeCellSettings:
     """Fraction of the cone in which a missing echo counts as free space. Toward the border a sensor hears only large
     walls: a cone ends where the one-way gain is 6 dB lower, 12 dB in both ways. Chosen on simulated rooms and
     confirmed on two recorded runs."""
+    min_detection: float = 0.85
+    """Instead of this fraction, with a calibration: share of the walls that must be heard at an angle, ..."""
+    min_expected: int = 30
+    """... among at least so many."""
     reach: float = 0.95
     """Fraction of the maximum range up to which silence clears cells."""
     range_margin: float = 0.04

@@ -4,11 +4,12 @@ import math
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, get_type_hints
+from typing import Annotated, Any, NamedTuple, NoReturn, get_type_hints
 
 import msgspec
 import numpy as np
 import tomli_w
+from jaxtyping import Float, Int
 from msgspec import Meta
 
 from jaxsonar.fileio.atomic_files import atomic_write, read_toml, shown
@@ -125,6 +126,38 @@ def load_ring(filename: str | os.PathLike[str]) -> Ring:
         return _ring(given)
     except SonarError as error:
         raise SonarError(f"{shown(file)}: {error}") from None
+
+
+class DetectionTable(NamedTuple):
+    """How often walls were heard in the runs of a calibration, over the angle off the axis."""
+
+    off_axis: Float[np.ndarray, " edges"]
+    """Edges of the bins of the angle, radians, from 0."""
+    expected: Int[np.ndarray, " bins"]
+    """Number of readings with a wall at this angle."""
+    heard: Int[np.ndarray, " bins"]
+    """Number of those that heard it."""
+
+
+def load_detection(filename: str | os.PathLike[str]) -> DetectionTable | None:
+    """The detections in the table ``[calibration.echo_model]`` of a ring file.
+
+    None for a shipped ring, and for a file without this table, or with one that does not hold such numbers.
+    """
+    if not os.path.isfile(filename):
+        return None
+    calibration = _read(Path(filename)).calibration
+    model = (calibration or {}).get("echo_model")
+    if not isinstance(model, dict):
+        return None
+    try:
+        edges = np.radians(np.array(model["off_axis_deg"], np.float64))
+        expected, heard = np.array(model["expected"], np.int64), np.array(model["heard"], np.int64)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+    if not len(edges) == len(expected) + 1 == len(heard) + 1 or not (np.diff(edges) > 0).all():
+        return None
+    return DetectionTable(edges, expected, heard)
 
 
 def _ring(given: _ArrayFile | _CircleFile) -> Ring:

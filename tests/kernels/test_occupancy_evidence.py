@@ -21,7 +21,8 @@ def seen(first_echo, walls=None, *, certain=0.6, margin=0.07):
     walls = np.zeros((1, 2, 2)) if walls is None else walls
     found = kernels.seen_through(
         sensor_pose[None], np.zeros((1, 8, 2), np.int32), np.full(8, np.radians(15), np.float32),
-        np.asarray(first_echo, np.float32)[None], walls[None].astype(np.float32), certain=np.float32(certain),
+        np.asarray(first_echo, np.float32)[None], walls[None].astype(np.float32),
+        certain=np.full(8, certain * np.radians(15), np.float32),
         margin=np.float32(margin), resolution=RESOLUTION, size=SIZE, cone=SIZE, rays=40,
     )  # fmt: skip
     return np.asarray(found.directions[0]), np.asarray(found.looks[0]), sensor_pose.astype(float)

@@ -1,6 +1,7 @@
 """Grids of logs in which not every sensor was measured in every scan, or not at the pose of the scan."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,6 +14,9 @@ from support.rooms import loop
 from jaxsonar import Log, Ring, simulate
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.occupancy import grid_evidence
+from jaxsonar.occupancy.direct_readings import certain_angle
+from jaxsonar.occupancy.grid_evidence import GridEvidence
+from jaxsonar.occupancy.known_reflectors import KnownReflectors
 from jaxsonar.occupancy.occupancy_grid import NO_WALLS
 
 RING = Ring.circular(count=12, beam=0.7, neighbors=1)
@@ -139,3 +143,26 @@ def test_methods_keep_the_echoes_of_the_paper_they_come_from(method):
     expected = {"em": log.echo_count, "wilkes": direct.sum(), "elfes": len(scan_sensor)}
     assert arcs.echoes.sum() == expected[method]
     assert (tx == rx).all() == (method != "em")
+
+
+def test_the_certain_angle_is_that_up_to_which_a_calibration_heard_its_walls():
+    edges = np.radians([0.0, 5.0, 10.0, 15.0, 20.0])
+    expected = np.array([400, 100, 40, 10])
+    assert certain_angle(edges, expected, np.array([396, 92, 24, 9])) == edges[2]
+    assert certain_angle(edges, expected, np.array([396, 92, 38, 10])) == edges[3]  # too few beyond
+    assert certain_angle(edges, expected, np.array([200, 92, 38, 10])) is None
+    assert certain_angle(edges, np.zeros(4, int), np.zeros(4, int)) is None
+
+
+def test_a_smaller_certain_angle_sees_through_fewer_cells():
+    poses = driving(0.3 * np.arange(4))
+    log = simulate(RING, ROOM, poses).as_log(RING, poses)
+    found = []
+    for certain in (0.05, 0.2, None, 2.0):
+        evidence = GridEvidence(RING, certain=certain)
+        evidence.add(log, KnownReflectors.of_walls(NO_WALLS))
+        found.append(evidence.passes > 0)
+    for narrow, wide in pairwise(found):  # 60 % of 0.35 rad if omitted
+        assert (narrow & ~wide).sum() < 0.01 * wide.sum()  # cells at the sensors themselves
+        assert narrow.sum() < wide.sum()
+    assert found[0].sum() < 0.5 * found[3].sum()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.sensors.ring_toml import load_ring, ring_toml, save_ring, shipped_rings
+from jaxsonar.sensors.ring_toml import load_detection, load_ring, ring_toml, save_ring, shipped_rings
 
 CIRCLE = """\
 name = "round"
@@ -354,3 +354,25 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
         save_ring(Ring.circular(count=8), file)
     assert file.read_text() == before
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_the_detections_of_a_calibration_are_read_and_anything_else_is_not(tmp_path):
+    file = tmp_path / "ring.toml"
+    save_ring(Ring.circular(count=8, neighbors=0), file)
+    plain = file.read_text()
+    assert load_detection(file) is None
+    assert load_detection("faw") is None
+    model = "\n[calibration.echo_model]\noff_axis_deg = [0.0, 5.0, 10.0]\nexpected = [40, 20]\nheard = [39, 12]\n"
+    file.write_text(plain + model)
+    found = load_detection(file)
+    assert found is not None
+    np.testing.assert_allclose(found.off_axis, np.radians([0, 5, 10]))
+    assert (found.expected.tolist(), found.heard.tolist()) == ([40, 20], [39, 12])
+    for other in (
+        model.replace("10.0", "5.0"),
+        model.replace(", 12", ""),
+        model.replace("39", '"many"'),
+        model.replace("heard", "h"),
+    ):
+        file.write_text(plain + other)
+        assert load_detection(file) is None
