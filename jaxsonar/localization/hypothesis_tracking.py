@@ -240,7 +240,7 @@ class HypothesisTracker:
         poses, covariances = np.asarray(found.poses), np.asarray(found.covariances)
         evidence = hypotheses.evidence.copy()
         np.add.at(evidence, (np.arange(len(pose))[:, None], found.landmark), found.evidence)
-        of_scan = found.evidence.sum(axis=1)
+        of_scan = found.evidence.sum(axis=1) + found.log_odometry
         if previous is not None:
             of_scan = of_scan - SETTINGS.crossing_nats * self._crosses(hypotheses.pose, poses)
         return PoseTracks(

@@ -68,6 +68,9 @@ class ScanUpdate(NamedTuple):
     """Log-likelihood ratio of each landmark's echoes against unknown reflectors, nats; negative if it was missed."""
     explained: Float[AnyArray, " hypotheses"]
     """Number of echoes that the map explains."""
+    log_odometry: Float[AnyArray, " hypotheses"]
+    """Log-probability of the fitted pose given the predicted one, relative to the latter, and of the volume of poses
+    that the scan leaves (Laplace's approximation): the other part of the scan's marginal likelihood, nats."""
 
 
 @jax.jit
@@ -130,12 +133,21 @@ def _update_one(
         change = jnp.linalg.solve(information, vector - prior_information @ _difference(state, pose))
         return state + change
 
-    state = jax.lax.fori_loop(0, iterations, step, pose)
-    match = match_at(state, 0.0)
-    information, vector = information_of(match, 0.0)
-    state = state + jnp.linalg.solve(information, vector - prior_information @ _difference(state, pose))
-    evidence, explained = _evidence(state, match, landmarks, landmark_covariance, is_near, scan)
-    return ScanUpdate(_wrapped(state), jnp.linalg.inv(information), rows, evidence, explained)
+    def last_step(state):
+        information, vector = information_of(match_at(state, 0.0), 0.0)
+        return state + jnp.linalg.solve(information, vector - prior_information @ _difference(state, pose)), information
+
+    state, information = last_step(jax.lax.fori_loop(0, iterations, step, pose))
+    # A fit that contradicts the prediction is a wrong match of echoes to walls: the prediction is kept.
+    change = _difference(state, pose)
+    squared = change @ prior_information @ change
+    is_fit = squared < SETTINGS.max_innovation
+    state = jnp.where(is_fit, state, pose)
+    information = jnp.where(is_fit, information, prior_information)
+    evidence, explained = _evidence(state, match_at(state, 0.0), landmarks, landmark_covariance, is_near, scan)
+    volume = (jnp.linalg.slogdet(prior_information)[1] - jnp.linalg.slogdet(information)[1]) / 2
+    log_odometry = volume - jnp.where(is_fit, squared, 0.0) / 2
+    return ScanUpdate(_wrapped(state), jnp.linalg.inv(information), rows, evidence, explained, log_odometry)
 
 
 class _Match(NamedTuple):

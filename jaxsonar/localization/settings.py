@@ -17,6 +17,9 @@ class UpdateSettings:
     """Gauss-Newton steps before the last one, for the first scan of a track and for the others."""
     annealing_factor: float = 0.2
     """The weights of the echoes begin with the variance of the predicted pose; each step multiplies it by this."""
+    max_innovation: float = 16.3
+    """Squared Mahalanobis distance from the predicted pose (three degrees of freedom, 0.1 % of the right fits are
+    farther) from which a fit is rejected. An error of the map is the same at all scans: it makes no pose jump."""
     known_share: float = 0.5
     """Prior probability that an echo comes from a landmark of the map."""
     independent_echoes: float = 2.0
