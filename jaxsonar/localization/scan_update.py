@@ -127,27 +127,33 @@ def _update_one(
         vector = by_pose.T @ match.residual - jnp.einsum("kij,kj->i", gain, right)
         return information + prior_information, vector
 
-    def step(number, state):
-        annealing = SETTINGS.annealing_factor ** number.astype(pose.dtype)
+    def step(annealing, state):
         information, vector = information_of(match_at(state, annealing), annealing)
-        change = jnp.linalg.solve(information, vector - prior_information @ _difference(state, pose))
-        return state + change
-
-    def last_step(state):
-        information, vector = information_of(match_at(state, 0.0), 0.0)
         return state + jnp.linalg.solve(information, vector - prior_information @ _difference(state, pose)), information
 
-    state, information = last_step(jax.lax.fori_loop(0, iterations, step, pose))
-    # A fit that contradicts the prediction is a wrong match of echoes to walls: the prediction is kept.
-    change = _difference(state, pose)
-    squared = change @ prior_information @ change
-    is_fit = squared < SETTINGS.max_innovation
-    state = jnp.where(is_fit, state, pose)
-    information = jnp.where(is_fit, information, prior_information)
-    evidence, explained = _evidence(state, match_at(state, 0.0), landmarks, landmark_covariance, is_near, scan)
-    volume = (jnp.linalg.slogdet(prior_information)[1] - jnp.linalg.slogdet(information)[1]) / 2
-    log_odometry = volume - jnp.where(is_fit, squared, 0.0) / 2
-    return ScanUpdate(_wrapped(state), jnp.linalg.inv(information), rows, evidence, explained, log_odometry)
+    def annealed(number, state):
+        return step(SETTINGS.annealing_factor ** number.astype(pose.dtype), state)[0]
+
+    def finished(state):
+        """The update by a fit, after its last step, and its log-likelihood."""
+        state, information = step(0.0, state)
+        # A fit that contradicts the prediction is a wrong match of echoes to walls: the prediction is kept.
+        change = _difference(state, pose)
+        squared = change @ prior_information @ change
+        is_fit = squared < SETTINGS.max_innovation
+        state = jnp.where(is_fit, state, pose)
+        information = jnp.where(is_fit, information, prior_information)
+        evidence, explained = _evidence(state, match_at(state, 0.0), landmarks, landmark_covariance, is_near, scan)
+        volume = (jnp.linalg.slogdet(prior_information)[1] - jnp.linalg.slogdet(information)[1]) / 2
+        log_odometry = volume - jnp.where(is_fit, squared, 0.0) / 2
+        covariance = jnp.linalg.inv(information)
+        return ScanUpdate(_wrapped(state), covariance, rows, evidence, explained, log_odometry)
+
+    # The first fit finds poses far from the prediction. The second one starts with the matches at the prediction.
+    far = finished(jax.lax.fori_loop(0, iterations, annealed, pose))
+    near = finished(jax.lax.fori_loop(0, SETTINGS.near_iterations, lambda _, state: step(0.0, state)[0], pose))
+    is_far = far.evidence.sum() + far.log_odometry >= near.evidence.sum() + near.log_odometry
+    return jax.tree.map(lambda one, other: jnp.where(is_far, one, other), far, near)
 
 
 class _Match(NamedTuple):
