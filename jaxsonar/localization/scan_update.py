@@ -131,11 +131,14 @@ def _update_one(
         information, vector = information_of(match_at(state, annealing), annealing)
         return state + jnp.linalg.solve(information, vector - prior_information @ _difference(state, pose)), information
 
-    def annealed(number, state):
-        return step(SETTINGS.annealing_factor ** number.astype(pose.dtype), state)[0]
-
-    def finished(state):
-        """The update by a fit, after its last step, and its log-likelihood."""
+    def fit_from(annealing):
+        """The update by a fit whose weights begin with this fraction of the variance of the predicted pose."""
+        state = jax.lax.fori_loop(
+            0,
+            iterations,
+            lambda number, state: step(annealing * SETTINGS.annealing_factor ** number.astype(pose.dtype), state)[0],
+            pose,
+        )
         state, information = step(0.0, state)
         # A fit that contradicts the prediction is a wrong match of echoes to walls: the prediction is kept.
         change = _difference(state, pose)
@@ -149,11 +152,10 @@ def _update_one(
         covariance = jnp.linalg.inv(information)
         return ScanUpdate(_wrapped(state), covariance, rows, evidence, explained, log_odometry)
 
-    # The first fit finds poses far from the prediction. The second one starts with the matches at the prediction.
-    far = finished(jax.lax.fori_loop(0, iterations, annealed, pose))
-    near = finished(jax.lax.fori_loop(0, SETTINGS.near_iterations, lambda _, state: step(0.0, state)[0], pose))
-    is_far = far.evidence.sum() + far.log_odometry >= near.evidence.sum() + near.log_odometry
-    return jax.tree.map(lambda one, other: jnp.where(is_far, one, other), far, near)
+    # One fit finds poses far from the prediction, one starts with the matches at the prediction.
+    fits = jax.vmap(fit_from)(jnp.array([1.0, 0.0], dtype=pose.dtype))
+    best = (fits.evidence.sum(axis=1) + fits.log_odometry).argmax()
+    return jax.tree.map(lambda column: column[best], fits)
 
 
 class _Match(NamedTuple):

@@ -15,8 +15,6 @@ class UpdateSettings:
     """Number of landmarks that are considered from one pose, the nearest first."""
     iterations: tuple[int, int] = (9, 3)
     """Gauss-Newton steps before the last one, for the first scan of a track and for the others."""
-    near_iterations: int = 2
-    """The same for the fit that starts with the matches of the echoes at the predicted pose."""
     annealing_factor: float = 0.2
     """The weights of the echoes begin with the variance of the predicted pose; each step multiplies it by this."""
     max_innovation: float = 16.3

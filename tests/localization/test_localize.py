@@ -210,9 +210,10 @@ def test_an_update_balances_echoes_and_odometry():
     poses = np.stack([truth, predicted, predicted])
     sd = [(0.05, 0.05), (0.05, 0.05), (1e-4, 1e-4)]
     covariances = np.stack([diagonal_covariance(one) for one in sd])
+    padded = np.resize(poses, (SETTINGS.batch, 3)), np.resize(covariances, (SETTINGS.batch, 3, 3))
     with jax.enable_x64(True):
-        found = update_hypotheses(poses, covariances, known.arrays, tracker.scans[0], np.int64(9))
-    found = [np.asarray(column) for column in found]
+        found = update_hypotheses(*padded, known.arrays, tracker.scans[0], np.int64(9))
+    found = [np.asarray(column)[: len(poses)] for column in found]
     after, covariance, log_odometry = found[0], found[1], found[5]
     np.testing.assert_allclose(after[:2, :2], np.tile(truth[:2], (2, 1)), atol=0.01)
     np.testing.assert_allclose(after[2], predicted, atol=5e-4)
