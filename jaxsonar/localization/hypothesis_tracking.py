@@ -158,7 +158,8 @@ class HypothesisTracker:
         passed = np.empty(len(moved))  # motion nearby
         for begin in range(0, len(moved), SETTINGS.distance_rows):  # no table of all pairs of scans
             part = slice(begin, begin + SETTINGS.distance_rows)
-            is_near = np.linalg.norm(position[part, None] - position, axis=-1) < self.trust.stretch / 2
+            squared = sum(np.square(np.subtract.outer(one[part], one)) for one in position.T)
+            is_near = squared < (self.trust.stretch / 2) ** 2
             passed[part] = is_near @ moved
         weight = moved / np.maximum(passed, self.trust.stretch)
         weight[0] = max(1.0 - weight.sum(), 0.0)
