@@ -30,7 +30,7 @@ from jaxsonar.sensors.ring import Ring
 
 
 class PoseTracks(NamedTuple):
-    """Pose hypotheses and their tracks through the scans so far, one row each."""
+    """Pose hypotheses and their tracks through the scans so far, one row each. Scans to come have rows of zeros."""
 
     pose: Float[np.ndarray, "hypotheses 3"]
     """world_from_robot of the latest scan; of the first one before any update."""
@@ -42,11 +42,12 @@ class PoseTracks(NamedTuple):
     is_start: Bool[np.ndarray, " hypotheses"]
     """Whether it is the start pose that was given."""
     poses: Float[np.ndarray, "hypotheses scans 3"]
-    """Filtered poses of all scans so far."""
+    """Filtered poses."""
     covariances: Float[np.ndarray, "hypotheses scans 3 3"]
     """Their covariances."""
     scan_evidence: Float[np.ndarray, "hypotheses scans"]
-    """Evidence of each of these scans: log-likelihood ratio of its echoes against unknown reflectors, nats."""
+    """Evidence of each scan: log-likelihood ratio of its echoes against unknown reflectors, with the agreement of the
+    pose with the odometry (``ScanUpdate.log_odometry``), nats."""
 
     @classmethod
     def at(
@@ -54,9 +55,8 @@ class PoseTracks(NamedTuple):
     ) -> "PoseTracks":
         """Hypotheses before the first scan, in a map with this many landmarks."""
         count = len(pose)
-        tracks = np.zeros((count, 0, 3)), np.zeros((count, 0, 3, 3)), np.zeros((count, 0))
         nothing, table = np.zeros(count), np.zeros((count, landmarks))
-        return cls(pose, covariance, table, nothing, np.zeros(count, dtype=bool), *tracks)
+        return cls(pose, covariance, table, nothing, np.zeros(count, dtype=bool), *_empty_tracks(count, 0))
 
     def take(self, rows: Int[np.ndarray, " rows"] | Bool[np.ndarray, " hypotheses"]) -> "PoseTracks":
         """Select some of the hypotheses."""
@@ -155,8 +155,13 @@ class HypothesisTracker:
         Scans on a stretch that is passed several times share it. Together all scans are at least one stretch.
         """
         position, moved = self.odometry[self.rows, :2], np.append(0.0, self._moved)
-        is_near = np.linalg.norm(position[:, None] - position, axis=-1) < self.trust.stretch / 2
-        weight = moved / np.maximum(is_near @ moved, self.trust.stretch)
+        passed = np.empty(len(moved))  # motion nearby
+        for begin in range(0, len(moved), SETTINGS.distance_rows):  # no table of all pairs of scans
+            part = slice(begin, begin + SETTINGS.distance_rows)
+            squared = sum(np.square(np.subtract.outer(one[part], one)) for one in position.T)
+            is_near = squared < (self.trust.stretch / 2) ** 2
+            passed[part] = is_near @ moved
+        weight = moved / np.maximum(passed, self.trust.stretch)
         weight[0] = max(1.0 - weight.sum(), 0.0)
         return weight
 
@@ -221,38 +226,35 @@ class HypothesisTracker:
             numbers: of the scans in ``rows``, consecutive.
             progress: called with a stage and (scans done, scans).
         """
-        for k, number in enumerate(numbers):
+        hypotheses = PoseTracks(*hypotheses[:5], *_empty_tracks(len(hypotheses.pose), len(numbers)))
+        hypotheses = hypotheses._replace(evidence=hypotheses.evidence.copy())
+        for k in range(len(numbers)):
             if not len(hypotheses.pose):
                 return hypotheses
-            hypotheses = self.step(hypotheses, int(number), int(numbers[k - 1]) if k else None)
-            if (k + 1) % SETTINGS.pruning_scans == 0 or k + 1 == len(numbers):
-                hypotheses = self.best_of(hypotheses, numbers[: k + 1])
+            hypotheses = self._step(hypotheses, k, numbers)
+            if (k + 1) % SETTINGS.pruning_scans == 0:
+                kept = np.sort(self._possible(hypotheses, numbers[: k + 1]))
+                hypotheses = hypotheses.take(kept) if len(kept) < len(hypotheses.pose) else hypotheses
             if progress:
                 progress("hypotheses", k + 1, len(numbers))
-        return hypotheses
+        return self.best_of(hypotheses, numbers)
 
-    def step(self, hypotheses: PoseTracks, number: int, previous: int | None) -> PoseTracks:
-        """Predict by odometry from the scan ``previous`` (None: no motion), and update by the scan ``number``."""
+    def _step(self, hypotheses: PoseTracks, k: int, numbers: Int[np.ndarray, " steps"]) -> PoseTracks:
+        """Predict by odometry, and update by the scan ``numbers[k]``; its row of the tracks is written in place."""
+        number, previous = int(numbers[k]), int(numbers[k - 1]) if k else None
         pose, covariance = hypotheses.pose, hypotheses.covariance
         if previous is not None:
             pose, covariance = self._predict_all(pose, covariance, previous, number)
         found = self._update_all(pose, covariance, number, UPDATE_SETTINGS.iterations[previous is not None])
         poses, covariances = np.asarray(found.poses), np.asarray(found.covariances)
-        evidence = hypotheses.evidence.copy()
-        np.add.at(evidence, (np.arange(len(pose))[:, None], found.landmark), found.evidence)
-        of_scan = found.evidence.sum(axis=1)
+        np.add.at(hypotheses.evidence, (np.arange(len(pose))[:, None], found.landmark), found.evidence)
+        of_scan = found.evidence.sum(axis=1) + found.log_odometry
         if previous is not None:
             of_scan = of_scan - SETTINGS.crossing_nats * self._crosses(hypotheses.pose, poses)
-        return PoseTracks(
-            poses,
-            covariances,
-            evidence,
-            hypotheses.explained + found.explained,
-            hypotheses.is_start,
-            np.concatenate([hypotheses.poses, poses[:, None]], axis=1),
-            np.concatenate([hypotheses.covariances, covariances[:, None]], axis=1),
-            np.concatenate([hypotheses.scan_evidence, of_scan[:, None]], axis=1),
-        )
+        for column, row in zip(hypotheses[5:], (poses, covariances, of_scan), strict=True):
+            column[:, k] = row
+        explained = hypotheses.explained + found.explained
+        return hypotheses._replace(pose=poses, covariance=covariances, explained=explained)
 
     def log_likelihoods(
         self, hypotheses: PoseTracks, numbers: Int[np.ndarray, " steps"]
@@ -262,7 +264,7 @@ class HypothesisTracker:
         See ``place_probabilities.relative_log_likelihood``.
         """
         none = SETTINGS.chance_nats * self.echo_counts[numbers]
-        both = np.concatenate([hypotheses.scan_evidence, none[None]])
+        both = np.concatenate([hypotheses.scan_evidence[:, : len(numbers)], none[None]])
         found = relative_log_likelihood(both, self.scan_weights[numbers], self.trust)
         return found[:-1], float(found[-1])
 
@@ -271,12 +273,15 @@ class HypothesisTracker:
 
         A given start pose is kept, and preferred to others that are the same, because it assumes least.
         """
+        return hypotheses.take(self._possible(hypotheses, numbers))
+
+    def _possible(self, hypotheses: PoseTracks, numbers: Int[np.ndarray, " steps"]) -> Int[np.ndarray, " kept"]:
+        """Rows of ``best_of``."""
         score, _ = self.log_likelihoods(hypotheses, numbers)
         order = np.lexsort((-score, ~hypotheses.is_start))
         kept = order[_distinct(hypotheses.take(order))]
         kept = kept[(score[kept] >= score.max(initial=-np.inf) - SETTINGS.pruning) | hypotheses.is_start[kept]]
-        kept = kept[np.argsort(-score[kept], kind="stable")[: SETTINGS.max_tracked]]
-        return hypotheses.take(kept)
+        return kept[np.argsort(-score[kept], kind="stable")[: SETTINGS.max_tracked]]
 
     def _update_all(
         self,
@@ -319,6 +324,13 @@ class HypothesisTracker:
             covariances[k] += gain @ (covariances[k + 1] - joint[:3, :3]) @ gain.T
         return poses, covariances
 
+    def odometry_misfit(self, poses: Float[np.ndarray, "scans 3"]) -> float:
+        """Mean squared Mahalanobis distance of the steps of a smoothed track from those of the odometry."""
+        step, moved = (relative(one[:-1], one[1:]) for one in (self.odometry[self.rows], poses))
+        variance = np.array([step_variance(self.odometry_noise, one) for one in step]).reshape(-1, 3)
+        squared = np.square(subtract_poses(moved, step)) / variance
+        return float(squared.sum(axis=1).mean()) if len(step) else 0.0
+
     def _predict(
         self, pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "unknowns unknowns"], before: int, after: int
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "unknowns unknowns"]]:
@@ -342,6 +354,17 @@ class HypothesisTracker:
         by_pose[:, 0, 2], by_pose[:, 1, 2] = pose[:, 1] - moved[:, 1], moved[:, 0] - pose[:, 0]
         noise = np.diag(step_variance(self.odometry_noise, step))
         return moved, by_pose @ covariance @ by_pose.swapaxes(1, 2) + by_step @ noise @ by_step.swapaxes(1, 2)
+
+
+def _empty_tracks(
+    count: int, scans: int
+) -> tuple[
+    Float[np.ndarray, "hypotheses scans 3"],
+    Float[np.ndarray, "hypotheses scans 3 3"],
+    Float[np.ndarray, "hypotheses scans"],
+]:
+    """Poses, covariances and evidence of tracks that have room for this many scans."""
+    return np.zeros((count, scans, 3)), np.zeros((count, scans, 3, 3)), np.zeros((count, scans))
 
 
 def _take(paths: kernels.EchoPaths, rows: Int[np.ndarray, " rows"]) -> kernels.EchoPaths:

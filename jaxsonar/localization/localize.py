@@ -135,6 +135,9 @@ def localize(
     if is_certain and first is None and not tracks.is_determined[order[0]]:
         is_certain = False
         reason = f"{len(numbers)} scans: a direction of the pose is not determined; a longer path may help"
+    if is_certain and tracker.odometry_misfit(smoothed[order[0]][0]) > SETTINGS.max_odometry_misfit:
+        is_certain = False
+        reason = f"{len(numbers)} scans: the track at the best place contradicts the odometry"
     # 4. The poses of its track.
     poses, covariance = np.full((len(log), 3), np.nan), np.full((len(log), 3, 3), np.nan)
     if is_certain:

@@ -68,6 +68,9 @@ class ScanUpdate(NamedTuple):
     """Log-likelihood ratio of each landmark's echoes against unknown reflectors, nats; negative if it was missed."""
     explained: Float[AnyArray, " hypotheses"]
     """Number of echoes that the map explains."""
+    log_odometry: Float[AnyArray, " hypotheses"]
+    """Log-probability of the fitted pose given the predicted one, relative to the latter, and of the volume of poses
+    that the scan leaves (Laplace's approximation): the other part of the scan's marginal likelihood, nats."""
 
 
 @jax.jit
@@ -124,18 +127,35 @@ def _update_one(
         vector = by_pose.T @ match.residual - jnp.einsum("kij,kj->i", gain, right)
         return information + prior_information, vector
 
-    def step(number, state):
-        annealing = SETTINGS.annealing_factor ** number.astype(pose.dtype)
+    def step(annealing, state):
         information, vector = information_of(match_at(state, annealing), annealing)
-        change = jnp.linalg.solve(information, vector - prior_information @ _difference(state, pose))
-        return state + change
+        return state + jnp.linalg.solve(information, vector - prior_information @ _difference(state, pose)), information
 
-    state = jax.lax.fori_loop(0, iterations, step, pose)
-    match = match_at(state, 0.0)
-    information, vector = information_of(match, 0.0)
-    state = state + jnp.linalg.solve(information, vector - prior_information @ _difference(state, pose))
-    evidence, explained = _evidence(state, match, landmarks, landmark_covariance, is_near, scan)
-    return ScanUpdate(_wrapped(state), jnp.linalg.inv(information), rows, evidence, explained)
+    def fit_from(annealing):
+        """The update by a fit whose weights begin with this fraction of the variance of the predicted pose."""
+        state = jax.lax.fori_loop(
+            0,
+            iterations,
+            lambda number, state: step(annealing * SETTINGS.annealing_factor ** number.astype(pose.dtype), state)[0],
+            pose,
+        )
+        state, information = step(0.0, state)
+        # A fit that contradicts the prediction is a wrong match of echoes to walls: the prediction is kept.
+        change = _difference(state, pose)
+        squared = change @ prior_information @ change
+        is_fit = squared < SETTINGS.max_innovation
+        state = jnp.where(is_fit, state, pose)
+        information = jnp.where(is_fit, information, prior_information)
+        evidence, explained = _evidence(state, match_at(state, 0.0), landmarks, landmark_covariance, is_near, scan)
+        volume = (jnp.linalg.slogdet(prior_information)[1] - jnp.linalg.slogdet(information)[1]) / 2
+        log_odometry = volume - jnp.where(is_fit, squared, 0.0) / 2
+        covariance = jnp.linalg.inv(information)
+        return ScanUpdate(_wrapped(state), covariance, rows, evidence, explained, log_odometry)
+
+    # One fit finds poses far from the prediction, one starts with the matches at the prediction.
+    fits = jax.vmap(fit_from)(jnp.array([1.0, 0.0], dtype=pose.dtype))
+    best = (fits.evidence.sum(axis=1) + fits.log_odometry).argmax()
+    return jax.tree.map(lambda column: column[best], fits)
 
 
 class _Match(NamedTuple):

@@ -17,6 +17,9 @@ class UpdateSettings:
     """Gauss-Newton steps before the last one, for the first scan of a track and for the others."""
     annealing_factor: float = 0.2
     """The weights of the echoes begin with the variance of the predicted pose; each step multiplies it by this."""
+    max_innovation: float = 16.3
+    """Squared Mahalanobis distance from the predicted pose (three degrees of freedom, 0.1 % of the right fits are
+    farther) from which a fit is rejected. An error of the map is the same at all scans: it makes no pose jump."""
     known_share: float = 0.5
     """Prior probability that an echo comes from a landmark of the map."""
     independent_echoes: float = 2.0
@@ -117,6 +120,9 @@ class LocalizationSettings:
     """Squared Mahalanobis distance up to which two hypotheses are the same."""
     max_pose_sd: tuple[float, float] = (0.04, float(np.radians(2.0)))
     """Largest standard deviations of a determined pose: position (m), heading (rad)."""
+    max_odometry_misfit: float = 4.0
+    """Largest mean squared Mahalanobis distance of the steps of a certain track from the odometry. It is 3 if the map
+    determines every pose exactly, and less otherwise."""
     later_groups: int = 4
     """Number of groups of ``first_scans`` later scans that contribute hypotheses."""
     later_hypotheses: int = 6
@@ -139,6 +145,8 @@ class LocalizationSettings:
     """Evidence against a track for every passage through a wall: a door that the map shows closed."""
     crossing_margin: float = 0.15
     """A track nearer to the end of a wall does not pass through it, metres."""
+    distance_rows: int = 256
+    """Number of scans whose distances from all scans are computed together."""
     batch: int = 8
     """Number of hypotheses that are updated together; the last batch is padded."""
     min_echoes: int = 64

@@ -3,13 +3,26 @@
 from dataclasses import replace
 from functools import cache
 
+import jax
 import numpy as np
 import pytest
 
 from jaxsonar import Log, Ring, Room, SonarError, simulate
-from jaxsonar.geometry.se2 import compose, inverse, transform_points, wrap_angle
+from jaxsonar.estimation.odometry_noise import OdometryNoise
+from jaxsonar.geometry.se2 import (
+    compose,
+    diagonal_covariance,
+    inverse,
+    relative,
+    subtract_poses,
+    transform_points,
+    wrap_angle,
+)
+from jaxsonar.localization.hypothesis_tracking import HypothesisTracker
+from jaxsonar.localization.known_map import KnownMap
 from jaxsonar.localization.localize import Localized, localize
 from jaxsonar.localization.scan_update import update_hypotheses
+from jaxsonar.localization.settings import SETTINGS, UPDATE_SETTINGS
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_from_room import map_from_room
 from jaxsonar.simulation.office import load_office
@@ -161,6 +174,74 @@ def test_a_plan_is_ambiguous_until_the_drive_leaves_the_rooms_that_are_alike():
     apart = errors_of(found, poses)
     assert np.median(np.hypot(apart[:, 0], apart[:, 1])) < 0.08
     assert np.median(np.abs(apart[:, 2])) < np.radians(1.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 4])
+def test_the_office_is_found_in_its_floor_plan(seed):
+    """A wrong place that fits the last scans does not win: its track contradicts the odometry."""
+    ring, room, truth, stamps = office().ring, office().room, office().poses, office().stamps
+    given = simulate(ring, room, truth, sigma=0.003, seed=seed, stamps=stamps).as_log(ring, truth)
+    found = localize(ring, map_from_room(room), given)
+    assert found.is_certain, found.reason
+    assert np.hypot(*errors_of(found, truth)[:, :2].T).max() < 0.05
+    assert np.hypot(*(found.hypotheses[0].pose - truth[0])[:2]) < 0.05
+
+
+@pytest.mark.slow
+def test_no_wrong_place_is_certain_if_the_odometry_slips():
+    """The odometry slips by 0.2 m: the place is right if it is certain, and the track recovers."""
+    ring, room, truth, stamps = office().ring, office().room, office().poses, office().stamps
+    odometry = truth.copy()
+    odometry[8:] = compose(compose(truth[7], np.array([-0.2, 0.0, 0.0])), relative(truth[7], truth[8:]))
+    given = simulate(ring, room, truth, sigma=0.003, seed=1, stamps=stamps).as_log(ring, odometry)
+    found = localize(ring, map_from_room(room), given)
+    apart = np.hypot(*errors_of(found, truth)[:, :2].T)
+    assert not found.is_certain or (apart[[0, -1]] < 0.05).all()
+
+
+def test_an_update_balances_echoes_and_odometry():
+    """Its evidence is Laplace's approximation, and a fit far from a certain prediction is rejected."""
+    truth = office().poses[0]
+    noise = OdometryNoise()
+    known = KnownMap.of(map_from_room(office().room))
+    tracker = HypothesisTracker(RING, known, log()[:1], (), office().poses[:1], SIGMA, noise, SETTINGS.plan_trust)
+    predicted = truth + np.array([0.02, -0.01, 0.01])
+    poses = np.stack([truth, predicted, predicted])
+    sd = [(0.05, 0.05), (0.05, 0.05), (1e-4, 1e-4)]
+    covariances = np.stack([diagonal_covariance(one) for one in sd])
+    padded = np.resize(poses, (SETTINGS.batch, 3)), np.resize(covariances, (SETTINGS.batch, 3, 3))
+    with jax.enable_x64(True):
+        found = update_hypotheses(*padded, known.arrays, tracker.scans[0], np.int64(9))
+    found = [np.asarray(column)[: len(poses)] for column in found]
+    after, covariance, log_odometry = found[0], found[1], found[5]
+    np.testing.assert_allclose(after[:2, :2], np.tile(truth[:2], (2, 1)), atol=0.01)
+    np.testing.assert_allclose(after[2], predicted, atol=5e-4)
+    change = subtract_poses(after, poses)
+    squared = np.einsum("ni,nij,nj->n", change, np.linalg.inv(covariances), change)
+    volume = (np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(covariances)[1]) / 2
+    np.testing.assert_allclose(log_odometry, volume - squared / 2, atol=1e-6)
+    assert (log_odometry < 0).all()
+    assert (squared < UPDATE_SETTINGS.max_innovation).all()
+
+
+def test_the_scans_of_a_long_log_share_their_stretches():
+    """The weights are those of the table of all distances."""
+    count = 3 * SETTINGS.distance_rows // 2
+    odometry = np.cumsum(np.random.default_rng(3).normal(0, 0.1, (count, 3)), axis=0)
+    known = KnownMap.of(map_from_room(office().room))
+    trust = SETTINGS.plan_trust
+    tracker = HypothesisTracker(RING, known, log()[:1], (), odometry, SIGMA, OdometryNoise(), trust)
+    step = relative(odometry[:-1], odometry[1:])
+    moved = np.append(0.0, np.hypot(*step[:, :2].T) + SETTINGS.turn_length * np.abs(step[:, 2]))
+    distance = np.linalg.norm(odometry[:, None, :2] - odometry[:, :2], axis=-1)
+    expected = moved / np.maximum((distance < trust.stretch / 2) @ moved, trust.stretch)
+    np.testing.assert_allclose(tracker.scan_weights[1:], expected[1:])
+    # A track that follows the odometry agrees with it.
+    turned = compose(np.array([1.0, 2.0, 3.0]), odometry)
+    assert tracker.odometry_misfit(turned) < 1e-9
+    turned[count // 2 :, 0] += 1.0
+    assert tracker.odometry_misfit(turned) > 1e-3
 
 
 def test_an_update_is_compiled_once():
