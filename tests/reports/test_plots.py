@@ -136,7 +136,7 @@ DRAW = {
     "grid in the room": lambda case: plot_grid.grid_figure(
         GridPanel("Grid", GRID, 0.1, (-1.0, 2.0)), room=case.room, poses=np.array([[0.5, 0.2, 0.0]])
     ),
-    "grids": lambda case: plot_grid.grid_comparison_figure(
+    "grid_comparison": lambda case: plot_grid.grid_comparison_figure(
         [GridPanel("A", GRID, 0.1, (-1.0, 2.0)), GridPanel("B", GRID, 0.2, (0.0, 0.0))], room=case.room
     ),
 }
@@ -169,7 +169,7 @@ def test_every_figure_can_be_drawn(case, draw):
 
 
 def test_every_figure_function_is_tested():
-    modules = (plot_scan, plot_map)
+    modules = (plot_scan, plot_map, plot_grid)
     drawing = {name for module in modules for name in vars(module) if name.endswith("_figure")}
     assert drawing == {f"{name.split()[0]}_figure" for name in DRAW if name != "last sensor fires"}
 
@@ -356,7 +356,7 @@ def test_svg_is_xml_and_the_same_twice(figure, tmp_path):
         "aggregate in the room",
         "modeling in the room",
         "map with all",
-        "grids",
+        "grid_comparison",
     ],
 )
 def test_every_svg_is_the_same_twice(tmp_path, name):
