@@ -15,6 +15,7 @@ from jaxsonar import kernels
 from jaxsonar.kernels.detection_cones import visibility
 from jaxsonar.kernels.landmarks import AnyArray, landmark_in_robot_frame
 from jaxsonar.kernels.measurement_model import reflector_echo
+from jaxsonar.kernels.planar_geometry import normal, tangent, wrap_angle
 from jaxsonar.kernels.sensor_array import widen_cones
 from jaxsonar.localization.settings import UPDATE_SETTINGS as SETTINGS
 
@@ -252,7 +253,7 @@ def _is_well_visible(
 
     def visible(landmark, path):
         echo = reflector_echo(jnp.asarray(landmark.kind), landmark_in_robot_frame(jnp.asarray(pose), landmark), path)
-        along = echo.footpoint + jnp.dot(_tangent(landmark.parameters[1]), pose[:2] - landmark.anchor)
+        along = echo.footpoint + jnp.dot(tangent(jnp.asarray(landmark.parameters[1])), pose[:2] - landmark.anchor)
         inside = (along > landmark.extent[0] + SETTINGS.end_margin) & (along < landmark.extent[1] - SETTINGS.end_margin)
         return (visibility(echo, path) > 0.5) & inside
 
@@ -274,8 +275,8 @@ def _near_landmarks(
     is_near = (kind >= 0) & (distance < max_range + uncertainty)
     is_near &= ~_is_hidden(pose, landmarks, foot, is_wall & is_near)
     # The other side of a wall: normal and distance are reversed.
-    theta = landmarks.parameters[:, 1]
-    side = ((jnp.asarray(landmarks.anchor) - pose[None, :2]) * _normal(theta)).sum(-1) + landmarks.parameters[:, 0]
+    theta = jnp.asarray(landmarks.parameters[:, 1])
+    side = ((jnp.asarray(landmarks.anchor) - pose[None, :2]) * normal(theta)).sum(-1) + landmarks.parameters[:, 0]
     is_reversed = is_wall & (side < 0)
     other = jnp.stack([-landmarks.parameters[:, 0], theta + jnp.pi], axis=-1)
     parameters = jnp.where(is_reversed[:, None], other, landmarks.parameters)
@@ -296,10 +297,11 @@ def _nearest(
     """Rows of the nearest landmarks, these landmarks, their distances (metres) and nearest points."""
     every = known.landmarks
     kind = jnp.asarray(every.kind)
-    tangent, normal = _tangent(every.parameters[:, 1]), _normal(every.parameters[:, 1])
+    theta = jnp.asarray(every.parameters[:, 1])
+    t, n = tangent(theta), normal(theta)
     offset = pose[None, :2] - every.anchor
-    along = jnp.clip((offset * tangent).sum(-1), every.extent[:, 0], every.extent[:, 1])
-    on_wall = every.anchor + every.parameters[:, :1] * normal + along[:, None] * tangent
+    along = jnp.clip((offset * t).sum(-1), every.extent[:, 0], every.extent[:, 1])
+    on_wall = every.anchor + every.parameters[:, :1] * n + along[:, None] * t
     foot = jnp.where((kind == kernels.PLANE)[:, None], on_wall, every.anchor + every.parameters)
     distance = jnp.where(kind >= 0, jnp.linalg.norm(foot - pose[None, :2], axis=-1), jnp.inf)
     size = min(SETTINGS.max_landmarks, len(distance))
@@ -315,16 +317,16 @@ def _is_hidden(
     is_wall: Bool[Array, " near"],
 ) -> Bool[Array, " near"]:
     """Whether a wall stands between the robot and the nearest point of a landmark."""
-    theta = landmarks.parameters[:, 1]
-    normal, tangent = _normal(theta), _tangent(theta)
-    here = ((landmarks.anchor - pose[None, :2]) * normal).sum(-1) + landmarks.parameters[:, 0]
+    theta = jnp.asarray(landmarks.parameters[:, 1])
+    n, t = normal(theta), tangent(theta)
+    here = ((landmarks.anchor - pose[None, :2]) * n).sum(-1) + landmarks.parameters[:, 0]
     # Fraction of the way to each point (rows) at which the line meets each wall (columns).
     way = foot - pose[None, :2]
-    toward = way @ normal.T
+    toward = way @ n.T
     fraction = here[None] / jnp.where(jnp.abs(toward) < 1e-9, 1e-9, toward)
     length = jnp.linalg.norm(foot - pose[None, :2], axis=-1)[:, None]
     meets = pose[None, None, :2] + fraction[..., None] * way[:, None]
-    along = ((meets - landmarks.anchor[None]) * tangent[None]).sum(-1)
+    along = ((meets - landmarks.anchor[None]) * t[None]).sum(-1)
     margin = SETTINGS.sight_margin
     inside = (along > landmarks.extent[None, :, 0] + margin) & (along < landmarks.extent[None, :, 1] - margin)
     between = (fraction > 0) & (fraction * length < length - margin)
@@ -336,12 +338,4 @@ def _difference(pose: Float[AnyArray, "3"], other: Float[AnyArray, "3"]) -> Floa
 
 
 def _wrapped(pose: Float[AnyArray, "3"]) -> Float[Array, "3"]:
-    return jnp.stack([pose[0], pose[1], jnp.mod(pose[2] + jnp.pi, 2 * jnp.pi) - jnp.pi])
-
-
-def _normal(theta: Float[AnyArray, "*batch"]) -> Float[Array, "*batch 2"]:
-    return jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=-1)
-
-
-def _tangent(theta: Float[AnyArray, "*batch"]) -> Float[Array, "*batch 2"]:
-    return jnp.stack([-jnp.sin(theta), jnp.cos(theta)], axis=-1)
+    return jnp.stack([pose[0], pose[1], wrap_angle(jnp.asarray(pose[2]))])

@@ -72,6 +72,10 @@ class DirectReadings(NamedTuple):
             robot = compose(robot, flat.path_pose[:, direct])
         return cls(measured, first, robot)
 
+    def quiet_range(self, max_range: float) -> Float[np.ndarray, "scans sensors"]:
+        """Range up to which each sensor heard nothing, metres: its first echo, or most of the maximum range."""
+        return np.where(np.isfinite(self.first_echo), self.first_echo, SETTINGS.free.reach * max_range)
+
 
 def footprint_cells(
     sensors: TransducerArrays, pose: Float[np.ndarray, " 3"], resolution: float

@@ -200,7 +200,8 @@ class GridEvidence:
     ) -> None:
         """Add what a batch of scans saw through, and where the robot stood."""
         sensors, resolution, free = self.sensors, self.resolution, SETTINGS.free
-        robot, measured = readings.robot[rows], readings.measured[rows]
+        here = DirectReadings(readings.measured[rows], readings.first_echo[rows], readings.robot[rows])
+        robot, measured = here.robot, here.measured
         for row in rows:
             column, line = (footprint_cells(sensors, pose[row], resolution) - self.area.corner).T
             self.footprint[line, column] += 1
@@ -216,10 +217,7 @@ class GridEvidence:
         sensor_pose = np.concatenate(
             [position - (low * resolution)[:, None], (sensors.heading + robot[..., 2])[..., None]], axis=-1
         )
-        silent = np.where(
-            np.isfinite(readings.first_echo[rows]), readings.first_echo[rows], free.reach * self.ring.max_range
-        )
-        first_echo = np.where(measured, np.minimum(silent, self.ring.max_range), 0.0)
+        first_echo = np.where(measured, np.minimum(here.quiet_range(self.ring.max_range), self.ring.max_range), 0.0)
         walls = walls_near(known.walls, pose[rows, :2], sensors.max_distance + max(motion, 0.0))
         walls = walls[None] - (low * resolution)[:, None, None].astype(np.float32)
         half_width = np.maximum(sensors.half_width, 1e-3)
@@ -245,14 +243,14 @@ class GridEvidence:
             first = max(-column[scan], 0), max(-row[scan], 0)
             last = min(self.area.shape[1] - column[scan], size), min(self.area.shape[0] - row[scan], size)
             tile = slice(first[1], last[1]), slice(first[0], last[0])
-            here = (
+            place = (
                 slice(row[scan] + first[1], row[scan] + last[1]),
                 slice(column[scan] + first[0], column[scan] + last[0]),
             )
             bits = directions[scan][tile]
-            self.looks[here] += looks[scan][tile]
+            self.looks[place] += looks[scan][tile]
             for k in np.flatnonzero([(bits & (1 << k)).any() for k in range(kernels.DIRECTIONS)]):
-                part = self.passes[k][here]
+                part = self.passes[k][place]
                 part += ((bits >> k) & 1).astype(np.uint16) & (part < np.iinfo(np.uint16).max)
 
     def _keep_echoes(self, log: Log, posed: Bool[np.ndarray, " scans"], known: KnownReflectors) -> None:

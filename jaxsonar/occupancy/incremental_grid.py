@@ -34,7 +34,6 @@ class IncrementalGrid:
         Raises:
             SonarError: a resolution out of range, or an unknown method.
         """
-        self.ring = ring
         self.evidence = GridEvidence(ring, resolution=resolution, method=method, certain=certain)
         self._pending: list[Log] = []
         self._readings: list[FacingReadings] = []
@@ -42,7 +41,6 @@ class IncrementalGrid:
 
     def set_ring(self, ring: Ring) -> None:
         """Use another ring for the scans that are added from now on, and for those that are pending."""
-        self.ring = ring
         self.evidence.set_ring(ring)
 
     def add(self, log: Log) -> None:
@@ -83,7 +81,8 @@ class IncrementalGrid:
         _check(given)
         known = walls if isinstance(walls, KnownReflectors) else KnownReflectors.of_walls(given)
         self._readings.extend(_facing_readings(self.evidence, log) for log in self._pending)
-        readings = FacingReadings.concatenate(self._readings, self.ring.max_range).latest(SETTINGS.max_readings)
+        max_range = self.evidence.ring.max_range
+        readings = FacingReadings.concatenate(self._readings, max_range).latest(SETTINGS.max_readings)
         self._readings = [readings]
         readings = readings._replace(driven=_way(self._poses, self.evidence.resolution))
         profile = profile_walls(known, readings, resolution=self.evidence.resolution)
@@ -135,12 +134,12 @@ def _facing_readings(evidence: GridEvidence, log: Log) -> FacingReadings:
     readings = DirectReadings.of(ring, log)
     posed = np.asarray(np.isfinite(log.pose).all(axis=-1))
     used = readings.measured & posed[:, None]
-    robot, sensor, first = readings.robot[used], np.nonzero(used)[1], readings.first_echo[used]
+    robot, sensor = readings.robot[used], np.nonzero(used)[1]
     return FacingReadings(
         transform_points(robot, sensors.position[sensor]),
         sensors.heading[sensor] + robot[:, 2],
         evidence.certain[sensor],
-        np.where(np.isfinite(first), first, SETTINGS.free.reach * ring.max_range),
+        readings.quiet_range(ring.max_range)[used],
         np.zeros((0, 2)),
         ring.max_range,
     )

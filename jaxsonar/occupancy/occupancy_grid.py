@@ -161,7 +161,7 @@ def _swept(evidence: GridEvidence, readings: FacingReadings) -> Bool[np.ndarray,
     # One cell less, because the points of the way are rounded to cells.
     radius = float((-outline[:, 2]).min(initial=np.inf)) / evidence.resolution - 1 if len(outline) else 0.0
     if not 1 <= radius < np.inf:
-        return way & (evidence.footprint > 0)
+        return np.zeros_like(way)
     half = int(radius)
     disk = np.hypot(*np.mgrid[-half : half + 1, -half : half + 1]) <= radius
     return np.asarray(ndimage.binary_dilation(way, disk), bool)
