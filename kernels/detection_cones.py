@@ -26,7 +26,40 @@ class VisibilitySettings:
     by hand."""
 
 
+    beam_edge_db: float = 6.0
+    """One-way loss at the border of a cone, dB; Gaussian in the off-axis angle. Data sheets define the beam angle by
+    6 dB."""
+    absorption_db_per_m: float = 1.3
+    """Loss in air per metre of path at 40 kHz, dB/m (ISO 9613-1, 20 deg C, 50 % relative humidity)."""
+    level_sd: float = 1.5
+    """Spread of the threshold of detection, dB: 6 dB beams differ from real ones; chosen by hand."""
+
+
 SETTINGS = VisibilitySettings()
+
+
+def echo_level(echo: PredictedEcho, path: EchoPaths) -> Float[Array, ""]:
+    """Level of the echo of a large smooth wall, dB relative to a wall on the axis at 1 m.
+
+    Spreading, absorption and both beams. Corners return as much sound as walls; edges, poles and columns less.
+    """
+    out, back = echo.departure - path.axes[0], echo.arrival - path.axes[1]
+    off_axis = dot(out, out) / path.cone[0] + dot(back, back) / path.cone[1]
+    spreading = 20 * jnp.log10(jnp.maximum(echo.range, 1e-2))
+    absorption = 2 * SETTINGS.absorption_db_per_m * (echo.range - 1)
+    return -(spreading + absorption + SETTINGS.beam_edge_db * off_axis)
+
+
+def audibility(echo: PredictedEcho, path: EchoPaths, threshold: Float[Array, ""]) -> Float[Array, ""]:
+    """Weight of an echo by its level: that of ``visibility`` inside both cones, outside them 1 above the threshold.
+
+    Args:
+        echo: the echo.
+        path: its path.
+        threshold: level of the faintest echoes that are heard outside the cones, dB (``echo_level``); inf: none.
+    """
+    outside = jax.nn.sigmoid((echo_level(echo, path) - threshold) / SETTINGS.level_sd)
+    return jnp.maximum(visibility(echo, path), jnp.where(echo.exists, outside, 0))
 
 
 def visibility(echo: PredictedEcho, path: EchoPaths) -> Float[Array, ""]:

@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from . import hough_accumulator as hough
-from .detection_cones import visibility
+from .detection_cones import SETTINGS as CONES
+from .detection_cones import echo_level, visibility
 from .hough_accumulator import HoughSettings
 from .hough_voting import PackedEchoes, RingArcs, map_scans, tangent_lines
 from .measurement_model import PLANE, plane_echo, point_echo
@@ -233,11 +234,14 @@ def evaluate_hypotheses(
 
     def plane(x: Float[Array, "2"]) -> Hypotheses:
         one = refine(scan, plane_echo, x, scene, clutter, settings)
-        missed = settings.missed_weight_plane * plane_missed_log_likelihood(scan, one, scene, settings)
+        soft = scene.silence_threshold < settings.deaf_threshold
+        weight = jnp.where(soft, settings.missed_weight_plane_soft, settings.missed_weight_plane)
+        missed = weight * plane_missed_log_likelihood(scan, one, scene, settings)
         one = with_base(one, missed, plane_log_prior(scan, one, scene, settings))
         # Points have fewer echoes than a full wall.
         fraction = count(one.log_ratio > 0) / scan.full_wall_paths
-        return one._replace(base=one.base + settings.full_wall_bonus * (fraction - settings.typical_fraction))
+        bonus = jnp.where(soft, settings.full_wall_bonus_soft, settings.full_wall_bonus)
+        return one._replace(base=one.base + bonus * (fraction - settings.typical_fraction))
 
     def point(is_edge: Float[Array, ""], x: Float[Array, "2"]) -> Hypotheses:
         model = partial(point_echo, is_edge)
@@ -327,6 +331,8 @@ def update_scene(
     weight = settings.detection_weight
     detection = (weight * settings.detection_probability + received) / (weight + expected)
 
+    threshold = estimate_threshold(scan, selected.parameters, low, high, involved & wall[:, None], detection, scene, settings)
+
     # Sigma: residuals of the walls, minus two degrees of freedom for each wall.
     enough = wall & (involved.sum(axis=1) >= settings.min_echoes_for_sigma)
     squares = jnp.where(involved & enough[:, None], selected.residual**2, 0).sum()
@@ -343,4 +349,31 @@ def update_scene(
         detection_probability=jnp.clip(detection, *settings.detection_bounds),
         aligned_fraction=aligned_walls / (count(wall) + settings.aligned_weight),
         sigma=jnp.where(jnp.isfinite(sigma), scene.sigma, jnp.maximum(estimate, settings.min_sigma)),
+        threshold=threshold,
+        silence_threshold=threshold,
     )
+
+
+def estimate_threshold(scan, lines, low, high, involved, detection, scene, settings: DetectionSettings) -> Float[Array, ""]:
+    """Most likely level of the faintest echoes of walls that are heard outside the cones, dB.
+
+    Counted are the paths between the outermost footpoints of the echoes of a wall.
+    """
+
+    def one(line: Float[Array, "2"], low: Float[Array, ""], high: Float[Array, ""], path: EchoPaths):
+        echo = plane_echo(line, path)
+        in_range = echo.exists & (echo.range < scan.max_range - settings.range_margin - 2 * scene.sigma)
+        between = (echo.footpoint > low) & (echo.footpoint < high)
+        outside = in_range & between & (visibility(echo, path) < 0.05)
+        return outside, echo_level(echo, path)
+
+    each_path = jax.vmap(jax.vmap(one, in_axes=(None, None, None, -1)), in_axes=(0, 0, 0, None))
+    outside, level = each_path(lines, low, high, scan.paths)
+    outside = outside if scan.measured is None else outside & scan.measured[None]
+    heard = jnp.zeros_like(outside).at[:, scan.path_index].max(involved)
+    outside = outside & (low < high)[:, None]
+    grid = jnp.asarray((settings.deaf_threshold, *settings.thresholds), level.dtype)
+    probability = 0.01 + (detection - 0.02) * jax.nn.sigmoid((level[..., None] - grid) / CONES.level_sd)
+    log_likelihood = jnp.where(heard[..., None], jnp.log(probability), jnp.log(1 - probability))
+    total = jnp.where(outside[..., None], log_likelihood, 0).sum((0, 1))
+    return grid[total.argmax()]

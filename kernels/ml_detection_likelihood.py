@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .detection_cones import off_axis_ratio, visibility
+from .detection_cones import audibility, echo_level
 from .measurement_model import plane_echo, second_order_echo
 from .ml_detection_settings import DetectionSettings
 from .ml_detection_state import Hypotheses, Model, ScanData, SceneEstimate, count, log_normal, regularized_inverse
@@ -33,7 +33,7 @@ def _second_order_density(scan: ScanData, scene: SceneEstimate, settings: Detect
         def one(path: EchoPaths, measured: Float[Array, ""]) -> Float[Array, ""]:
             echo = second_order_echo(first, second, path)
             sd = 2 * scene.sigma + settings.second_order_sd
-            return visibility(echo, path) * jnp.exp(log_normal(measured - echo.range, sd))
+            return audibility(echo, path, scene.threshold) * jnp.exp(log_normal(measured - echo.range, sd))
 
         each_echo = jax.vmap(one, in_axes=-1)
         return jnp.where(known, scene.detection_probability * each_echo(scan.echo_paths, scan.ranges), 0)
@@ -66,7 +66,7 @@ def refine(
 
     def predict(x: Float[Array, "2"], path: EchoPaths):
         echo = model(x, path)
-        return echo, visibility(echo, path)
+        return echo, audibility(echo, path, scene.threshold)
 
     def step(x: Float[Array, "2"], _: None):
         echo, visible = jax.vmap(predict, in_axes=(None, -1), out_axes=-1)(x, scan.echo_paths)
@@ -119,9 +119,9 @@ def missed_detections(
     def predict(path: EchoPaths):
         echo = model(reflector.parameters, path)
         in_range = echo.range < scan.max_range - settings.range_margin - 2 * scene.sigma
-        visible = jnp.where(in_range, visibility(echo, path), 0)
+        visible = jnp.where(in_range, audibility(echo, path, scene.silence_threshold), 0)
         cost = jnp.log(1 - scene.detection_probability * visible)
-        return echo.range, echo.footpoint, visible, off_axis_ratio(echo, path), cost
+        return echo.range, echo.footpoint, visible, -echo_level(echo, path), cost
 
     each_path = jax.vmap(predict, in_axes=-1, out_axes=-1)
     _, footpoint, visible, off_axis, cost = each_path(scan.paths)
@@ -145,11 +145,13 @@ def point_missed_log_likelihood(
     """Log likelihood of the missed detections of ONE corner (0) or edge (1), at most 0 nats."""
     missed = missed_detections(scan, model, point, scene, settings)
     # A faint edge is received near the axes only: up to the farthest of its echoes.
-    border = jnp.where(point.log_ratio > 0, missed.echo_off_axis, 0).max() + settings.off_axis_margin
+    border = jnp.where(point.log_ratio > 0, missed.echo_off_axis, -jnp.inf).max() + settings.off_axis_margin
     border = jnp.where(is_edge > 0, border, jnp.inf)
     inside = missed.total(missed.off_axis < border, missed.echo_off_axis < border)
     outside = missed.total(missed.off_axis >= border, missed.echo_off_axis >= border)
-    return jnp.maximum(inside, -settings.max_occlusion_cost) + jnp.maximum(outside, -settings.max_faint_edge_cost)
+    soft = scene.silence_threshold < settings.deaf_threshold
+    most = jnp.where(soft, settings.max_occlusion_cost_soft, settings.max_occlusion_cost)
+    return jnp.maximum(inside, -most) + jnp.maximum(outside, -settings.max_faint_edge_cost)
 
 
 def plane_missed_log_likelihood(
@@ -163,7 +165,8 @@ def plane_missed_log_likelihood(
     footpoint, echo_footpoint, own = missed.footpoint, missed.echo_footpoint, plane.log_ratio > 0
     low, high = jnp.where(own, plane.footpoint, jnp.inf).min(), jnp.where(own, plane.footpoint, -jnp.inf).max()
     inside = missed.total((footpoint >= low) & (footpoint <= high), (echo_footpoint >= low) & (echo_footpoint <= high))
-    total = jnp.maximum(inside, -settings.max_occlusion_cost)
+    soft = scene.silence_threshold < settings.deaf_threshold
+    total = jnp.maximum(inside, -jnp.where(soft, settings.max_occlusion_cost_soft, settings.max_occlusion_cost))
     for gap, echo_gap in ((low - footpoint, low - echo_footpoint), (footpoint - high, echo_footpoint - high)):
         silent = (missed.visibility > settings.gap_visibility) & (gap > settings.footpoint_margin)
         next_silent = jnp.where(silent, gap, jnp.inf).min()

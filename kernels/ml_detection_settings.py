@@ -67,6 +67,13 @@ class DetectionSettings:
     """Bounds of the estimated detection probability; chosen by hand."""
     certain_visibility: float = 0.95
     """Visibility above which a path counts for the estimate of the detection probability; chosen by hand."""
+    initial_threshold: float = -30.0
+    """First guess of the level of the faintest wall echoes outside the cones, dB (``detection_cones.echo_level``). No echo
+    is expected there until the threshold is estimated."""
+    deaf_threshold: float = 100.0
+    """Level of the threshold of a ring that hears nothing outside its cones, dB."""
+    thresholds: tuple[float, ...] = (-6.0, -10.0, -14.0, -18.0, -22.0, -26.0, -30.0, -34.0, -38.0)
+    """Other levels of the threshold among which the most likely one is estimated, dB."""
     blanking_distance: float = 0.035
     """Metres behind an echo in which a path cannot receive another one."""
     excuse_gate: float = 4.0
@@ -75,6 +82,12 @@ class DetectionSettings:
     """Metres below the maximum range, in addition to two sigma, from which on no echo is expected."""
     max_occlusion_cost: float = 6.0
     """Largest cost of missed detections, nats: another object may occlude the reflector."""
+    max_occlusion_cost_soft: float = 20.0
+    """The same where the ring hears outside of its cones: most of the paths would have to be occluded."""
+    missed_weight_plane_soft: float = 1.0
+    full_wall_bonus_soft: float = 0.0
+    handicap_soft: float = 2.5
+    tempering_soft: float = 0.44
     max_faint_edge_cost: float = 1.0
     """Largest cost of missed detections far off the axes of an edge, nats: its echo may be too faint."""
     missed_weight_plane: float = 0.7

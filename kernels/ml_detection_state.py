@@ -52,6 +52,10 @@ class SceneEstimate(NamedTuple):
     """Fraction of the walls that are parallel or perpendicular to another one."""
     sigma: Float[Array, ""]
     """Standard deviation of the ranges, metres."""
+    threshold: Float[Array, ""]
+    """Level of the faintest echoes of walls that are heard outside the cones, dB (``detection_cones.echo_level``)."""
+    silence_threshold: Float[Array, ""]
+    """The same for missed detections: no echo is expected below this level, dB."""
 
     @staticmethod
     def initial(sigma: Float[Array, ""], settings: DetectionSettings) -> "SceneEstimate":
@@ -64,6 +68,8 @@ class SceneEstimate(NamedTuple):
             detection_probability=jnp.asarray(settings.detection_probability, sigma.dtype),
             aligned_fraction=jnp.asarray(settings.aligned_fraction, sigma.dtype),
             sigma=sigma,
+            threshold=jnp.asarray(settings.initial_threshold, sigma.dtype),
+            silence_threshold=jnp.asarray(settings.deaf_threshold, sigma.dtype),
         )
 
 
