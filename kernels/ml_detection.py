@@ -373,7 +373,7 @@ def estimate_threshold(scan, lines, low, high, involved, detection, scene, setti
     heard = jnp.zeros_like(outside).at[:, scan.path_index].max(involved)
     outside = outside & (low < high)[:, None]
     grid = jnp.asarray((settings.deaf_threshold, *settings.thresholds), level.dtype)
-    probability = 0.01 + (detection - 0.02) * jax.nn.sigmoid((level[..., None] - grid) / CONES.level_sd)
+    probability = 0.01 + (detection - 0.02) * jax.nn.sigmoid((level[..., None] - grid[None, None]) / CONES.level_sd)
     log_likelihood = jnp.where(heard[..., None], jnp.log(probability), jnp.log(1 - probability))
     total = jnp.where(outside[..., None], log_likelihood, 0).sum((0, 1))
     return grid[total.argmax()]
