@@ -27,6 +27,7 @@ from .detection_cones import echo_level, visibility
 from .hough_accumulator import HoughSettings
 from .hough_voting import PackedEchoes, RingArcs, map_scans, tangent_lines
 from .measurement_model import PLANE, plane_echo, point_echo
+from .ml_detection_circles import fit_circles
 from .ml_detection_likelihood import (
     alignment_ratio,
     clutter_log_density,
@@ -54,8 +55,12 @@ class Detections(eqx.Module):
     """(rho, theta) of a plane, (x, y) of a corner or an edge; robot frame, metres, radians."""
     covariance: Float[Array, "*scans reflectors 2 2"]
     """Covariance of the parameters by the noise of the ranges."""
-    probability: Float[Array, "*scans reflectors 3"]
-    """Posterior probabilities of plane, corner and edge, given that it is one of them."""
+    circle: Float[Array, "*scans reflectors 3"]
+    """Center x, y and radius of the reflector as a circle, metres."""
+    circle_covariance: Float[Array, "*scans reflectors 3 3"]
+    """Covariance of the circle by the noise of the ranges and the prior of the curvature."""
+    probability: Float[Array, "*scans reflectors 4"]
+    """Posterior probabilities of plane, corner, edge and circle, given that it is one of them."""
     evidence: Float[Array, "*scans reflectors"]
     """Nats above clutter."""
     involved: Bool[Array, "*scans reflectors echoes"]
@@ -132,8 +137,13 @@ def detect_in_scan(
         return (scene, hypotheses.parameters.reshape(parameters.shape)), (selected, selection, scene.sigma)
 
     start = SceneEstimate.initial(initial_sigma, settings), parameters
-    _, passes = jax.lax.scan(one_pass, start, None, length=settings.passes)
+    (scene, _), passes = jax.lax.scan(one_pass, start, None, length=settings.passes)
     selected, selection, final_sigma = jax.tree.map(lambda leaf: leaf[-1], passes)
+
+    # Fit the selected reflectors as circles, and let the four kinds compete.
+    clutter = clutter_log_density(scan, scene, settings)
+    circles = fit_circles(scan, selected, selection, clutter, scene, settings)
+    selection = with_circles(selection, circles.score, settings)
 
     # Planes in canonical form, and their endpoints.
     is_plane = selection.kind == PLANE
@@ -146,6 +156,8 @@ def detect_in_scan(
     each_segment = jax.vmap(lambda x, involved: segment_endpoints(x[0], x[1], echo_paths.midpoint, involved))
     return Detections(
         kind=jnp.where(selection.evidence > -jnp.inf, selection.kind, -1),
+        circle=circles.circle,
+        circle_covariance=circles.covariance,
         parameters=parameters,
         covariance=covariance,
         probability=selection.probability,
@@ -160,9 +172,11 @@ def _no_detections(packed: PackedEchoes, sigma: Float[Array, ""], settings: Dete
     size, dtype = settings.reflectors, packed.range.dtype
     return Detections(
         kind=jnp.full(size, -1),
+        circle=jnp.zeros((size, 3), dtype),
+        circle_covariance=jnp.zeros((size, 3, 3), dtype),
         parameters=jnp.zeros((size, 2), dtype),
         covariance=jnp.zeros((size, 2, 2), dtype),
-        probability=jnp.zeros((size, 3), dtype),
+        probability=jnp.zeros((size, 4), dtype),
         evidence=jnp.full(size, -jnp.inf, dtype),
         involved=jnp.zeros((size, len(packed.path)), bool),
         segment=jnp.zeros((size, 2, 2), dtype),
@@ -287,8 +301,17 @@ def select_reflectors(
         kind=best // len(usable),
         evidence=jnp.where(evidence > settings.min_evidence, evidence, -jnp.inf),
         involved=involved,
+        log_odds=log_odds,
         probability=jax.nn.softmax(log_odds, axis=1),
     )
+
+
+def with_circles(selection: Selection, score: Float[Array, " reflectors"], settings: DetectionSettings) -> Selection:
+    """Add circles to the competition of the kinds."""
+    log_odds = jnp.concatenate([selection.log_odds, settings.tempering * score[:, None]], axis=1)
+    probability = jax.nn.softmax(log_odds, axis=1)
+    wins = probability.argmax(axis=1) == 3
+    return selection._replace(kind=jnp.where(wins, 3, selection.kind), log_odds=log_odds, probability=probability)
 
 
 def update_scene(

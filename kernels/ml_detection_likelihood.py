@@ -141,6 +141,8 @@ def point_missed_log_likelihood(
     point: Hypotheses,
     scene: SceneEstimate,
     settings: DetectionSettings,
+    strength: Float[Array, ""] | float = -24.0,
+    strength_sd: Float[Array, ""] | float = 8.0,
 ) -> Float[Array, ""]:
     """Log likelihood of the missed detections of ONE corner (0) or edge (1), at most 0 nats."""
     missed = missed_detections(scan, model, point, scene, settings)
@@ -151,7 +153,10 @@ def point_missed_log_likelihood(
     outside = missed.total(missed.off_axis >= border, missed.echo_off_axis >= border)
     soft = scene.silence_threshold < settings.deaf_threshold
     most = jnp.where(soft, settings.max_occlusion_cost_soft, settings.max_occlusion_cost)
-    return jnp.maximum(inside, -most) + jnp.maximum(outside, -settings.max_faint_edge_cost)
+    # How much fainter than a wall it is.
+    faintness = jnp.clip((border + scene.silence_threshold - strength) / strength_sd, -3.5, 3.5)
+    unlikely = jnp.where(soft & (is_edge > 0), -0.5 * faintness**2, 0)
+    return jnp.maximum(inside, -most) + jnp.maximum(outside, -settings.max_faint_edge_cost) + unlikely
 
 
 def plane_missed_log_likelihood(

@@ -110,7 +110,9 @@ class Selection(NamedTuple):
     """Nats; -inf where no hypothesis has enough."""
     involved: Bool[Array, "reflectors echoes"]
     """Echoes that the reflector explains, of those that were left by the reflectors before it."""
-    probability: Float[Array, "reflectors 3"]
+    log_odds: Float[Array, "reflectors kinds"]
+    """Tempered evidence of the kinds, nats."""
+    probability: Float[Array, "reflectors kinds"]
     """Posterior probabilities of the kinds, given these echoes."""
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar.fileio.atomic_files import open_output
 
-KIND_NAMES = ("plane", "corner", "edge")
+KIND_NAMES = ("plane", "corner", "edge", "circle")
 """Names of the reflector kinds ``kernels.PLANE``, ``kernels.CORNER`` and ``kernels.EDGE``, by their values."""
 
 
