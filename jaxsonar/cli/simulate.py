@@ -36,6 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="soft",
         help="soft: by amplitude, also outside of the cones; hard: only within both cones (default: soft)",
     )
+    parser.add_argument(
+        "--no-crosstalk",
+        action="store_true",
+        help="no echoes of other sensors of the firing group; with hard beams there are none anyway",
+    )
     parser.add_argument("--seed", type=number(int, 0, 2**32 - 1), default=0, help="seed of the noise (default: 0)")
     parser.add_argument(
         "--max-echoes",
@@ -92,6 +97,7 @@ def run(options: argparse.Namespace) -> None:
             clutter=options.clutter,
             seed=options.seed,
             beams=options.beams,
+            crosstalk=False if options.no_crosstalk else None,
             max_echoes=options.max_echoes,
             stamps=stamps,
             progress=lambda done, _: show(done),

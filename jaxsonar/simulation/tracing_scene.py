@@ -155,11 +155,13 @@ class TracingScene:
 
     def audible(self, found: TracedEchoes) -> TracedEchoes:
         """Echoes within the beams with no wall or circle across any leg; the cheapest test comes first."""
-        for side, point in ((0, "first"), (1, "last")):
-            if self.axis is not None:
-                sensor = self.pairs[found.pair, side]
-                leg = getattr(found, point) - self.sensors[found.group, sensor]
-                found = found[in_cone(leg, self.axis[found.group, sensor], self.cos_limit[sensor])]
+        if self.axis is not None:
+            kept = np.arange(len(found))
+            for side, point in ((0, found.first), (1, found.last)):
+                group, sensor = found.group[kept], self.pairs[found.pair[kept], side]
+                leg = point[kept] - self.sensors[group, sensor]
+                kept = kept[in_cone(leg, self.axis[group, sensor], self.cos_limit[sensor])]
+            found = found[kept]
         found = found[self.loud(found)]
         for side, point in ((0, "first"), (1, "last")):
             start = self.sensors[found.group, self.pairs[found.pair, side]]
