@@ -18,13 +18,25 @@ def detect_echoes(
     array: TransducerArray,
     room: Room,
     poses: Float[np.ndarray, "scans 3"],
+    moving: Float[np.ndarray, "scans walkers 3"],
     *,
     acoustics: Acoustics,
     beams: str,
     max_echoes: int,
     blanking: float,
 ) -> EchoColumns:
-    """Echoes that a threshold detector reports in some scans, with exact ranges; arguments as for ``simulate``."""
+    """Echoes that a threshold detector reports in some scans, with exact ranges.
+
+    Args:
+        array: the sensors.
+        room: the reflectors.
+        poses: world_from_robot of the scans.
+        moving: centers x, y and radii of the walkers at each scan, metres.
+        acoustics: as for ``simulate``.
+        beams: as for ``simulate``.
+        max_echoes: as for ``simulate``.
+        blanking: as for ``simulate``.
+    """
     # Trace the echoes of all pairs of sensors, and drop those below the threshold.
     sensors, axis = array.in_world(poses)
     found = trace_echoes(
@@ -35,8 +47,10 @@ def detect_echoes(
         axis=axis,
         half_beam=array.half_beam,
         acoustics=acoustics if beams == "soft" else None,
+        moving=moving,
     )
-    amplitude = amplitudes(found, array.pairs, sensors, axis, array.half_beam, acoustics, room.circles[:, 2])
+    radius = np.append(room.circles[:, 2], moving[0, :, 2])
+    amplitude = amplitudes(found, array.pairs, sensors, axis, array.half_beam, acoustics, radius)
     loud = amplitude >= acoustics.threshold
     found, amplitude = found[loud], amplitude[loud]
     # Both sensors of a pair transmit in turn; each direction has a path of its own.

@@ -3,7 +3,7 @@
 The geometry is exact (``echo_tracing``). Amplitudes determine which echoes a threshold detector reports.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from jaxsonar.simulation.echo_columns import EchoColumns
 from jaxsonar.simulation.echo_detection import BEAMS, detect_echoes
 from jaxsonar.simulation.traced_echoes import EchoKind
 from jaxsonar.simulation.transducer_array import TransducerArray
+from jaxsonar.simulation.walker import Walker, circles_of_walkers
 
 SCAN_PERIOD = 0.1
 """Time between scans without stamps, seconds: about the period of the paper's ring (8 firing groups of 11.7 ms)."""
@@ -41,7 +42,7 @@ class Simulation:
     """Ground truth: type of the reflector or of the false echo, a value of ``EchoKind``."""
     reflector: Int[np.ndarray, " echoes"]
     """Ground truth: wall (the first of two for second order), vertex of ``Room.junctions`` (corner, edge), pole or
-    circle; -1 for clutter."""
+    circle (those of the room, then the walkers); -1 for clutter."""
     reflector_kind: Int[np.ndarray, " echoes"]
     """Ground truth: type of the reflector; as ``kind``, except that crosstalk has the type of its reflector."""
     transmitter: Int[np.ndarray, " echoes"]
@@ -89,6 +90,7 @@ def simulate(
     acoustics: Acoustics | None = None,
     beams: str = "soft",
     crosstalk: bool | None = None,
+    walkers: Sequence[Walker] = (),
     stamps: Float[np.ndarray, " scans"] | None = None,
     progress: Callable[[int, int], None] | None = None,
     chunk: int = 128,
@@ -120,7 +122,9 @@ def simulate(
         crosstalk: whether a receiver also detects echoes of the other transmitters of the firing group
             (``Ring.firing_groups``). They are reported on its path of this group, with half the true path length from
             their transmitter; their kind is ``EchoKind.CROSSTALK``. Default: with soft beams.
-        stamps: (scans,) seconds, not decreasing; 0.1 s apart if omitted. Only the drift depends on them.
+        walkers: walking persons. Each is a circle at its position at the stamp of the scan; their indices as reflectors
+            follow those of the circles of the room. Sensors inside of a person detect nothing.
+        stamps: (scans,) seconds, not decreasing; 0.1 s apart if omitted. Only drift and walkers depend on them.
         progress: called with (scans done, all scans) from time to time.
         chunk: number of scans that are traced at once; does not change the result.
 
@@ -140,6 +144,7 @@ def simulate(
             array,
             room,
             poses[begin : begin + chunk],
+            circles_of_walkers(walkers, times[begin : begin + chunk]),
             acoustics=acoustics,
             beams=beams,
             max_echoes=max_echoes,
