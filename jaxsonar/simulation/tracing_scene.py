@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.segments import crossings, point_to_segments
 from jaxsonar.simulation.acoustics import Acoustics, amplitudes
+from jaxsonar.simulation.beam_bounds import largest_loss, least_wall_losses
 from jaxsonar.simulation.traced_echoes import TracedEchoes
 
 TOLERANCE = 1e-9
@@ -105,6 +106,8 @@ class TracingScene:
     """Half the nominal width of each cone, radians."""
     cos_limit: Float[np.ndarray, " sensors"]
     """Cosine of the largest off-axis angle: the border of the cone (hard beams) or 90 deg (soft beams)."""
+    wall_loss: Float[np.ndarray, "groups walls sensors"] | None
+    """Smallest one-way loss of each beam towards each wall, dB; None for omnidirectional sensors."""
     acoustics: Acoustics | None
     """Soft beams: echoes must reach the threshold of this model; None for hard beams."""
 
@@ -153,8 +156,29 @@ class TracingScene:
             axis=axis,
             half_beam=half_beam,
             cos_limit=np.cos(half_beam) if acoustics is None else np.zeros(len(half_beam)),
+            wall_loss=None if axis is None else least_wall_losses(sensors, axis, walls, half_beam, acoustics),
             acoustics=acoustics,
         )
+
+    def candidates(
+        self, group: Int[np.ndarray, " rows"], first: Int[np.ndarray, " rows"], last: Int[np.ndarray, " rows"]
+    ) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, " found"]]:
+        """(row, pair) that can give an echo over a first and a last wall (equal for one reflection), by the beams.
+
+        Args:
+            group: index of the group of sensors.
+            first: wall that tx must reach.
+            last: wall from which rx must hear.
+        """
+        if self.wall_loss is None:
+            row, pair = np.divmod(np.arange(len(group) * len(self.pairs)), len(self.pairs))
+            return row, pair
+        legs = self.distance[group, first] + self.separation[first, last] + self.distance[group, last]
+        limit = largest_loss(legs / 2 - self.radius[group], self.acoustics)
+        i, j = self.pairs.T
+        loss = self.wall_loss[group, first][:, i] + self.wall_loss[group, last][:, j]
+        row, pair = np.nonzero(loss <= limit[:, None])
+        return row, pair
 
     def audible(self, found: TracedEchoes) -> TracedEchoes:
         """Echoes within the beams with no wall or circle across any leg; the cheapest test comes first."""
