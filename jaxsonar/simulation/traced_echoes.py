@@ -25,6 +25,8 @@ class EchoKind(IntEnum):
     """False echo without any reflector."""
     CIRCLE = 6
     """One reflection at a circle."""
+    CROSSTALK = 7
+    """Echo of another transmitter of the same firing group, from any reflector."""
 
 
 @dataclass(frozen=True, eq=False)
