@@ -12,7 +12,7 @@ from benchmarks.aural.table import markdown, rows
 
 def main() -> None:
     """Print the table."""
-    argparse.ArgumentParser(prog="python -m benchmarks.aural", description=__doc__.splitlines()[0]).parse_args()
+    argparse.ArgumentParser(prog="python -m benchmarks.aural", description=__doc__).parse_args()
     print(markdown(rows()), end="")
 
 

@@ -103,7 +103,7 @@ def _draw(
 
 
 def _draw_kinds(axes: Axes, bounds: RingBounds, value: Callable[[DistanceBounds, str], float]) -> None:
-    for width, (kind, color) in zip((3.0, 2.0, 1.2), _KIND_COLORS.items(), strict=True):  # curves may coincide
+    for width, (kind, color) in zip((2.6, 1.8, 1.1), _KIND_COLORS.items(), strict=True):  # curves may coincide
         for rows in (bounds.shot, bounds.scan):
             _draw(axes, rows, [value(row, kind) for row in rows], color, scan=rows is bounds.scan, width=width)
 
@@ -119,7 +119,7 @@ def _draw_radii(axes: Axes, bounds: RingBounds) -> None:
         axes.axhline(1e3 * radius, color=color, lw=0.8, ls=":")
         handles.append(Line2D([], [], color=color, lw=2, label=f"radius {radius:g} m"))
     handles.append(Line2D([], [], color=ROBOT_COLOR, lw=0.8, ls=":", label="as large as the radius"))
-    axes.legend(handles=handles, fontsize=8)
+    axes.legend(handles=handles, fontsize=8, frameon=True, edgecolor="none", framealpha=0.85)
 
 
 def _draw_errors(axes: Axes, bounds: RingBounds) -> None:
