@@ -49,6 +49,15 @@ class PackedEchoes(NamedTuple):
     echo. None: all are the identity."""
 
 
+class CrosstalkPaths(eqx.Module):
+    """Paths on which the sound of other transmitters of a firing group reaches the receiver of each path."""
+
+    paths: EchoPaths
+    """(paths, transmitters) their geometry."""
+    exists: Bool[Array, "*paths transmitters"]
+    """False for padding."""
+
+
 class RingArcs(eqx.Module):
     """Data that all scans of a ring share: its paths and their arcs, for one set of settings."""
 
@@ -66,16 +75,25 @@ class RingArcs(eqx.Module):
     """Half path length beyond which echoes are ignored, metres."""
     full_wall_paths: Float[Array, ""]
     """Number of paths that receive an echo of a wide wall."""
+    crosstalk: CrosstalkPaths | None = None
+    """Paths from the other transmitters of the same firing group; None if all fire alone."""
 
 
 @partial(jax.jit, static_argnames=("settings", "points"))
-def ring_arcs(sensors: SensorArray, *, settings: HoughSettings, points: int) -> RingArcs:
+def ring_arcs(
+    sensors: SensorArray,
+    *,
+    settings: HoughSettings,
+    points: int,
+    simultaneous: Int[Array, "paths transmitters"] | None = None,
+) -> RingArcs:
     """Equidistant points on the arcs of every path of a ring, and the threshold for its scans.
 
     Args:
         sensors: the ring.
         settings: point pitch, cells and threshold.
         points: number of points on the widest arc (``points_of_widest_arc``).
+        simultaneous: other transmitters that fire at the same time as that of each path; -1 for padding.
     """
     paths = echo_paths(sensors)
     arcs_of_paths = jax.vmap(partial(arcs.arc, pitch=settings.point_pitch, points=points))(paths)
@@ -87,7 +105,15 @@ def ring_arcs(sensors: SensorArray, *, settings: HoughSettings, points: int) -> 
         range_scale=sensors.range_scale,
         max_range=sensors.max_range,
         full_wall_paths=hough_accumulator.full_wall_paths(paths),
+        crosstalk=None if simultaneous is None else _crosstalk_paths(sensors, simultaneous),
     )
+
+
+def _crosstalk_paths(sensors: SensorArray, simultaneous: Int[Array, "paths transmitters"]) -> CrosstalkPaths:
+    rx = jnp.broadcast_to(sensors.rx[:, None], simultaneous.shape)
+    of_all = eqx.tree_at(lambda s: (s.tx, s.rx), sensors, (jnp.maximum(simultaneous, 0).ravel(), rx.ravel()))
+    paths = jax.tree.map(lambda leaf: leaf.reshape(*simultaneous.shape, *leaf.shape[1:]), echo_paths(of_all))
+    return CrosstalkPaths(paths, simultaneous >= 0)
 
 
 def points_of_widest_arc(beam: Float[np.ndarray, " sensors"], settings: HoughSettings) -> int:

@@ -26,7 +26,7 @@ from .detection_cones import SETTINGS as CONES
 from .detection_cones import echo_level, visibility
 from .hough_accumulator import HoughSettings
 from .hough_voting import PackedEchoes, RingArcs, map_scans, tangent_lines
-from .measurement_model import PLANE, plane_echo, point_echo
+from .measurement_model import CORNER, PLANE, plane_echo, point_echo
 from .ml_detection_circles import fit_circles
 from .ml_detection_likelihood import (
     alignment_ratio,
@@ -40,7 +40,7 @@ from .ml_detection_likelihood import (
 from .ml_detection_settings import DetectionSettings
 from .ml_detection_state import Hypotheses, ScanData, SceneEstimate, Selection, count, determinant
 from .planar_geometry import fold_line, segment_endpoints, wrap_angle
-from .robust_fit import edge_from_midpoint, fit_reflector, paths_and_ranges, plane_from_both_sides, start_of_point
+from .robust_fit import crosstalk_of_echoes, edge_from_midpoint, fit_reflector, paths_and_ranges, plane_from_both_sides, start_of_point
 from .sensor_array import EchoPaths, transform_path
 
 _IS_EDGE = (0.0, 1.0)  # corner, edge
@@ -126,7 +126,17 @@ def detect_in_scan(
     # Passes over the whole scan: evaluate all hypotheses, select the best ones, update the estimate of the scene.
     paths = ring.paths if packed.path_pose is None else jax.vmap(transform_path)(ring.paths, packed.path_pose)
     paths, own_paths = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (paths, echo_paths))
-    scan = ScanData(paths, own_paths, packed.path, ranges, ranges > 0, ring.max_range, full_wall_paths, packed.measured)
+    scan = ScanData(
+        paths=paths,
+        echo_paths=own_paths,
+        path_index=packed.path,
+        ranges=ranges,
+        valid=ranges > 0,
+        max_range=ring.max_range,
+        full_wall_paths=full_wall_paths,
+        measured=packed.measured,
+        crosstalk=crosstalk_of_echoes(ring, packed),
+    )
 
     def one_pass(state: tuple[SceneEstimate, Float[Array, "3 k 2"]], _: None):
         scene, parameters = state
@@ -364,7 +374,8 @@ def update_scene(
     estimate = jnp.sqrt((prior_squares + squares) / (settings.sigma_weight + degrees_of_freedom))
 
     # Fraction of the walls that are parallel or perpendicular to another one: posterior of each wall, averaged.
-    walls = scene._replace(walls=selected.parameters, covariance=covariance, is_wall=wall)
+    corner = (selection.kind == CORNER) & (selection.evidence > -jnp.inf)
+    walls = scene._replace(walls=selected.parameters, covariance=covariance, is_wall=wall, is_corner=corner)
     ratio = jax.vmap(lambda line, c: alignment_ratio(line, c[1, 1], walls, settings))(selected.parameters, covariance)
     aligned = scene.aligned_fraction * ratio / (1 - scene.aligned_fraction + scene.aligned_fraction * ratio)
     aligned_walls = jnp.where(wall, aligned, 0).sum() + settings.aligned_weight * settings.aligned_fraction

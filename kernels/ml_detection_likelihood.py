@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .detection_cones import audibility, echo_level
-from .measurement_model import plane_echo, second_order_echo
+from .measurement_model import CORNER, PLANE, corner_echo, echo_of_kind, plane_echo, second_order_echo
 from .ml_detection_settings import DetectionSettings
 from .ml_detection_state import Hypotheses, Model, ScanData, SceneEstimate, count, log_normal, regularized_inverse
 from .planar_geometry import normal, tangent, wrap_angle
@@ -22,7 +22,37 @@ from .sensor_array import EchoPaths
 
 def clutter_log_density(scan: ScanData, scene: SceneEstimate, settings: DetectionSettings) -> Float[Array, " echoes"]:
     """Log density of clutter at each echo's range, 1/m: unexplained echoes and those that two walls reflect."""
-    return jnp.log(settings.clutter_density + _second_order_density(scan, scene, settings))
+    structured = jnp.maximum(_second_order_density(scan, scene, settings), _crosstalk_density(scan, scene, settings))
+    return jnp.log(settings.clutter_density + structured)
+
+
+def _crosstalk_density(scan: ScanData, scene: SceneEstimate, settings: DetectionSettings) -> Float[Array, " echoes"]:
+    """Density of the echoes of known walls and corners that come from another transmitter of the firing group, 1/m."""
+    if scan.crosstalk is None:
+        return jnp.zeros_like(scan.ranges)
+
+    def one(
+        parameters: Float[Array, "2"],
+        is_corner: Bool[Array, ""],
+        path: EchoPaths,
+        exists: Bool[Array, ""],
+        measured: Float[Array, ""],
+    ) -> Float[Array, ""]:
+        echo = echo_of_kind(
+            jnp.where(is_corner, CORNER, PLANE), plane_echo(parameters, path), corner_echo(parameters, path)
+        )
+        sd = 2 * scene.sigma + settings.second_order_sd
+        heard = audibility(echo, path, scene.threshold) * jnp.exp(log_normal(measured - echo.range, sd))
+        return jnp.where(exists, heard, 0)
+
+    each_echo = jax.vmap(one, in_axes=(None, None, -1, -1, -1))
+    each_transmitter = jax.vmap(each_echo, in_axes=(None, None, -2, -2, None))
+    each_reflector = jax.vmap(each_transmitter, in_axes=(0, 0, None, None, None))
+    paths, exists = scan.crosstalk.paths, scan.crosstalk.exists
+    density = each_reflector(scene.walls, scene.is_corner, paths, exists, scan.ranges)
+    known = (scene.is_wall | scene.is_corner)[:, None, None]
+    density = scene.detection_probability * jnp.where(known, density, 0).max(axis=(0, 1))
+    return jnp.where(scan.valid, density, 0)
 
 
 def _second_order_density(scan: ScanData, scene: SceneEstimate, settings: DetectionSettings) -> Float[Array, " echoes"]:

@@ -141,7 +141,7 @@ class DetectionSettings:
     crossing_penalty: float = 2.0
     """Cost of a wall whose foot is on the line of another wall, nats: it is probably a corner."""
 
-    expected_circles: float = 0.1
+    expected_circles: float = 0.02
     circle_starts: tuple[float, float, float] = (0.4, 0.6, 0.8)
     circle_shape: tuple[float, float] = (0.75, 0.2)
     circle_bounds: tuple[float, float] = (0.02, 0.98)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .hough_voting import CrosstalkPaths
 from .measurement_model import PredictedEcho
 from .ml_detection_settings import DetectionSettings
 from .sensor_array import EchoPaths
@@ -35,6 +36,8 @@ class ScanData(NamedTuple):
     """Number of measured paths that receive an echo of a wide wall."""
     measured: Bool[Array, " paths"] | None
     """Which of the paths were measured; None: all. The others are evidence neither for nor against a reflector."""
+    crosstalk: CrosstalkPaths | None = None
+    """Paths from other transmitters to the receiver of each echo, the axis of the echoes last."""
 
 
 class SceneEstimate(NamedTuple):
@@ -46,6 +49,8 @@ class SceneEstimate(NamedTuple):
     """Of rho and theta."""
     is_wall: Bool[Array, " reflectors"]
     """Which of the rows are walls."""
+    is_corner: Bool[Array, " reflectors"]
+    """Which of the rows are corners; ``walls`` holds their x, y."""
     detection_probability: Float[Array, ""]
     """Probability that an echo inside both cones is received."""
     aligned_fraction: Float[Array, ""]
@@ -65,6 +70,7 @@ class SceneEstimate(NamedTuple):
             walls=jnp.zeros((size, 2)),
             covariance=jnp.zeros((size, 2, 2)),
             is_wall=jnp.zeros(size, bool),
+            is_corner=jnp.zeros(size, bool),
             detection_probability=jnp.asarray(settings.detection_probability, sigma.dtype),
             aligned_fraction=jnp.asarray(settings.aligned_fraction, sigma.dtype),
             sigma=sigma,

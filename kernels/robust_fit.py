@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .hough_voting import PackedEchoes, RingArcs
+from .hough_voting import CrosstalkPaths, PackedEchoes, RingArcs
 from .measurement_model import corner_echo, corrected_range, edge_echo, image_source, plane_coordinates
 from .planar_geometry import dot, fold_line, length_and_direction, normal, tangent
 from .sensor_array import EchoPaths, transform_path
@@ -87,6 +87,17 @@ def paths_and_ranges(ring: RingArcs, echoes: PackedEchoes) -> tuple[EchoPaths, F
     if echoes.pose is not None:
         paths = jax.vmap(transform_path)(paths, echoes.pose)
     return paths, jnp.where((ranges > 0) & (ranges < ring.max_range), ranges, 0)
+
+
+def crosstalk_of_echoes(ring: RingArcs, echoes: PackedEchoes) -> CrosstalkPaths | None:
+    """Paths of other transmitters to the receiver of every echo of ONE scan: axes (transmitters, echoes) last."""
+    if ring.crosstalk is None:
+        return None
+    found = jax.tree.map(lambda leaf: leaf[echoes.path], ring.crosstalk)
+    if echoes.pose is not None:
+        moved = jax.vmap(jax.vmap(transform_path, in_axes=(0, None)))(found.paths, echoes.pose)
+        found = eqx.tree_at(lambda f: f.paths, found, moved)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, (0, 1), (-1, -2)), found)
 
 
 def fit_reflector(

@@ -42,7 +42,31 @@ def arc_tables(ring: Ring, settings: kernels.HoughSettings) -> ArcTables:
     key = ("arc_tables", settings)
     if key not in ring.cache:
         points = kernels.points_of_widest_arc(np.asarray(ring.beam), settings)
-        arcs = kernels.ring_arcs(ring.sensors, settings=settings, points=points)
+        arcs = kernels.ring_arcs(
+            ring.sensors, settings=settings, points=points, simultaneous=simultaneous_transmitters(ring)
+        )
         pieces = -(-np.asarray(arcs.arcs.exists).sum(axis=1) // kernels.PIECE_POINTS)
         ring.cache[key] = ArcTables(arcs, pieces)
     return ring.cache[key]
+
+
+def simultaneous_transmitters(ring: Ring, *, most: int = 2) -> Int[np.ndarray, "paths transmitters"] | None:
+    """Other sensors of the firing group of each path's transmitter, those nearest to its receiver first.
+
+    Args:
+        ring: the sensors.
+        most: number of them; -1 where a group has fewer.
+
+    Returns:
+        None if every sensor fires alone.
+    """
+    group, (tx, rx) = ring.firing_group_of_sensor, ring.paths.T
+    together = group[tx][:, None] == group
+    together[np.arange(len(tx)), tx] = False
+    most = min(most, int(together.sum(axis=1).max(initial=0)))
+    if not most:
+        return None
+    position = np.asarray(ring.position)
+    distance = np.linalg.norm(position[rx][:, None] - position, axis=-1)
+    nearest = np.argsort(np.where(together, distance, np.inf), axis=1, kind="stable")[:, :most]
+    return np.where(np.take_along_axis(together, nearest, axis=1), nearest, -1).astype(np.int32)
