@@ -102,6 +102,7 @@ def run(options: argparse.Namespace) -> None:
     walkers = [load_walker(*source) for source in sources]
     for (file, _), walker in zip(sources, walkers, strict=True):
         _warn_of_walker(messages, file, walker, ring, poses, stamps)
+    _warn_of_columns(messages, room.circles, ring, poses)
     messages.warn_of_noise(options.sigma, drift=options.drift, clutter=options.clutter)
     messages.check()
     with progress_bar("scans", len(poses)) as show:
@@ -158,6 +159,21 @@ def _walker_source(text: str) -> tuple[str, float]:
         raise SonarError(f"{came}; allowed is CSV or CSV:RADIUS, the radius a number of metres") from None
 
 
+def _warn_of_columns(messages: InputMessages, circles: "np.ndarray", ring: "Ring", poses: "np.ndarray") -> None:
+    """Warn of circles of the room (x, y, radius) that overlap the robot; those in another unit have a warning."""
+    import numpy as np
+
+    from jaxsonar.plausibility.implausible_room import ROOM_SETTINGS
+
+    reach = float(np.linalg.norm(np.asarray(ring.position), axis=-1).max())
+    for x, y, radius in circles.tolist():
+        inside = np.flatnonzero(np.hypot(*(poses[:, :2] - (x, y)).T) < radius + reach)
+        if len(inside) and radius <= ROOM_SETTINGS.column:
+            found = f"the robot overlaps the circle at ({x:g}, {y:g}) in {len(inside)} of {len(poses)} scans"
+            cause = "sensors inside of it detect nothing; room and path are probably not in one frame"
+            messages.warn(f"{found}, first in scan {inside[0]}; {cause}; give both in one frame")
+
+
 def _warn_of_walker(
     messages: InputMessages, file: str, walker: "Walker", ring: "Ring", poses: "np.ndarray", stamps: "np.ndarray"
 ) -> None:
@@ -171,7 +187,7 @@ def _warn_of_walker(
     reach = float(np.linalg.norm(np.asarray(ring.position), axis=-1).max())
     inside = np.flatnonzero(distance < reach)
     if len(inside):
-        found = f"the robot is inside of the person in {len(inside)} of {len(poses)} scans, first in scan {inside[0]}"
+        found = f"the robot overlaps the person in {len(inside)} of {len(poses)} scans, first in scan {inside[0]}"
         messages.warn(f"{shown(file)}: {found}; sensors inside of a person detect nothing")
     elif distance.min() > reach + ring.max_range:
         found = f"the person stays {distance.min():g} m or more from the robot, out of range"

@@ -5,9 +5,8 @@ from jaxtyping import Float
 
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.simulation.acoustics import Acoustics, amplitudes, unblanked
-from jaxsonar.simulation.echo_columns import EchoColumns
 from jaxsonar.simulation.echo_tracing import trace_echoes
-from jaxsonar.simulation.traced_echoes import EchoKind
+from jaxsonar.simulation.traced_echoes import EchoColumns, EchoKind
 from jaxsonar.simulation.transducer_array import TransducerArray
 
 BEAMS = ("soft", "hard")

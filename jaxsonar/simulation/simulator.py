@@ -14,9 +14,8 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.simulation.acoustics import Acoustics, ranks
-from jaxsonar.simulation.echo_columns import EchoColumns
 from jaxsonar.simulation.echo_detection import BEAMS, detect_echoes
-from jaxsonar.simulation.traced_echoes import EchoKind
+from jaxsonar.simulation.traced_echoes import EchoColumns, EchoKind
 from jaxsonar.simulation.transducer_array import TransducerArray
 from jaxsonar.simulation.walker import Walker, circles_of_walkers
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.simulation.echo_columns import EchoColumns
+from jaxsonar.simulation.traced_echoes import EchoColumns
 
 
 class TransducerArray(NamedTuple):

@@ -198,8 +198,17 @@ def test_a_wrong_person_is_answered_in_one_line(mistake, capsys):
         assert word in shown
 
 
+def test_a_column_in_the_way_of_the_robot_is_a_warning(capsys):
+    save_room(Room(OFFICE.room.walls, circles=np.array([[0.6, 0.0, 0.2], [*BESIDE, 0.2]])), "room.geojson")
+    arguments = ["room.geojson", "--ring", "faw", "--path", DATA / "office-path.csv", "-o", "a.csv"]
+    assert cli.main(["simulate", *map(str, arguments)]) == 0
+    warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning")]
+    assert len(warnings) == 1
+    assert "the robot overlaps the circle at (0.6, 0) in" in warnings[0]
+
+
 PROBABLE = {
-    "inside": ([[0.1, 0.0], [0.1, 0.0]], (0.0, 1e4), "the robot is inside of the person in"),
+    "inside": ([[0.1, 0.0], [0.1, 0.0]], (0.0, 1e4), "the robot overlaps the person in"),
     "millimetres": ([[800.0, 0.0], [900.0, 0.0]], (0.0, 1e4), "out of range; give positions in metres"),
     "clock": ([BESIDE, BESIDE], (1.7e9, 1.7e9 + 9), "give stamps of the same clock"),
 }

@@ -196,7 +196,7 @@ GOOD = feature("LineString", [[0, 0], [1, 0]])
         (feature("Point", "here", kind="pole"), "here"),
         (feature("Circle", [0, 0]), "Circle"),
         (feature("MultiPoint", [[0, 0]]), "MultiPoint"),
-        (feature("Point", [0, 0], kind="circle"), "circle of radius None"),
+        (feature("Point", [0, 0], kind="circle"), "circle without radius"),
         (feature("Point", [0, 0], kind="circle", radius=0), "circle of radius 0"),
         (feature("Point", [0, 0], kind="pole", radius=0.1), "radius of a pole"),
         (feature("LineString", [[0, 0], [0, 1]], radius=0.1), "radius of a LineString"),

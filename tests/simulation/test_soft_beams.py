@@ -91,7 +91,7 @@ def assert_same_echoes(mine, other):
 @pytest.mark.parametrize("threshold", [0.0, 0.02, 0.2])
 def test_an_echo_is_reported_if_and_only_if_it_is_loud(threshold):
     room, poses = some_room(1)
-    settings = UNLIMITED | {"acoustics": Acoustics(threshold=threshold), "crosstalk": False}
+    settings: dict[str, Any] = UNLIMITED | {"acoustics": Acoustics(threshold=threshold), "crosstalk": False}
     heard = simulate(SMALL, room, poses, **settings)
     expected = loud_echoes(SMALL, room, poses, threshold, [(*pair, k) for k, pair in enumerate(SMALL.paths)])
     assert_same_echoes(table_of(heard), expected)
@@ -114,7 +114,7 @@ def pairs_of_crosstalk(ring):
 def test_crosstalk_is_what_a_receiver_hears_of_other_transmitters_of_the_group(count, beam):
     ring = Ring.circular(count=count, neighbors=1, beam=beam)
     room, poses = some_room(2)
-    settings = UNLIMITED | {"acoustics": Acoustics(threshold=0.005)}
+    settings: dict[str, Any] = UNLIMITED | {"acoustics": Acoustics(threshold=0.005)}
     heard = simulate(ring, room, poses, **settings)
     crosstalk = heard.kind == EchoKind.CROSSTALK
     directed = pairs_of_crosstalk(ring)

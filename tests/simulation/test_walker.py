@@ -1,6 +1,7 @@
 """Walking persons: circles that move from scan to scan, and their files."""
 
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from support.rooms import some_poses
 
 from jaxsonar import Ring, Room, random_room, simulate
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.hardware.messages import Group
 from jaxsonar.simulation.device_messages import room_messages
 from jaxsonar.simulation.traced_echoes import EchoKind
 from jaxsonar.simulation.walker import Walker, distances_to_robot, load_walker
@@ -30,7 +32,7 @@ def test_a_walker_at_rest_is_a_circle_of_the_room(rng):
     room = random_room(rng, box=1.0, segment=1.0, pole=1.0, columns=1.0)
     poses = some_poses(rng, room, 20)
     x, y = poses[0, :2] + [0.6, 0.0]
-    errors = {"sigma": 0.002, "drift": 0.001, "dropout": 0.1, "clutter": 0.1}
+    errors: dict[str, Any] = {"sigma": 0.002, "drift": 0.001, "dropout": 0.1, "clutter": 0.1}
     more = Room(room.walls, room.wall_names, room.poles, np.concatenate([room.circles, [[x, y, 0.15]]]))
     expected = simulate(RING, more, poses, **errors)
     assert_equal_simulations(simulate(RING, room, poses, walkers=[standing(x, y, 0.15)], **errors), expected)
@@ -46,10 +48,10 @@ def test_the_echo_of_a_walker_follows_it():
     heard = simulate(ring, EMPTY, np.zeros((26, 3)), walkers=[walker], stamps=stamps)
     assert heard.scan.tolist() == list(range(26))
     before, after = (stamps[:, None] < at for at in (1.0, 3.0))
-    share = np.clip(stamps[:, None], 0, 1), np.clip((stamps[:, None] - 1) / 2, 0, 1)
-    first = (1 - share[0]) * [1.0, -0.4] + share[0] * [1.0, 0.0]
-    second = (1 - share[1]) * [1.0, 0.0] + share[1] * [1.6, 0.2]
-    center = np.where(before, first, np.where(after, second, [1.6, 0.2]))
+    early, late = np.clip(stamps[:, None], 0, 1), np.clip((stamps[:, None] - 1) / 2, 0, 1)
+    a, b, c = np.array([[1.0, -0.4], [1.0, 0.0], [1.6, 0.2]])
+    first, second = (1 - early) * a + early * b, (1 - late) * b + late * c
+    center = np.where(before, first, np.where(after, second, c))
     np.testing.assert_allclose(heard.range, np.linalg.norm(center, axis=1) - 0.25, atol=1e-9)
     assert (heard.kind == EchoKind.CIRCLE).all()
     assert (heard.reflector == 0).all()
@@ -72,7 +74,7 @@ def test_the_order_of_chunks_and_walkers_does_not_change_the_echoes(rng):
     room = random_room(rng)
     poses = some_poses(rng, room, 12)
     near = poses[[0, 5], :2] + [0.5, 0.3]
-    walkers = [Walker(np.array([0.0, 1.1]), near), standing(*near.mean(0), 0.1)]
+    walkers = [Walker(np.array([0.0, 1.1]), near), standing(near[:, 0].mean(), near[:, 1].mean(), 0.1)]
     one = simulate(RING, room, poses, walkers=walkers)
     assert_equal_simulations(one, simulate(RING, room, poses, walkers=walkers, chunk=5))
     other = simulate(RING, room, poses, walkers=walkers[::-1])
@@ -91,7 +93,7 @@ def test_a_device_sees_the_walker_when_each_group_fires():
     ring = Ring([(0.0, 0.0), (0.0, 0.0)], [0.0, 0.0], beam=1.0, neighbors=1, max_range=4.0)
     stamps = np.array([1.0, 2.0])
     messages = room_messages(ring, EMPTY, np.zeros((2, 3)), stamps, walkers=[walker])
-    echoes = [(message.time_us * 1e-6, message.echoes) for message in messages if hasattr(message, "echoes")]
+    echoes = [(message.time_us * 1e-6, message.echoes) for message in messages if isinstance(message, Group)]
     assert len(echoes) == 4
     for time, each in echoes:
         expected = walker.position_at(np.array([time]))[0, 0] - 0.2
