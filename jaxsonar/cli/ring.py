@@ -4,6 +4,7 @@ import argparse
 
 from jaxsonar.cli.arguments import RING_HELP, figure_filename, filename, noise
 from jaxsonar.cli.console import print_tables, progress_bar, write_figure, write_json
+from jaxsonar.cli.inputs import InputMessages, add_strict, load_checked_ring
 
 SUMMARY = "Describe a ring, and compute what it can observe."
 
@@ -25,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--figure", type=figure_filename, metavar="FIG", help="with --bounds: draw the bounds, .svg, .png or .pdf"
     )
+    add_strict(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -32,13 +34,16 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.fileio.atomic_files import check_outputs
     from jaxsonar.hardware.errors import SonarError
     from jaxsonar.reports.observability_tables import bounds_table, ring_lines
-    from jaxsonar.sensors.ring_toml import load_ring
 
     for name in ("sigma", "json", "figure"):
         if getattr(options, name) is not None and not options.bounds:
             raise SonarError(f"--{name} came without --bounds; allowed is it with --bounds")
     check_outputs({"--json": options.json, "--figure": options.figure}, [options.ring])
-    ring = load_ring(options.ring)
+    messages = InputMessages(strict=options.strict)
+    ring = load_checked_ring(options.ring, messages)
+    if options.sigma is not None:
+        messages.warn_of_noise(options.sigma)
+    messages.check()
     if options.json != "-":
         print("\n".join(ring_lines(ring)))
     if not options.bounds:

@@ -4,7 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from support.commands import call
+from support.commands import RING, call
 
 from jaxsonar import load_ring
 from jaxsonar.observability import ring_bounds as ring_bounds_module
@@ -50,6 +50,14 @@ def test_the_bounds_are_printed_written_and_drawn(few, tmp_path, capsys):
 def test_json_on_standard_output_is_alone(few, capsys):
     assert call("ring", "corridor8", "--bounds", "--json", "-") == 0
     assert json.loads(capsys.readouterr().out)["sigma"] == 0.001
+
+
+def test_a_ring_that_is_probably_wrong_gets_a_warning(tmp_path, capsys):
+    file = tmp_path / "ring.toml"
+    file.write_text(RING.replace("radius = 0.28", "radius = 28"))
+    assert call("ring", file) == 0
+    assert "warning: " in capsys.readouterr().err
+    assert call("ring", file, "--strict") == 2
 
 
 @pytest.mark.parametrize(
