@@ -375,7 +375,13 @@ def update_scene(
 
     # Fraction of the walls that are parallel or perpendicular to another one: posterior of each wall, averaged.
     corner = (selection.kind == CORNER) & (selection.evidence > -jnp.inf)
-    walls = scene._replace(walls=selected.parameters, covariance=covariance, is_wall=wall, is_corner=corner)
+    walls = scene._replace(
+        walls=selected.parameters,
+        covariance=covariance,
+        is_wall=wall,
+        extent=jnp.stack([low, high], axis=-1),
+        is_corner=corner,
+    )
     ratio = jax.vmap(lambda line, c: alignment_ratio(line, c[1, 1], walls, settings))(selected.parameters, covariance)
     aligned = scene.aligned_fraction * ratio / (1 - scene.aligned_fraction + scene.aligned_fraction * ratio)
     aligned_walls = jnp.where(wall, aligned, 0).sum() + settings.aligned_weight * settings.aligned_fraction

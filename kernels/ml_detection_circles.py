@@ -131,6 +131,7 @@ def _fit_circle(
     prior = jnp.log(density) + log_normal(x[2] - mean, jnp.asarray(sd, x.dtype))
     volume = 1.5 * jnp.log(2 * jnp.pi) + 0.5 * jnp.log(_determinant(covariance))
     score = gain + settings.missed_weight_point * missed + settings.prior_weight * prior + volume
+    score -= jnp.where(scene.silence_threshold < settings.deaf_threshold, 0, settings.circle_handicap)
     enough = supported.sum() >= settings.min_circle_echoes
 
     # Center and radius instead of rho, theta, q.

@@ -222,7 +222,25 @@ def plane_log_prior(
     crossing = (scene.is_wall & (jnp.abs(distance) < settings.crossing_distance) & _oblique(turn, settings)).any()
     alignment = alignment_ratio(plane.parameters, plane.covariance[1, 1], scene, settings)
     direction = jnp.log(1 - scene.aligned_fraction + scene.aligned_fraction * alignment)
-    return density + (direction - jnp.where(crossing, settings.crossing_penalty, 0))
+    # Sound does not pass through walls: the outermost points of reflection must not be behind another one.
+    own = plane.log_ratio > 0
+    ends = jnp.stack([jnp.where(own, plane.footpoint, jnp.inf).min(), jnp.where(own, plane.footpoint, -jnp.inf).max()])
+    ends = jnp.where(own.any(), ends, 0)
+    points = (rho * normal(theta))[None] + ends[:, None] * tangent(theta)[None]
+    occluded = (is_behind(points[0], scene, settings) & is_behind(points[1], scene, settings)).any()
+    penalty = jnp.where(crossing, settings.crossing_penalty, 0) + jnp.where(occluded, settings.occluded_penalty, 0)
+    return density + (direction - penalty)
+
+
+def is_behind(point: Float[Array, "2"], scene: SceneEstimate, settings: DetectionSettings) -> Bool[Array, " walls"]:
+    """Known walls that the line from the origin to ONE point crosses between their outermost echoes."""
+    n, t = normal(scene.walls[:, 1]), tangent(scene.walls[:, 1])
+    depth, along = n @ point, t @ point
+    behind = depth > scene.walls[:, 0] + settings.same_wall_rho
+    crossing = along * scene.walls[:, 0] / jnp.where(behind, depth, 1)
+    margin = settings.occlusion_margin
+    between = (crossing > scene.extent[:, 0] - margin) & (crossing < scene.extent[:, 1] + margin)
+    return scene.is_wall & behind & between
 
 
 def alignment_ratio(
@@ -282,7 +300,8 @@ def point_log_prior(
         + settings.corner_fraction_one_wall * on_any_wall
         + settings.corner_fraction_two_walls * on_two_walls
     )
-    return jnp.log(jnp.where(is_edge > 0, edges, settings.expected_corners * corners))
+    penalty = jnp.where(is_behind(place, scene, settings).any(), settings.occluded_penalty, 0)
+    return jnp.log(jnp.where(is_edge > 0, edges, settings.expected_corners * corners)) - penalty
 
 
 def _oblique(turn: Float[Array, "*any"], settings: DetectionSettings) -> Bool[Array, "*any"]:

@@ -49,7 +49,7 @@ class DetectionSettings:
 
     # Noise, clutter and missed detections
 
-    initial_sigma: float = 0.006
+    initial_sigma: float = 0.003
     """First guess of the standard deviation of the ranges where it is estimated, metres."""
     sigma_weight: float = 6.0
     """Weight of the previous pass's sigma in the new estimate, in echoes."""
@@ -142,6 +142,9 @@ class DetectionSettings:
     """Cost of a wall whose foot is on the line of another wall, nats: it is probably a corner."""
 
     expected_circles: float = 0.02
+    circle_handicap: float = 12.0
+    occluded_penalty: float = 8.0
+    occlusion_margin: float = 0.03
     circle_starts: tuple[float, float, float] = (0.4, 0.6, 0.8)
     circle_shape: tuple[float, float] = (0.75, 0.2)
     circle_bounds: tuple[float, float] = (0.02, 0.98)

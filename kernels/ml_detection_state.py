@@ -49,6 +49,8 @@ class SceneEstimate(NamedTuple):
     """Of rho and theta."""
     is_wall: Bool[Array, " reflectors"]
     """Which of the rows are walls."""
+    extent: Float[Array, "reflectors 2"]
+    """Outermost footpoints of the echoes of each wall: coordinates along it, metres from the foot of the origin."""
     is_corner: Bool[Array, " reflectors"]
     """Which of the rows are corners; ``walls`` holds their x, y."""
     detection_probability: Float[Array, ""]
@@ -70,6 +72,7 @@ class SceneEstimate(NamedTuple):
             walls=jnp.zeros((size, 2)),
             covariance=jnp.zeros((size, 2, 2)),
             is_wall=jnp.zeros(size, bool),
+            extent=jnp.zeros((size, 2)),
             is_corner=jnp.zeros(size, bool),
             detection_probability=jnp.asarray(settings.detection_probability, sigma.dtype),
             aligned_fraction=jnp.asarray(settings.aligned_fraction, sigma.dtype),

@@ -68,7 +68,8 @@ def ml_detections(
         rows = slice(0, len(batch.scans))  # without padding
         found = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], found)
         # A kind is decided if its posterior probability suffices and its parameters are those that were fitted.
-        decided = (found.kind >= 0) & (found.probability.max(axis=-1) >= SETTINGS.min_probability)
+        least = np.where(found.kind == kernels.PLANE, SETTINGS.min_wall_probability, SETTINGS.min_probability)
+        decided = (found.kind >= 0) & (found.probability.max(axis=-1) >= least)
         decided &= found.probability.argmax(axis=-1) == found.kind
         # Direct echoes alone cannot distinguish a corner from an edge; only the prior would decide.
         cross = (found.involved & (ring.paths[batch.path, 0] != ring.paths[batch.path, 1])[rows, None]).any(axis=-1)
