@@ -25,7 +25,6 @@ class VisibilitySettings:
     """Metres that a wall of a map may extend beyond its endpoints, which are the outermost observed footpoints; chosen
     by hand."""
 
-
     beam_edge_db: float = 6.0
     """One-way loss at the border of a cone, dB; Gaussian in the off-axis angle. Data sheets define the beam angle by
     6 dB."""

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .hough_voting import CrosstalkPaths
-from .measurement_model import PredictedEcho
-from .ml_detection_settings import DetectionSettings
-from .sensor_array import EchoPaths
+from ..hough_voting import CrosstalkPaths
+from ..measurement_model import PredictedEcho
+from ..sensor_array import EchoPaths
+from .settings import DetectionSettings
 
 Model = Callable[[Float[Array, "2"], EchoPaths], PredictedEcho]
 """The measurement model of one kind of reflector."""
@@ -119,10 +119,8 @@ class Selection(NamedTuple):
     """Nats; -inf where no hypothesis has enough."""
     involved: Bool[Array, "reflectors echoes"]
     """Echoes that the reflector explains, of those that were left by the reflectors before it."""
-    log_odds: Float[Array, "reflectors kinds"]
-    """Tempered evidence of the kinds, nats."""
-    probability: Float[Array, "reflectors kinds"]
-    """Posterior probabilities of the kinds, given these echoes."""
+    log_odds: Float[Array, "reflectors 3"]
+    """Tempered evidence for plane, corner and edge, given these echoes, nats."""
 
 
 def log_normal(x: Float[Array, "*any"], sigma: Float[Array, "*#any"]) -> Float[Array, "*any"]:
