@@ -30,6 +30,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--clutter", type=finite(0, 100), default=0.0, metavar="P", help="false echoes per real echo (default: 0)"
     )
+    parser.add_argument(
+        "--beams",
+        choices=("soft", "hard"),
+        default="soft",
+        help="soft: by amplitude, also outside of the cones; hard: only within both cones (default: soft)",
+    )
     parser.add_argument("--seed", type=number(int, 0, 2**32 - 1), default=0, help="seed of the noise (default: 0)")
     parser.add_argument(
         "--max-echoes",
@@ -85,6 +91,7 @@ def run(options: argparse.Namespace) -> None:
             dropout=options.dropout,
             clutter=options.clutter,
             seed=options.seed,
+            beams=options.beams,
             max_echoes=options.max_echoes,
             stamps=stamps,
             progress=lambda done, _: show(done),

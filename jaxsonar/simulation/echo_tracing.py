@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.floor_plans.room import Room
+from jaxsonar.simulation.acoustics import Acoustics
 from jaxsonar.simulation.circle_echoes import trace_circles
 from jaxsonar.simulation.image_sources import trace_corners, trace_planes, trace_second_order
 from jaxsonar.simulation.point_scatterers import trace_edges, trace_poles
@@ -24,6 +25,7 @@ def trace_echoes(
     max_range: float = np.inf,
     axis: Float[np.ndarray, "groups sensors 2"] | None = None,
     half_beam: Float[np.ndarray, " sensors"] | None = None,
+    acoustics: Acoustics | None = None,
 ) -> TracedEchoes:
     """All echoes between pairs of sensors, for many poses of one array at once.
 
@@ -36,7 +38,9 @@ def trace_echoes(
     - Circle: one reflection at its outside, where the path over it is shortest.
 
     No leg intersects a wall or a circle; poles do not occlude. With ``axis`` and ``half_beam`` the sound must leave tx
-    and reach rx within their cones, in its exact directions (no far-field approximation).
+    and reach rx within their cones, in its exact directions (no far-field approximation). With ``acoustics`` the beams
+    are soft: the cones do not limit the directions, but the amplitude must reach the threshold, and both directions lie
+    in front of the sensors (at most 90 deg off their axes).
 
     Args:
         room: the reflectors.
@@ -45,8 +49,9 @@ def trace_echoes(
         max_range: largest half path length, metres.
         axis: (groups, sensors, 2) unit vectors of the sensor axes, world frame; requires half_beam.
         half_beam: (sensors,) half the width of each cone, radians.
+        acoustics: amplitudes and threshold for soft beams; requires axis and half_beam.
     """
-    scene = TracingScene.of(room, sensors, pairs, max_range, axis, half_beam)
+    scene = TracingScene.of(room, sensors, pairs, max_range, axis, half_beam, acoustics)
     junctions = room.junctions
     found = TracedEchoes.concatenate(
         [

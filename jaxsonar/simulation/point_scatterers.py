@@ -52,10 +52,16 @@ def _trace_points(
     distance = np.linalg.norm(leg, axis=-1)
     visible = (distance > TOLERANCE) & visibility(point, leg)
     if scene.axis is not None:
-        visible &= in_cone(leg, scene.axis[g], scene.cos_half_beam)
-    row, sensor = np.nonzero(visible)
-    visible[row, sensor] = ~scene.block(scene.sensors[g[row], sensor], points[point[row]])
+        visible &= in_cone(leg, scene.axis[g], scene.cos_limit)
     length = distance[:, i] + distance[:, j]
     row, pair = np.nonzero(visible[:, i] & visible[:, j] & (length <= 2 * scene.max_range))
     at = points[point[row]]
-    return TracedEchoes.of_kind(kind, g[row], pair, point[row], length[row, pair], at, at)
+    found = TracedEchoes.of_kind(kind, g[row], pair, point[row], length[row, pair], at, at)
+    loud = scene.loud(found)
+    found, row, pair = found[loud], row[loud], pair[loud]
+    # Occlusion is tested once for each leg and not for each echo.
+    needed = np.zeros_like(visible)
+    needed[row, i[pair]] = needed[row, j[pair]] = True
+    at_row, sensor = np.nonzero(needed)
+    needed[at_row, sensor] = ~scene.block(scene.sensors[g[at_row], sensor], points[point[at_row]])
+    return found[needed[row, i[pair]] & needed[row, j[pair]]]

@@ -1,11 +1,11 @@
 """Simulator: the echoes of a ring in a room, each with the reflector that caused it, and measurement errors.
 
-The geometry is exact (``echo_tracing``). Amplitudes only determine which echoes a threshold detector reports.
+The geometry is exact (``echo_tracing``). Amplitudes determine which echoes a threshold detector reports.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,6 +22,8 @@ from jaxsonar.simulation.traced_echoes import EchoKind
 
 SCAN_PERIOD = 0.1
 """Time between scans without stamps, seconds: about the period of the paper's ring (8 firing groups of 11.7 ms)."""
+Beams = Literal["soft", "hard"]
+"""Models of the beams; see ``simulate``."""
 MIN_CLUTTER_RANGE = 0.1
 """Smallest range of false echoes, metres; chosen by hand."""
 
@@ -83,6 +85,7 @@ def simulate(
     max_echoes: int = 3,
     blanking: float = 0.03,
     acoustics: Acoustics | None = None,
+    beams: Beams = "soft",
     stamps: Float[np.ndarray, " scans"] | None = None,
     progress: Callable[[int, int], None] | None = None,
     chunk: int = 128,
@@ -109,6 +112,8 @@ def simulate(
         blanking: an echo that is less than this behind the previous reported one is not detected (half path length,
             metres).
         acoustics: amplitudes and detection threshold; ``Acoustics()`` if omitted.
+        beams: "soft": a path detects every echo whose amplitude reaches the threshold, also outside of the nominal
+            cones, up to 90 deg off the axes. "hard": only echoes within both cones.
         stamps: (scans,) seconds, not decreasing; 0.1 s apart if omitted. Only the drift depends on them.
         progress: called with (scans done, all scans) from time to time.
         chunk: number of scans that are traced at once; does not change the result.
@@ -118,12 +123,14 @@ def simulate(
     """
     acoustics = Acoustics() if acoustics is None else acoustics
     times = np.arange(len(poses)) * SCAN_PERIOD if stamps is None else np.array(stamps, dtype=np.float64)
+    if beams not in get_args(Beams):
+        raise SonarError(f"simulate: beams {beams!r}; allowed is {' or '.join(get_args(Beams))}")
     _check(poses, times, sigma, drift, drift_time, dropout, clutter, seed, max_echoes, blanking, chunk)
     # Trace the echoes and detect those above the threshold.
     array = _TransducerArray.of(ring)
     parts = [_Echoes.empty()]
     for begin in range(0, len(poses), chunk):
-        detected = _detect(array, room, poses[begin : begin + chunk], acoustics, max_echoes, blanking)
+        detected = _detect(array, room, poses[begin : begin + chunk], acoustics, beams, max_echoes, blanking)
         parts.append(_both_directions(array, detected._replace(scan=detected.scan + begin)))
         if progress is not None:
             progress(min(begin + chunk, len(poses)), len(poses))
@@ -225,6 +232,7 @@ def _detect(
     room: Room,
     poses: Float[np.ndarray, "scans 3"],
     acoustics: Acoustics,
+    beams: Beams,
     max_echoes: int,
     blanking: float,
 ) -> _Echoes:
@@ -234,7 +242,15 @@ def _detect(
     sensors = poses[:, None, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
     heading = poses[:, 2, None] + array.heading
     axis = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    found = trace_echoes(room, sensors, array.pairs, max_range=array.max_range, axis=axis, half_beam=array.half_beam)
+    found = trace_echoes(
+        room,
+        sensors,
+        array.pairs,
+        max_range=array.max_range,
+        axis=axis,
+        half_beam=array.half_beam,
+        acoustics=acoustics if beams == "soft" else None,
+    )
     amplitude = amplitudes(found, array.pairs, sensors, axis, array.half_beam, acoustics, room.circles[:, 2])
     loud = amplitude >= acoustics.threshold
     found, amplitude = found[loud], amplitude[loud]

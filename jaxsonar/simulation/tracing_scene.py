@@ -9,11 +9,14 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.segments import crossings, point_to_segments
+from jaxsonar.simulation.acoustics import Acoustics, amplitudes
 from jaxsonar.simulation.traced_echoes import TracedEchoes
 
 TOLERANCE = 1e-9
 """Rounding error that is allowed when a point lies on a wall or at its end, metres; double precision of coordinates
 of some metres leaves 1e-15."""
+LOUDNESS_MARGIN = 1e-6
+"""Relative rounding error of amplitudes that is allowed before the final test of the threshold."""
 
 
 class WallFrames(NamedTuple):
@@ -98,8 +101,12 @@ class TracingScene:
     """Largest half path length, metres."""
     axis: Float[np.ndarray, "groups sensors 2"] | None
     """Unit vectors of the sensor axes; None for omnidirectional sensors."""
-    cos_half_beam: Float[np.ndarray, " sensors"]
-    """Cosine of half the cone width."""
+    half_beam: Float[np.ndarray, " sensors"]
+    """Half the nominal width of each cone, radians."""
+    cos_limit: Float[np.ndarray, " sensors"]
+    """Cosine of the largest off-axis angle: the border of the cone (hard beams) or 90 deg (soft beams)."""
+    acoustics: Acoustics | None
+    """Soft beams: echoes must reach the threshold of this model; None for hard beams."""
 
     @classmethod
     def of(
@@ -110,6 +117,7 @@ class TracingScene:
         max_range: float,
         axis: Float[np.ndarray, "groups sensors 2"] | None,
         half_beam: Float[np.ndarray, " sensors"] | None,
+        acoustics: Acoustics | None = None,
     ) -> "TracingScene":
         """Prepare a room and groups of sensors in the world frame; arguments as ``echo_tracing.trace_echoes``."""
         corners = np.concatenate([room.walls.reshape(-1, 2), room.poles, room.circles[:, :2]])
@@ -125,6 +133,7 @@ class TracingScene:
         ends = point_to_segments(walls.reshape(-1, 2), walls).reshape(len(walls), 2, len(walls)).min(1)
         share_a, share_b = crossings(walls, walls)
         crossed = (share_a >= 0) & (share_a <= 1) & (share_b >= 0) & (share_b <= 1)
+        half_beam = np.full(sensors.shape[1], np.pi) if half_beam is None else half_beam
         return cls(
             origin=origin,
             walls=WallFrames.of(walls),
@@ -139,20 +148,33 @@ class TracingScene:
             baseline2=((sensors[:, pairs[:, 0]] - sensors[:, pairs[:, 1]]) ** 2).sum(-1),
             max_range=max_range,
             axis=axis,
-            cos_half_beam=np.zeros(sensors.shape[1]) if half_beam is None else np.cos(half_beam),
+            half_beam=half_beam,
+            cos_limit=np.cos(half_beam) if acoustics is None else np.zeros(len(half_beam)),
+            acoustics=acoustics,
         )
 
     def audible(self, found: TracedEchoes) -> TracedEchoes:
-        """Echoes that leave and arrive within the cones, with no wall across any leg; the cheapest test comes first."""
+        """Echoes within the beams with no wall or circle across any leg; the cheapest test comes first."""
         for side, point in ((0, "first"), (1, "last")):
             if self.axis is not None:
                 sensor = self.pairs[found.pair, side]
                 leg = getattr(found, point) - self.sensors[found.group, sensor]
-                found = found[in_cone(leg, self.axis[found.group, sensor], self.cos_half_beam[sensor])]
+                found = found[in_cone(leg, self.axis[found.group, sensor], self.cos_limit[sensor])]
+        found = found[self.loud(found)]
         for side, point in ((0, "first"), (1, "last")):
             start = self.sensors[found.group, self.pairs[found.pair, side]]
             found = found[~self.block(start, getattr(found, point))]
         return found[~self.block(found.first, found.last)]
+
+    def loud(self, found: TracedEchoes) -> Bool[np.ndarray, " found"]:
+        """Whether each echo reaches the threshold with soft beams; all do with hard beams and without axes."""
+        if self.axis is None or self.acoustics is None:
+            return np.ones(len(found), dtype=bool)
+        amplitude = amplitudes(
+            found, self.pairs, self.sensors, self.axis, self.half_beam, self.acoustics, self.circles[:, 2]
+        )
+        # The caller decides about echoes at the threshold, in the coordinates of the world.
+        return amplitude >= self.acoustics.threshold * (1 - LOUDNESS_MARGIN)
 
     def block(self, p: Float[np.ndarray, "legs 2"], q: Float[np.ndarray, "legs 2"]) -> Bool[np.ndarray, " legs"]:
         """Legs from p to q that a wall or a circle intersects; one that ends on it is not blocked by it."""
@@ -173,10 +195,10 @@ class TracingScene:
 
 
 def in_cone(
-    leg: Float[np.ndarray, "*batch 2"], axis: Float[np.ndarray, "*batch 2"], cos_half_beam: Float[np.ndarray, "..."]
+    leg: Float[np.ndarray, "*batch 2"], axis: Float[np.ndarray, "*batch 2"], cos_limit: Float[np.ndarray, "..."]
 ) -> Bool[np.ndarray, "*batch"]:
     """Whether the direction of a leg lies within the cone around the axis."""
-    return (leg * axis).sum(-1) >= (cos_half_beam - 1e-12) * np.linalg.norm(leg, axis=-1)
+    return (leg * axis).sum(-1) >= (cos_limit - 1e-12) * np.linalg.norm(leg, axis=-1)
 
 
 def row_slices(rows: int, width: int, cells: int = 1 << 18) -> Iterator[slice]:

@@ -39,17 +39,18 @@ def causes(heard: Simulation):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("beams", ["soft", "hard"])
 @settings(max_examples=8, deadline=None)
 @given(seed=seeds, beam=st.floats(0.2, np.pi), neighbors=st.integers(0, 5))
-def test_a_ring_receives_the_traced_echoes_within_both_cones(seed, beam, neighbors):
+def test_a_ring_receives_the_traced_echoes_within_both_cones_or_half_planes(beams, seed, beam, neighbors):
     rng = np.random.default_rng(seed)
     room = random_room(rng, box=0.7, segment=0.7, pole=0.7)
-    beams = np.append(rng.uniform(0.2, np.pi, 11), beam)
+    widths = np.append(rng.uniform(0.2, np.pi, 11), beam)
     heading = np.sort(rng.uniform(-np.pi, np.pi, 12))
     position = rng.uniform(-0.2, 0.2, (12, 2))
-    ring = Ring(position, heading, beam=beams, neighbors=neighbors, max_range=1.8)
+    ring = Ring(position, heading, beam=widths, neighbors=neighbors, max_range=1.8)
     poses = some_poses(rng, room, 3)
-    heard = simulate(ring, room, poses, **EVERYTHING)
+    heard = simulate(ring, room, poses, beams=beams, **EVERYTHING)
     expected = []
     for scan, (x, y, theta) in enumerate(poses):
         sensors = turned(position, theta, (x, y))
@@ -59,7 +60,10 @@ def test_a_ring_receives_the_traced_echoes_within_both_cones(seed, beam, neighbo
         for sensor, point in ((tx[found.pair], found.first), (rx[found.pair], found.last)):
             leg = point - sensors[sensor]
             off = np.arctan2(leg[:, 1], leg[:, 0]) - theta - heading[sensor]
-            keep &= np.abs((off + np.pi) % (2 * np.pi) - np.pi) <= beams[sensor] / 2 + 1e-9
+            keep &= (
+                np.abs((off + np.pi) % (2 * np.pi) - np.pi)
+                <= (widths[sensor] / 2 if beams == "hard" else np.pi / 2) + 1e-9
+            )
         found = found[keep]
         expected.append(
             np.column_stack([np.full(len(found), scan), found.pair, found.kind, found.reflector, found.length / 2])
