@@ -4,8 +4,8 @@ Modules, in the order of the data:
 
 - ``sensor_array``: sensors -> echo paths (transmitter-receiver pairs). ``isorange_arcs``: the arc of one echo.
 - ``hough_voting``, ``hough_accumulator``: arcs -> tangent lines -> votes -> low pass -> threshold (paper, section 4).
-- ``measurement_model``: the only range model of plane, corner and edge. ``detection_cones``: which echoes are received.
-  ``landmarks``: reflectors of the world.
+- ``measurement_model``: the only range model of plane, corner, edge and circle. ``detection_cones``: which echoes are
+  received. ``landmarks``: reflectors of the world.
 - ``robust_fit``: one reflector fitted to echoes. ``ml_detection`` with ``ml_detection_*``: all reflectors of a scan.
 - ``data_association``, ``iterated_ekf``, ``bundle_adjustment``: echoes and landmarks, poses and ring parameters.
 - ``focus_measure``, ``beam_pattern``: ring parameters without landmarks, and the detection cones of the sensors.
@@ -84,12 +84,17 @@ from .landmarks import Landmarks as Landmarks
 from .landmarks import Reflection as Reflection
 from .landmarks import landmark_in_robot_frame as landmark_in_robot_frame
 from .landmarks import predict_reflection as predict_reflection
+from .measurement_model import CIRCLE as CIRCLE
 from .measurement_model import CORNER as CORNER
 from .measurement_model import EDGE as EDGE
 from .measurement_model import PLANE as PLANE
 from .measurement_model import SECOND_ORDER as SECOND_ORDER
+from .measurement_model import CurvedEcho as CurvedEcho
+from .measurement_model import circle_echo as circle_echo
+from .measurement_model import circle_range as circle_range
 from .measurement_model import corner_range as corner_range
 from .measurement_model import corrected_range as corrected_range
+from .measurement_model import curved_echo as curved_echo
 from .measurement_model import edge_range as edge_range
 from .measurement_model import expected_range as expected_range
 from .measurement_model import plane_range as plane_range

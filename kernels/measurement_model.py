@@ -3,8 +3,9 @@
 This is the only range model of planes, corners and edges in the kernels. ``jaxsonar.sensors.range_models`` is its NumPy
 counterpart for code that cannot be compiled; the simulator has a geometry of its own, so that each checks the other.
 
-A reflector has two parameters: (rho, theta) of a plane, (x, y) of a corner or an edge. Robot frame, metres, radians. A
-range is half the length of the path transmitter -> reflector -> receiver.
+A reflector has two parameters: (rho, theta) of a plane, (x, y) of a corner or an edge. A circle has three: (x, y,
+radius), or (rho, theta, curvature), which is a plane at curvature 0. Robot frame, metres, radians. A range is half the
+length of the path transmitter -> reflector -> receiver.
 """
 
 from typing import NamedTuple
@@ -14,13 +15,27 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .planar_geometry import dot, length, length_and_direction, mirror_point, normal, safe_sqrt, tangent
+from .planar_geometry import (
+    dot,
+    length,
+    length_and_direction,
+    mirror_point,
+    normal,
+    safe_sqrt,
+    tangent,
+    wrap_angle,
+)
 from .sensor_array import EchoPaths
 
 PLANE, CORNER, EDGE = 0, 1, 2
 """Kinds of reflectors: a wall; a right-angled concave corner; an edge or a thin pole."""
 SECOND_ORDER = 3
 """Kind of a reflection only: reflected at one plane, then at another."""
+CIRCLE = 4
+"""Kind of a reflector: a round column, a leg, a person, convex towards the sensors."""
+REFLECTION_STEPS = 6
+"""Steps of Newton's method to the point of reflection on a circle. In 20000 random geometries, sensors at most 0.6 m
+apart needed 3 to reach the rounding error of double precision; sensors up to 3 m apart needed 7 (after 5: 0.1 um)."""
 
 
 class PredictedEcho(eqx.Module):
@@ -38,6 +53,21 @@ class PredictedEcho(eqx.Module):
     """Planes: coordinate of the point of reflection along the tangent, metres from the foot of the origin; else 0."""
     exists: Bool[Array, "*paths"]
     """Whether the path is possible, cones aside; for a plane: both sensors are in front of it."""
+
+
+class CurvedEcho(eqx.Module):
+    """What one path receives of one reflector with three parameters."""
+
+    range: Float[Array, "*paths"]
+    """Half the path length, metres."""
+    d_range_d_landmark: Float[Array, "*paths 3"]
+    """Derivatives of the range with respect to the reflector's three parameters."""
+    departure: Float[Array, "*paths 2"]
+    """Unit vector along which the sound leaves the transmitter."""
+    arrival: Float[Array, "*paths 2"]
+    """Unit vector from the receiver to where the sound comes from."""
+    exists: Bool[Array, "*paths"]
+    """Whether the path is possible, cones aside: the circle is not between the sensors, and both are outside of it."""
 
 
 # Ranges
@@ -103,6 +133,17 @@ def edge_range(
     """Range of the diffraction at an edge or a thin pole, metres: the mean of its distances from tx and rx."""
     offset = edge - midpoint
     return (length(offset + half_baseline) + length(offset - half_baseline)) / 2
+
+
+def circle_range(
+    center: Float[Array, "2"],
+    radius: Float[Array, ""],
+    midpoint: Float[Array, "2"],
+    half_baseline: Float[Array, "2"],
+) -> Float[Array, ""]:
+    """Range of the specular reflection at a circle, metres; radius 0 or more, metres."""
+    tx, rx = midpoint - half_baseline, midpoint + half_baseline
+    return reflection_on_arc(circle_arc(center, radius, midpoint), tx, rx).range
 
 
 def second_order_range(
@@ -227,3 +268,160 @@ def reflector_echo(kind: Int[Array, ""], reflector: Float[Array, "2"], path: Ech
     """Echo of ONE reflector of kind PLANE, CORNER or EDGE; does not exist for any other kind."""
     models = (plane_echo, corner_echo, edge_echo)
     return echo_of_kind(kind, *(model(reflector, path) for model in models))
+
+
+# Circles
+
+
+class Arc(NamedTuple):
+    """A curve of constant curvature: foot + (speed / rate) (sin(rate u) t + (1 - cos(rate u)) n) at the coordinate u.
+
+    Rate 1 and speed a give a circle of radius a, for which u is an angle, and which may shrink to a point. Rate kappa
+    and speed 1 give a circle of curvature kappa, for which u is the arc length, and which may straighten to a line.
+    """
+
+    foot: Float[Array, "2"]
+    """Point at u = 0, metres."""
+    normal: Float[Array, "2"]
+    """Unit normal n at the foot, towards the center of the circle, away from the sensors."""
+    rate: Float[Array, ""]
+    """Rotation of the tangent per unit of u, radians."""
+    speed: Float[Array, ""]
+    """Length of the curve per unit of u, metres."""
+
+
+def circle_arc(center: Float[Array, "2"], radius: Float[Array, ""], midpoint: Float[Array, "2"]) -> Arc:
+    """A circle by its center and radius, with the foot nearest to a path's midpoint."""
+    towards = length_and_direction(center - midpoint)[1]
+    return Arc(center - radius * towards, towards, jnp.ones_like(radius), radius)
+
+
+class ArcReflection(NamedTuple):
+    """The specular reflection of ONE path at an arc."""
+
+    range: Float[Array, ""]
+    departure: Float[Array, "2"]
+    arrival: Float[Array, "2"]
+    normal: Float[Array, "2"]
+    """Unit normal of the arc at the point of reflection."""
+    coordinate: Float[Array, ""]
+    """The point's coordinate u."""
+    exists: Bool[Array, ""]
+
+
+def reflection_on_arc(arc: Arc, tx: Float[Array, "2"], rx: Float[Array, "2"]) -> ArcReflection:
+    """Shortest path tx -> arc -> rx, where the angles of incidence and reflection are equal.
+
+    The path is stationary, so that its derivatives do not depend on the solver's. The last step of Newton's method is
+    differentiable nevertheless, which makes second derivatives correct, too.
+    """
+    start = jax.lax.stop_gradient((arc, tx, rx))
+    u, ends, outside = _first_coordinate(*start)
+    low, high = jnp.minimum(*ends), jnp.maximum(*ends)
+    u = jax.lax.fori_loop(0, REFLECTION_STEPS, lambda _, u: jnp.clip(_newton_step(*start, u), low, high), u)
+    u = _newton_step(arc, tx, rx, jax.lax.stop_gradient(u))
+    point, normal_here = _point_on_arc(arc, u)
+    out, departure = length_and_direction(point - tx)
+    back, arrival = length_and_direction(point - rx)
+    exists = outside & (dot(departure, normal_here) > 0) & (dot(arrival, normal_here) > 0)
+    return ArcReflection((out + back) / 2, departure, arrival, normal_here, u, exists)
+
+
+def _first_coordinate(
+    arc: Arc, tx: Float[Array, "2"], rx: Float[Array, "2"]
+) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""]], Bool[Array, ""]]:
+    """First estimate of the point of reflection, exact for a line, a point and nearby sensors.
+
+    Returns:
+        Its coordinate, the coordinates of the points nearest to tx and rx, between which the reflection must be, and
+        whether both sensors are outside of the circle.
+    """
+    rate = jnp.where(jnp.abs(arc.rate) < 1e-9, 1e-9, arc.rate)
+    (q_tx, h_tx, angle_tx), (q_rx, h_rx, angle_rx) = (_polar(arc, rate, sensor) for sensor in (tx, rx))
+    outside = (h_tx > 0) & (h_rx > 0)
+    # Small angles: tan(incidence) = q / h * angle from the normal through the sensor.
+    share = jnp.where(outside, q_rx * h_tx / jnp.where(outside, q_tx * h_rx + q_rx * h_tx, 1), 0.5)
+    first, span = angle_tx / rate, wrap_angle(angle_rx - angle_tx) / rate
+    return first + share * span, (first, first + span), outside
+
+
+def _polar(
+    arc: Arc, rate: Float[Array, ""], sensor: Float[Array, "2"]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Distance of a sensor from the center times the rate, its distance from the arc, and its angle rate * u."""
+    along, height = _in_frame(arc, sensor - arc.foot)
+    across, depth = rate * along, arc.speed - rate * height
+    q = safe_sqrt(across * across + depth * depth)
+    # h = (q - speed) / rate without cancellation.
+    h = (rate * (along * along + height * height) - 2 * arc.speed * height) / jnp.where(
+        q + arc.speed > 0, q + arc.speed, 1
+    )
+    return q, h, jnp.arctan2(across, depth)
+
+
+def _in_frame(arc: Arc, vector: Float[Array, "2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Components of a vector along the tangent and the normal at the arc's foot."""
+    n = arc.normal
+    return n[0] * vector[1] - n[1] * vector[0], dot(n, vector)
+
+
+def _point_on_arc(arc: Arc, u: Float[Array, ""]) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    """Point of an arc at a coordinate, and the unit normal there."""
+    n, t = arc.normal, jnp.stack([-arc.normal[1], arc.normal[0]])
+    angle = arc.rate * u
+    half = sinc(angle / 2)
+    point = arc.foot + arc.speed * u * (sinc(angle) * t + angle / 2 * half * half * n)
+    return point, jnp.cos(angle) * n - jnp.sin(angle) * t
+
+
+def _newton_step(arc: Arc, tx: Float[Array, "2"], rx: Float[Array, "2"], u: Float[Array, ""]) -> Float[Array, ""]:
+    """One step towards the coordinate at which the length of the path is stationary."""
+    point, n = _point_on_arc(arc, u)
+    (out, e_tx), (back, e_rx) = length_and_direction(point - tx), length_and_direction(point - rx)
+    t = jnp.stack([-n[1], n[0]])
+    slope = dot(e_tx + e_rx, t)
+    bend = sum(dot(e, n) ** 2 / jnp.where(d > 0, d, 1) for e, d in ((e_tx, out), (e_rx, back)))
+    curvature = arc.rate * dot(e_tx + e_rx, n) + arc.speed * bend
+    return u - slope / jnp.where(curvature > 1e-9, curvature, jnp.inf)
+
+
+def sinc(x: Float[Array, ""]) -> Float[Array, ""]:
+    """sin(x) / x with exact derivatives at and near 0."""
+    small = jnp.abs(x) < 0.5
+    square = jnp.where(small, x * x, 0)
+    series = jnp.ones_like(x)
+    for k in (7, 6, 5, 4, 3, 2, 1):
+        series = 1 - series * square / (2 * k * (2 * k + 1))
+    return jnp.where(small, series, jnp.sin(x) / jnp.where(small, 1, x))
+
+
+def circle_echo(center: Float[Array, "2"], radius: Float[Array, ""], path: EchoPaths) -> CurvedEcho:
+    """Echo of a circle (x, y, radius): specular reflection; derivatives by x, y and the radius."""
+    tx, rx = path.midpoint - path.half_baseline, path.midpoint + path.half_baseline
+    found = reflection_on_arc(circle_arc(center, radius, path.midpoint), tx, rx)
+    mean = (found.departure + found.arrival) / 2
+    d_landmark = jnp.stack([mean[0], mean[1], -dot(mean, found.normal)])
+    return CurvedEcho(found.range, d_landmark, found.departure, found.arrival, found.exists)
+
+
+def curved_echo(parameters: Float[Array, "3"], path: EchoPaths) -> CurvedEcho:
+    """Echo of a curved reflector (rho, theta, kappa): a plane for kappa = 0, a circle of radius 1 / kappa otherwise.
+
+    The circle touches the plane (rho, theta) on its far side, at the point nearest to the origin: its center is
+    (rho + 1 / kappa) normal(theta). Exact from kappa = 0 to poles of a millimetre, kappa = 1000 per metre. Negative
+    curvatures (concave surfaces) are valid while the sensors are much nearer to the surface than its center is.
+
+    Args:
+        parameters: rho in metres, theta in radians, kappa per metre.
+        path: the echo path.
+    """
+    rho, theta, kappa = parameters[0], parameters[1], parameters[2]
+    n = normal(theta)
+    tx, rx = path.midpoint - path.half_baseline, path.midpoint + path.half_baseline
+    found = reflection_on_arc(Arc(rho * n, n, kappa, jnp.ones_like(kappa)), tx, rx)
+    cosine = dot(found.departure + found.arrival, found.normal) / 2
+    u, angle = found.coordinate, kappa * found.coordinate
+    half = u * sinc(angle / 2)
+    # Displacement of the surface along its normal at the point of reflection, per unit of each parameter.
+    moved = jnp.stack([jnp.cos(angle), -(rho * jnp.sin(angle) + u * sinc(angle)), half * half / 2])
+    return CurvedEcho(found.range, cosine * moved, found.departure, found.arrival, found.exists)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from jaxsonar.estimation.odometry_noise import OdometryNoise
 
 
-RING_HELP = "ring TOML, or the name of a shipped ring: faw, corridor8, scitos24, sew-amr"
+RING_HELP = "ring TOML, or the name of a shipped ring: faw, bumper4, corridor8, scitos24, sew-amr"
 
 SIGMA_HELP = "standard deviation of the ranges, for ml (default: estimated for each scan)"
 

@@ -1,18 +1,23 @@
-"""Range models of plane, corner and edge in NumPy, with derivatives, for transducers at any pose.
+"""Range models of plane, corner, edge and circle in NumPy, with derivatives, for transducers at any pose.
 
 The same models as ``kernels.measurement_model``, which is their oracle in the tests. Registration evaluates them
 thousands of times on small arrays of changing shapes, for which calls of compiled JAX functions would be too slow.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.geometry.se2 import tangent_of, unit
+from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
+from jaxsonar.kernels.measurement_model import REFLECTION_STEPS
 
+Real = Any
+"""One number for each path: an array, for a single path a NumPy scalar."""
 KINDS = kernels.PLANE, kernels.CORNER, kernels.EDGE
+MIN_RATE = 1e-9
+"""Smallest curvature of a circle for a division, per metre; a smaller one is a straight line in double precision."""
 
 
 class PredictedRange(NamedTuple):
@@ -20,8 +25,8 @@ class PredictedRange(NamedTuple):
 
     range: Float[np.ndarray, "..."]
     """Half the length of the sound's path, metres."""
-    d_range_d_landmark: Float[np.ndarray, "... 2"]
-    """Derivative by the two parameters of the reflector."""
+    d_range_d_landmark: Float[np.ndarray, "... parameters"]
+    """Derivative by the parameters of the reflector: three for a circle, two for the other kinds."""
     d_range_d_midpoint: Float[np.ndarray, "... 2"]
     """Derivative by the midpoint between transmitter and receiver."""
     d_range_d_half_baseline: Float[np.ndarray, "... 2"]
@@ -110,6 +115,111 @@ def edge_range(
     out, back = out / first[..., None], back / second[..., None]
     mean = (out + back) / 2
     return PredictedRange((first + second) / 2, mean, -mean, (out - back) / 2)
+
+
+def circle_range(
+    circle: Float[np.ndarray, "*#batch 3"],
+    midpoint: Float[np.ndarray, "*#batch 2"],
+    half_baseline: Float[np.ndarray, "*#batch 2"],
+) -> PredictedRange:
+    """Range to a circle (x, y, radius), metres; radius 0 or more. NaN or meaningless if it is between the sensors."""
+    away = circle[..., :2] - midpoint
+    normal = away / np.sqrt((away**2).sum(-1))[..., None]
+    radius = circle[..., 2]
+    foot = away - radius[..., None] * normal
+    _, departure, arrival, here = _reflection(foot, normal, np.ones_like(radius), radius, half_baseline)
+    mean = (departure[0] + arrival[0]) / 2
+    d_radius = -(mean * here).sum(-1, keepdims=True)
+    return PredictedRange(
+        (departure[1] + arrival[1]) / 2,
+        np.concatenate([mean, np.broadcast_to(d_radius, (*mean.shape[:-1], 1))], axis=-1),
+        -mean,
+        (departure[0] - arrival[0]) / 2,
+    )
+
+
+def curved_range(
+    reflector: Float[np.ndarray, "*#batch 3"],
+    midpoint: Float[np.ndarray, "*#batch 2"],
+    half_baseline: Float[np.ndarray, "*#batch 2"],
+) -> PredictedRange:
+    """Range to a curved reflector (rho, theta, kappa): a plane for kappa = 0, a circle of radius 1 / kappa otherwise.
+
+    Args:
+        reflector: rho (metres) and theta (radians) of the tangent at the point nearest to the origin, curvature kappa
+            per metre. The center is (rho + 1 / kappa) (cos theta, sin theta).
+        midpoint: midpoint between transmitter and receiver, metres.
+        half_baseline: half the vector from transmitter to receiver, metres.
+    """
+    rho, kappa = reflector[..., 0], reflector[..., 2]
+    normal = unit(reflector[..., 1])
+    foot = rho[..., None] * normal - midpoint
+    u, departure, arrival, here = _reflection(foot, normal, kappa, np.ones_like(kappa), half_baseline)
+    mean = (departure[0] + arrival[0]) / 2
+    angle = kappa * u
+    along, half = u * _sinc(angle), u * _sinc(angle / 2)
+    # Displacement of the surface along its normal at the point of reflection, per unit of each parameter.
+    moved = np.stack([np.cos(angle), -(rho * np.sin(angle) + along), half * half / 2], axis=-1)
+    return PredictedRange(
+        (departure[1] + arrival[1]) / 2,
+        (mean * here).sum(-1)[..., None] * moved,
+        -mean,
+        (departure[0] - arrival[0]) / 2,
+    )
+
+
+def _reflection(
+    foot: Float[np.ndarray, "*#batch 2"],
+    normal: Float[np.ndarray, "*#batch 2"],
+    rate: Float[np.ndarray, "*#batch"],
+    speed: Float[np.ndarray, "*#batch"],
+    half_baseline: Float[np.ndarray, "*#batch 2"],
+) -> tuple[Real, tuple[np.ndarray, Real], tuple[np.ndarray, Real], np.ndarray]:
+    """Point of reflection on an arc, as ``kernels.measurement_model.reflection_on_arc``; midpoint at the origin.
+
+    Returns:
+        The point's coordinate, direction and length of the legs from the transmitter and from the receiver, and the
+        normal at the point.
+    """
+    tangent = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
+    safe = np.where(np.abs(rate) < MIN_RATE, MIN_RATE, rate)
+
+    def polar(sensor: np.ndarray) -> tuple[Real, Real, Real]:
+        offset = sensor - foot
+        along, height = (offset * tangent).sum(-1), (offset * normal).sum(-1)
+        across, depth = safe * along, speed - safe * height
+        distance = np.sqrt(across**2 + depth**2)
+        above = (safe * (along**2 + height**2) - 2 * speed * height) / (distance + speed)
+        return distance, np.maximum(above, 0), np.arctan2(across, depth)
+
+    def legs(u: Real) -> tuple[tuple[np.ndarray, Real], tuple[np.ndarray, Real], np.ndarray]:
+        angle = rate * u
+        half, cos, sin = _sinc(angle / 2), np.cos(angle)[..., None], np.sin(angle)[..., None]
+        out = speed * u
+        point = foot + (out * _sinc(angle))[..., None] * tangent + (out * angle / 2 * half * half)[..., None] * normal
+        both = []
+        for leg in (point + half_baseline, point - half_baseline):
+            length = np.sqrt((leg**2).sum(-1))
+            both.append((leg / length[..., None], length))
+        return both[0], both[1], cos * normal - sin * tangent
+
+    (far_tx, high_tx, angle_tx), (far_rx, high_rx, angle_rx) = polar(-half_baseline), polar(half_baseline)
+    weight = far_tx * high_rx + far_rx * high_tx
+    share = np.where(weight > 0, far_rx * high_tx / np.where(weight > 0, weight, 1), 0.5)
+    first, span = angle_tx / safe, wrap_angle(angle_rx - angle_tx) / safe
+    u, low, high = first + share * span, np.minimum(first, first + span), np.maximum(first, first + span)
+    for _ in range(REFLECTION_STEPS):
+        departure, arrival, here = legs(u)
+        total = departure[0] + arrival[0]
+        bend = sum((e * here).sum(-1) ** 2 / length for e, length in (departure, arrival))
+        curvature = rate * (total * here).sum(-1) + speed * bend
+        slope = total[..., 1] * here[..., 0] - total[..., 0] * here[..., 1]
+        u = np.clip(u - slope / np.where(curvature > 0, curvature, np.inf), low, high)
+    return u, *legs(u)
+
+
+def _sinc(x: Real) -> Real:
+    return np.sinc(x / np.pi)
 
 
 RANGE_OF_KIND = {kernels.PLANE: plane_range, kernels.CORNER: corner_range, kernels.EDGE: edge_range}

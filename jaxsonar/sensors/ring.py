@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.fileio.atomic_files import shown
+from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 
@@ -42,6 +43,8 @@ class Ring(eqx.Module):
     """Metres per second."""
     neighbors: int = eqx.field(static=True)
     """Cross echoes are received up to this neighbor on each side."""
+    closed: bool = eqx.field(static=True)
+    """Whether the list of sensors closes to a ring: are the last and the first sensor neighbors?"""
     max_range: float = eqx.field(static=True)
     """Largest half path length of an echo, metres."""
     name: str = eqx.field(static=True)
@@ -58,6 +61,7 @@ class Ring(eqx.Module):
         beam: Float[AnyArray, " sensors"] | Sequence[float] | float,
         neighbors: int,
         max_range: float,
+        closed: bool | None = None,
         range_offset: Float[AnyArray, " sensors"] | Sequence[float] | float = 0.0,
         speed_of_sound: Float[AnyArray, ""] | float = REFERENCE_SPEED_OF_SOUND,
         name: str = "ring",
@@ -71,8 +75,9 @@ class Ring(eqx.Module):
             position: (sensors, 2) mounting positions, robot frame, metres.
             heading: (sensors,) directions of the axes, radians counter-clockwise from x.
             beam: full width of the detection cone, radians, one for all sensors or one each.
-            neighbors: cross echoes are received up to this many sensors away, counted cyclically through the list.
+            neighbors: cross echoes are received up to this many sensors away in the list, which is cyclic if closed.
             max_range: largest half path length of an echo, metres.
+            closed: whether the last and the first sensor are neighbors; None decides from positions and headings.
             range_offset: subtracted from the reported range, metres, one for all sensors or one each.
             speed_of_sound: metres per second.
             name: name in messages and figures.
@@ -88,6 +93,7 @@ class Ring(eqx.Module):
         self.range_offset = _one_each(range_offset, count, "range_offset")
         self.speed_of_sound = np.array(speed_of_sound, dtype=np.float64)
         self.neighbors = _whole(neighbors, "neighbors")
+        self.closed = _is_closed(self.position, self.heading) if closed is None else bool(closed)
         self.max_range = float(max_range)
         self.name = name
         self.names = tuple(str(one) for one in names) if any(names) else ()
@@ -171,6 +177,7 @@ class Ring(eqx.Module):
             beam=beam,
             neighbors=neighbors,
             max_range=max_range,
+            closed=True,
             speed_of_sound=speed_of_sound,
             name=name,
             names=names,
@@ -186,14 +193,15 @@ class Ring(eqx.Module):
         """Echo paths (tx, rx), ordered by neighbor offset 0, +1, -1, +2, -2, ..., then by tx.
 
         The receiver is rx = (tx + offset) mod count. Offsets that give the same receivers, such as +2 and -2 in a ring
-        of four sensors, are listed once.
+        of four sensors, are listed once. In an open array, pairs that are more than ``neighbors`` apart in the list are
+        left out: those that only its two ends make neighbors.
         """
-        return _paths(self.count, self.neighbors)
+        return _paths(self.count, self.neighbors, self.closed)
 
     @property
     def path_index(self) -> Int[np.ndarray, "sensors sensors"]:
         """Row of ``paths`` for each (tx, rx); -1 if the pair is no echo path of this ring."""
-        return _path_index(self.count, self.neighbors)
+        return _path_index(self.count, self.neighbors, self.closed)
 
     @property
     def sensors(self) -> kernels.SensorArray:
@@ -255,8 +263,11 @@ class Ring(eqx.Module):
 
         Any two sensors of a group are at least 2 * neighbors + 2 apart, so that no receiver listens to both: every
         eighth sensor of the paper's ring, in eight groups. If this spacing does not divide the number of sensors, some
-        gaps are wider.
+        gaps of a ring are wider; some groups of an open array have a sensor less.
         """
+        if not self.closed:
+            spacing = min(2 * self.neighbors + 2, self.count)
+            return tuple(np.arange(first, self.count, spacing) for first in range(spacing))
         together = max(1, self.count // (2 * self.neighbors + 2))
         blocks = np.array_split(np.arange(self.count), together)
         longest = max(len(block) for block in blocks)
@@ -306,21 +317,36 @@ def _whole(value: int, field: str) -> int:
         raise SonarError(f"ring: {field} {value!r}; allowed is a whole number") from None
 
 
+def _is_closed(position: Float[np.ndarray, "sensors 2"], heading: Float[np.ndarray, " sensors"]) -> bool:
+    """Whether sensors surround the robot: the headings turn once or more, and the last step is one of the usual ones.
+
+    The step from the last sensor to the first may be twice as long as the longest other one, so that one sensor may be
+    missing, and a ring remains closed after a calibration.
+    """
+    if len(position) < 3:
+        return True
+    steps = np.linalg.norm(np.roll(position, -1, axis=0) - position, axis=1)
+    turns = wrap_angle(np.roll(heading, -1) - heading)
+    return bool(abs(turns.sum()) > np.pi and steps[-1] <= 2 * steps[:-1].max() + 1e-9)
+
+
 @lru_cache(maxsize=8)
-def _paths(count: int, neighbors: int) -> Int[np.ndarray, "paths 2"]:
+def _paths(count: int, neighbors: int, closed: bool) -> Int[np.ndarray, "paths 2"]:
     """``Ring.paths`` as a read-only array; cached because every scan needs it."""
     offsets = [0] + [sign * k for k in range(1, neighbors + 1) for sign in (1, -1)]
     distinct = list(dict.fromkeys(offset % count for offset in offsets))
     tx = np.tile(np.arange(count), len(distinct))
     paths = np.stack([tx, (tx + np.repeat(distinct, count)) % count], axis=-1)
+    if not closed:
+        paths = paths[np.abs(paths[:, 1] - paths[:, 0]) <= neighbors]
     paths.setflags(write=False)
     return paths
 
 
 @lru_cache(maxsize=8)
-def _path_index(count: int, neighbors: int) -> Int[np.ndarray, "sensors sensors"]:
+def _path_index(count: int, neighbors: int, closed: bool) -> Int[np.ndarray, "sensors sensors"]:
     """``Ring.path_index`` as a read-only array."""
-    paths, index = _paths(count, neighbors), np.full((count, count), -1)
+    paths, index = _paths(count, neighbors, closed), np.full((count, count), -1)
     index[paths[:, 0], paths[:, 1]] = np.arange(len(paths))
     index.setflags(write=False)
     return index

@@ -24,6 +24,7 @@ _Heading = Annotated[float, Meta(description="a finite number (degrees counter-c
 _Beam = Annotated[float, Meta(gt=0, le=180, description="a number above 0 and up to 180 (degrees)")]
 _Neighbors = Annotated[int, Meta(ge=0, description="a whole number, 0 or more and less than there are sensors")]
 _Name = Annotated[str, Meta(pattern="[^/]", description="a text, the frame or the topic of a sensor in bags")]
+_Closed = Annotated[bool | None, Meta(description="true (the last and the first sensor are neighbors) or false")]
 _MaxRange = Annotated[float, Meta(gt=0, description="a finite number above 0 (m)")]
 
 
@@ -39,6 +40,7 @@ class _RingTable(msgspec.Struct, forbid_unknown_fields=True):
 class _ArrayTable(msgspec.Struct, forbid_unknown_fields=True):
     neighbors: _Neighbors
     max_range: _MaxRange
+    closed: _Closed = None
 
 
 class _SensorTable(msgspec.Struct, forbid_unknown_fields=True):
@@ -88,7 +90,9 @@ def load_ring(filename: str | os.PathLike[str]) -> Ring:
     The file contains ``name``, optionally ``speed_of_sound`` (m/s), and either a circular ring or a general array. A
     ring is a table ``[ring]`` with count, radius, first_heading_deg, beam_deg, neighbors and max_range. An array is a
     table ``[array]`` with neighbors and max_range, and one table ``[[sensor]]`` per sensor with x, y, heading_deg,
-    beam_deg and optionally range_offset. Lengths are in metres. A table ``[calibration]`` is ignored.
+    beam_deg and optionally range_offset. ``closed = true`` in ``[array]`` makes the last and the first sensor
+    neighbors, ``false`` does not; without it, positions and headings decide. Lengths are in metres. A table
+    ``[calibration]`` is ignored.
 
     In both cases a ``[[sensor]]`` may contain ``frame`` or ``topic``, the name of the sensor in ROS bags
     (``Ring.names``). Beside ``[ring]`` these are the only keys, and there is one ``[[sensor]]`` per sensor.
@@ -183,6 +187,7 @@ def _ring(given: _ArrayFile | _CircleFile) -> Ring:
         beam=np.radians([sensor.beam_deg for sensor in sensors]),
         neighbors=given.array.neighbors,
         max_range=given.array.max_range,
+        closed=given.array.closed,
         range_offset=np.array([sensor.range_offset for sensor in sensors]),
         speed_of_sound=given.speed_of_sound,
         name=given.name,
@@ -226,7 +231,8 @@ def ring_toml(ring: Ring, *, each: bool = False) -> str:
     if (circle := _circle(ring)) and not each:
         text, sensors = tomli_w.dumps({**head, "ring": circle}), names
     else:
-        text = tomli_w.dumps({**head, "array": {"neighbors": ring.neighbors, "max_range": ring.max_range}})
+        array = {"neighbors": ring.neighbors, "max_range": ring.max_range, "closed": ring.closed}
+        text = tomli_w.dumps({**head, "array": array})
         sensors = [sensor | name for sensor, name in zip(_sensors(ring), names or [{}] * ring.count, strict=True)]
     # One table at a time, because the library writes lists of short tables as inline arrays.
     return text + "".join(f"\n[[sensor]]\n{tomli_w.dumps(sensor)}" for sensor in sensors)
@@ -238,7 +244,7 @@ def _circle(ring: Ring) -> dict[str, Any] | None:
     beam, offset = np.asarray(ring.beam, np.float64), np.asarray(ring.range_offset, np.float64)
     radius, first_heading = _short(np.hypot(*position[0])), float(heading[0])
     again = Ring.circular(count=ring.count, radius=radius, first_heading=first_heading, neighbors=ring.neighbors)
-    if offset.any() or (beam != beam[0]).any():
+    if not ring.closed or offset.any() or (beam != beam[0]).any():
         return None
     if np.abs(again.position - position).max() > 1e-12 or np.abs(again.heading - heading).max() > 1e-12:
         return None

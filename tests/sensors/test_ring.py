@@ -40,6 +40,62 @@ def test_paths_are_unique_and_path_index_is_the_inverse(shape):
     assert (ring.path_index >= 0).sum() == len(paths)
 
 
+@given(st.integers(1, 12).flatmap(lambda n: st.tuples(st.just(n), st.integers(0, n - 1))))
+def test_an_open_array_has_the_paths_between_neighbors_in_the_list(shape):
+    count, neighbors = shape
+    closed = Ring.circular(count=count, neighbors=neighbors)
+    paths = dataclasses.replace(closed, closed=False).paths
+    pairs = [(tx, rx) for tx in range(count) for rx in range(count) if abs(tx - rx) <= neighbors]
+    assert sorted(map(tuple, paths)) == pairs
+    assert [tuple(p) for p in closed.paths if abs(p[0] - p[1]) <= neighbors] == [tuple(p) for p in paths]  # same order
+    if 2 * neighbors < count:
+        sign = np.sign(paths[:, 1] - paths[:, 0])
+        order = np.lexsort((paths[:, 0], -sign, np.abs(paths[:, 1] - paths[:, 0])))
+        assert (order == np.arange(len(paths))).all()
+
+
+@given(st.integers(1, 50).flatmap(lambda n: st.tuples(st.just(n), st.integers(0, n - 1))))
+def test_firing_groups_of_an_open_array_do_not_interfere(shape):
+    count, neighbors = shape
+    groups = dataclasses.replace(Ring.circular(count=count, neighbors=neighbors), closed=False).firing_groups
+    assert sorted(np.concatenate(groups)) == list(range(count))
+    assert len(groups) == min(count, 2 * neighbors + 2)
+    for group in groups:
+        assert (np.diff(group) == 2 * neighbors + 2).all()
+
+
+def turned(heading_deg, radius=0.3, *, closed=None):
+    heading = np.radians(heading_deg)
+    position = radius * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    return Ring(position, heading, beam=1.0, neighbors=1, max_range=2.0, closed=closed)
+
+
+def test_the_geometry_decides_whether_an_array_is_closed(rng):
+    around = np.arange(0, 360, 15.0)
+    assert turned(around).closed
+    assert turned(-around).closed, "clockwise"
+    assert turned(np.delete(around, 7)).closed, "one sensor is missing"
+    assert turned(around, radius=0.0).closed
+    assert turned(np.concatenate([around, around])).closed, "two rings one above the other"
+    assert turned([0.0, 120.0, 240.0]).closed
+    assert not turned(around[:16]).closed, "a third of the ring is missing"
+    assert not turned(np.linspace(-60, 60, 8)).closed
+    assert not Ring(**BUMPER, beam=1.0, neighbors=1, max_range=3.0).closed
+    for _ in range(20):
+        ring = Ring.circular(neighbors=1)
+        position = ring.position + 0.005 * rng.normal(size=(24, 2))
+        heading = ring.heading + np.radians(3) * rng.normal(size=24)
+        assert Ring(position, heading, beam=1.0, neighbors=1, max_range=3.0).closed, "a calibrated ring"
+
+
+def test_the_caller_decides_whether_an_array_is_closed():
+    assert not turned(np.arange(0, 360, 15.0), closed=False).closed
+    bumper = Ring(**BUMPER, beam=1.0, neighbors=1, max_range=3.0, closed=True)
+    assert bumper.closed
+    assert (3, 0) in map(tuple, bumper.paths.tolist())
+    assert dataclasses.replace(bumper, neighbors=2).closed
+
+
 @pytest.mark.parametrize(("beam", "neighbors", "widths"), [(60, 3, [60, 45, 30, 15]), (120, 7, range(120, 14, -15))])
 def test_detection_ranges_of_section_3(beam, neighbors, widths):
     ring = Ring.circular(beam=np.radians(beam), neighbors=neighbors)

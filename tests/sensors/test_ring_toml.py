@@ -63,6 +63,7 @@ def refused(text):
 
 def assert_same(one, other):
     assert (one.name, one.neighbors, one.max_range) == (other.name, other.neighbors, other.max_range)
+    assert one.closed == other.closed
     for field in ("position", "heading", "beam", "range_offset", "speed_of_sound"):
         np.testing.assert_allclose(getattr(one, field), getattr(other, field), rtol=0, atol=1e-12, err_msg=field)
 
@@ -307,13 +308,47 @@ def test_arbitrary_bytes_raise_a_one_line_error(garbage):
 
 def test_shipped_rings_load_by_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert set(shipped_rings()) == {"corridor8", "faw", "scitos24", "sew-amr"}
+    assert set(shipped_rings()) == {"bumper4", "corridor8", "faw", "scitos24", "sew-amr"}
     for name in shipped_rings():
         ring = load_ring(name)
         assert_same(saved(ring)[1], ring)
     assert_same(load_ring("faw"), Ring.circular(name="FAW ring"))
     (tmp_path / "faw").write_text(CIRCLE)  # a file of that name has priority
     assert load_ring("faw").name == "round"
+
+
+def test_the_shipped_rings_have_the_paths_of_their_devices():
+    closed = {name: load_ring(name).closed for name in shipped_rings()}
+    assert closed == {"bumper4": False, "corridor8": False, "faw": True, "scitos24": True, "sew-amr": False}
+    for name in ("corridor8", "scitos24"):
+        ring = load_ring(name)
+        np.testing.assert_array_equal(ring.paths, np.column_stack([np.arange(ring.count)] * 2))
+    # All pairs, in the order in which they were before arrays could be open.
+    every = [(tx, (tx + offset) % 4) for offset in (0, 1, 3, 2) for tx in range(4)]
+    for name in ("sew-amr", "bumper4"):
+        assert [tuple(pair) for pair in load_ring(name).paths.tolist()] == every
+        assert [list(group) for group in load_ring(name).firing_groups] == [[0], [1], [2], [3]]
+
+
+def test_the_bumper_is_a_line_of_sensors_that_face_forward():
+    ring = load_ring("bumper4")
+    np.testing.assert_allclose(np.diff(ring.position, axis=0), [[0, 0.45]] * 3, atol=1e-12)
+    np.testing.assert_allclose(ring.position.mean(axis=0), [0.3, 0], atol=1e-12)
+    np.testing.assert_array_equal(ring.heading, 0)
+    np.testing.assert_allclose(np.degrees(ring.beam), 120)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_an_array_can_be_closed_or_open_whatever_its_geometry(closed):
+    file = BUMPER.replace("neighbors = 1", f"neighbors = 1\nclosed = {str(closed).lower()}")
+    ring = read(file)
+    assert ring.closed is closed
+    assert_same(saved(ring)[1], ring)
+    # A circular ring without [ring], such as a calibrated one.
+    around = dataclasses.replace(Ring.circular(count=6, neighbors=1), closed=closed, range_offset=0.1 * np.ones(6))
+    tables, again = saved(around)
+    assert tables["array"]["closed"] is closed
+    assert_same(again, around)
 
 
 def test_headings_of_the_recorded_rings():

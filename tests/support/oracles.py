@@ -297,3 +297,29 @@ def point_echoes(ring, pose, place, *, corner):
         if distance < ring.max_range:
             echoes.append((pose, path, distance))
     return echoes
+
+
+# Circles
+
+
+def shortest_path_over_circle(circle, tx, rx):
+    """Lengths of the shortest paths tx -> point of the circle -> rx: a grid over the circle, then golden sections.
+
+    Args:
+        circle: (n, 3) center and radius, metres.
+        tx: (n, 2) transmitters.
+        rx: (n, 2) receivers.
+    """
+
+    def length(angle):
+        point = circle[:, :2] + circle[:, 2:] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        return np.linalg.norm(point - tx, axis=-1) + np.linalg.norm(point - rx, axis=-1)
+
+    grid = np.linspace(0, 2 * math.pi, 720, endpoint=False)
+    best = grid[np.argmin([length(np.full(len(circle), angle)) for angle in grid], axis=0)]
+    low, high, golden = best - grid[1], best + grid[1], (math.sqrt(5) - 1) / 2
+    for _ in range(50):
+        left, right = high - golden * (high - low), low + golden * (high - low)
+        lower = length(left) < length(right)
+        low, high = np.where(lower, low, left), np.where(lower, right, high)
+    return length((low + high) / 2)
