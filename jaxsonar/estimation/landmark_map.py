@@ -1,7 +1,7 @@
 """Landmarks of a map, and the reflections at them that echoes can be associated with."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np

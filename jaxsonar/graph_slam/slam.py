@@ -23,8 +23,8 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.build_map import add_reflectors, assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_evidence import gather_evidence
-from jaxsonar.reflectors.posed_scans import PosedScans
 from jaxsonar.plausibility.odometry_jumps import OdometryJump
+from jaxsonar.reflectors.posed_scans import PosedScans
 from jaxsonar.registration.heading_slips import HeadingSlip
 from jaxsonar.scans.measured_paths import echoes_of_long_wall
 from jaxsonar.scans.scan_log import Log

@@ -123,7 +123,9 @@ def seeks_reflectors(method: str, window: float | None, merging: str) -> bool:
     return merging == "fused" and (method == "ml" or window is not None)
 
 
-def add_reflectors(world: GlobalMap, measurements: RangeMeasurements | None, *, sigma: float | None = None) -> GlobalMap:
+def add_reflectors(
+    world: GlobalMap, measurements: RangeMeasurements | None, *, sigma: float | None = None
+) -> GlobalMap:
     """A map with the reflectors that answer from several places and that its walls do not explain.
 
     They are corners, edges, circles, or of undecided kind. Short walls and points that such a reflector explains better

@@ -1,7 +1,7 @@
 """The global map: walls, corners, edges and circles in the world frame (paper, section 5)."""
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,11 +13,26 @@ POINT_KINDS = ("corner", "edge", "circle", "undecided")
 reflectors of uncertain kind."""
 REFLECTOR_KINDS = ("plane", "corner", "edge", "circle")
 """Kinds of reflectors, in the order of ``GlobalMap.point_probabilities``."""
+_OF_SOME_POINTS = {"point_radius": (), "point_circle_cov": (3, 3), "point_probabilities": (4,)}
+"""Fields that may be omitted, and the shape of each row."""
+_DERIVED: Any = None
+"""Default of columns that the constructor fills."""
+
+if TYPE_CHECKING:
+    _Radii = Float[np.ndarray, " points"]
+    _CircleCovariances = Float[np.ndarray, "points 3 3"]
+    _Probabilities = Float[np.ndarray, "points 4"]
+else:  # the constructor replaces None
+    _Radii = Float[np.ndarray, " points"] | None
+    _CircleCovariances = Float[np.ndarray, "points 3 3"] | None
+    _Probabilities = Float[np.ndarray, "points 4"] | None
 
 
 @dataclass(frozen=True, eq=False)
 class GlobalMap:
-    """Walls, corners, edges and circles in the world frame, sorted by decreasing number of echoes. The arrays are read-only.
+    """Walls, corners, edges and circles in the world frame, sorted by decreasing number of echoes.
+
+    The arrays are read-only.
 
     ``len(world)`` is the number of walls. Maps of the Hough detector, and maps merged as in the paper, have no points.
     """
@@ -38,8 +53,8 @@ class GlobalMap:
     scans: tuple[tuple[int, ...], ...]
     """Numbers of the scans that observed each wall, ascending."""
     points: Float[np.ndarray, "points 2"] = field(default_factory=lambda: np.zeros((0, 2)))
-    """Positions (x, y) of corners, edges and circles (their centers), metres. An undecided reflector has the position of
-    its point nearest to the robot."""
+    """Positions (x, y) of corners, edges and circles (their centers), metres. The position of an undecided reflector
+    is its point nearest to the robot."""
     point_kinds: tuple[str, ...] = ()
     """Kind of each point, one of ``POINT_KINDS``."""
     point_cov: Float[np.ndarray, "points 2 2"] = field(default_factory=lambda: np.zeros((0, 2, 2)))
@@ -48,17 +63,17 @@ class GlobalMap:
     """Number of echoes that support each point."""
     point_scans: tuple[tuple[int, ...], ...] = ()
     """Numbers of the scans that observed each point, ascending."""
-    point_radius: Float[np.ndarray, " points"] = field(default_factory=lambda: np.zeros(0))
+    point_radius: _Radii = _DERIVED
     """Radius of each circle, metres; NaN for all other points, and if omitted."""
-    point_circle_cov: Float[np.ndarray, "points 3 3"] = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    point_circle_cov: _CircleCovariances = _DERIVED
     """Covariance of the (x, y, radius) of each circle, square metres; NaN where unknown, and if omitted."""
-    point_probabilities: Float[np.ndarray, "points 4"] = field(default_factory=lambda: np.zeros((0, 4)))
+    point_probabilities: _Probabilities = _DERIVED
     """Probability of each of ``REFLECTOR_KINDS``; NaN where unknown, and if omitted."""
 
     def __post_init__(self):
-        for name in _OF_SOME_POINTS:
-            if not len(getattr(self, name)):
-                object.__setattr__(self, name, np.full((len(self.points), *getattr(self, name).shape[1:]), np.nan))
+        for name, shape in _OF_SOME_POINTS.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.full((len(self.points), *shape), np.nan))
         for name in (
             "segments",
             "rho",
@@ -102,8 +117,8 @@ class GlobalMap:
             points: positions, metres.
             columns: fields whose names begin with ``point_``.
         """
-        empty = {name: np.zeros((0, *getattr(self, name).shape[1:])) for name in _OF_SOME_POINTS}
-        return replace(self, points=points, **(empty | columns))
+        omitted: dict[str, Any] = dict.fromkeys(_OF_SOME_POINTS)
+        return replace(self, points=points, **(omitted | columns))
 
     def _taken(self, rows: Bool[np.ndarray, " rows"], names: list[str]) -> "GlobalMap":
         columns: dict[str, Any] = {name: getattr(self, name) for name in names}
@@ -111,7 +126,3 @@ class GlobalMap:
             is_array = isinstance(value, np.ndarray)
             columns[name] = value[rows] if is_array else tuple(value[k] for k in np.flatnonzero(rows).tolist())
         return replace(self, **columns)
-
-
-_OF_SOME_POINTS = ("point_radius", "point_circle_cov", "point_probabilities")
-"""Fields that may be omitted."""

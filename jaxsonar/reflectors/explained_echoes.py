@@ -10,9 +10,7 @@ from jaxsonar.reflectors.settings import SETTINGS
 from jaxsonar.sensors.range_models import corner_range, edge_range
 
 
-def wall_residuals(
-    echoes: RangeMeasurements, walls: Float[np.ndarray, "walls 2 2"]
-) -> Float[np.ndarray, "rows walls"]:
+def wall_residuals(echoes: RangeMeasurements, walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, "rows walls"]:
     """Measured minus predicted range of each echo for each wall, metres; inf where a wall cannot have caused it.
 
     Args:

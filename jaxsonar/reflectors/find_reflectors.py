@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsonar.geometry.se2 import tangent_of, unit
+from jaxsonar.geometry.se2 import perpendicular, tangent_of, unit
 from jaxsonar.geometry.segments import lengths
 from jaxsonar.reflectors.center_votes import center_seeds
 from jaxsonar.reflectors.explained_echoes import (
@@ -85,6 +85,8 @@ def find_reflectors(
     settings = SETTINGS.explanation
     long = lengths(walls) >= settings.released_length
     heard = np.flatnonzero(np.isfinite(measurements.distance))
+    if not len(heard):
+        return FoundReflectors((), np.zeros(len(walls), dtype=bool), np.zeros(len(points), dtype=bool), sigma)
     echoes = measurements.take(heard)
     residual = wall_residuals(echoes, walls)
     for chosen in (residual[:, long], residual):
@@ -103,7 +105,9 @@ def find_reflectors(
         left = np.flatnonzero(~explained)
         left = left[~explained_by_points(echoes.take(left), vertices, wide)]
         left = left[~explained_by_two_walls(echoes.take(left), fixed, wide)]
-        found = _search(measurements, heard[left], fixed, sigma)
+        seeds = _wall_seeds(walls[~long], echoes.origin.mean(axis=0))
+        on_walls = np.abs(residual[np.ix_(left, ~long)].T) < SETTINGS.fit.start_gate
+        found = _search(measurements, heard[left], fixed, sigma, seeds, on_walls)
         # Without long walls only the reflectors show the scatter of the ranges.
         squared = np.concatenate([one.residual for one in found] or [np.zeros(0)]) ** 2
         if long.any() or len(squared) < settings.min_scatter_echoes:
@@ -120,13 +124,31 @@ def find_reflectors(
 
 
 def _search(
-    measurements: RangeMeasurements, free: Int[np.ndarray, " free"], walls: Float[np.ndarray, "walls 2 2"], sigma: float
+    measurements: RangeMeasurements,
+    free: Int[np.ndarray, " free"],
+    walls: Float[np.ndarray, "walls 2 2"],
+    sigma: float,
+    wall_seeds: tuple[Float[np.ndarray, "short 2"], Float[np.ndarray, " short"]],
+    on_walls: Bool[np.ndarray, "short free"],
 ) -> list[Reflector]:
-    """The reflectors of the echoes that nothing explains, at the seeds with most votes first."""
+    """The reflectors of the echoes that nothing explains: first at short walls, then at the seeds with most votes.
+
+    Args:
+        measurements: echoes and silences.
+        free: rows of the echoes that nothing explains.
+        walls: both ends of the walls that hide what is behind them, metres.
+        sigma: standard deviation of ranges, metres.
+        wall_seeds: centers and radii of circles that touch the short walls, metres.
+        on_walls: echoes near each of these.
+    """
     weight = independent_weights(measurements.section)
     found: list[Reflector] = []
     centers, radii = center_seeds(measurements.take(free))
     near, close = near_echoes(measurements, free, centers, radii)
+    near_walls, close_walls = near_echoes(measurements, free, *wall_seeds)
+    near = np.concatenate([near_walls & on_walls, near])
+    close = np.concatenate([close_walls & on_walls, close])
+    centers, radii = np.concatenate([wall_seeds[0], centers]), np.append(wall_seeds[1], radii)
     is_free, left = np.ones(len(free), dtype=bool), np.ones(len(centers), dtype=bool)
     while True:
         left &= (close & is_free).sum(axis=1) >= SETTINGS.decision.min_echoes
@@ -134,13 +156,49 @@ def _search(
         if not len(chosen):
             return found
         left[chosen] = False
-        for fits in fit_kinds(measurements, free, weight, centers[chosen], radii[chosen], near[chosen] & is_free, sigma):
+        wave = fit_kinds(measurements, free, weight, centers[chosen], radii[chosen], near[chosen] & is_free, sigma)
+        wave = _refitted(measurements, free, is_free, weight, wave, sigma)
+        for fits in sorted(wave, key=lambda fits: -np.inf if fits is None else -float(fits.evidence.max())):
             one = None if fits is None else _decided(measurements, weight, fits, sigma, walls)
             if one is not None and is_free[np.searchsorted(free, one.echoes)].mean() > SETTINGS.decision.min_free_share:
                 # What is hidden by a wall, or heard at one place only, is an artifact; its echoes are used up, too.
                 is_free[np.searchsorted(free, one.echoes)] = False
                 if one.is_visible:
                     found.append(one)
+
+
+def _refitted(
+    measurements: RangeMeasurements,
+    free: Int[np.ndarray, " free"],
+    is_free: Bool[np.ndarray, " free"],
+    weight: Float[np.ndarray, " rows"],
+    fits: list[KindFits | None],
+    sigma: float,
+) -> list[KindFits | None]:
+    """The fits, repeated where more echoes are near a fitted corner, edge or circle than were near its seed."""
+    point = [k for k, one in enumerate(fits) if one is not None and np.argmax(one.evidence) != PLANE]
+    if not point:
+        return fits
+    best = [(one, int(np.argmax(one.evidence))) for k in point if (one := fits[k]) is not None]
+    centers = np.array([one.center[kind] for one, kind in best])
+    radii = np.array([one.parameters[kind, 2] for one, kind in best])
+    near, close = near_echoes(measurements, free, centers, radii, close=SETTINGS.fit.gate * sigma)
+    used = np.array([np.count_nonzero(one.inlier[kind]) for one, kind in best])
+    more = (close & is_free).sum(axis=1) > SETTINGS.fit.more_echoes * used
+    again = fit_kinds(measurements, free, weight, centers[more], radii[more], near[more] & is_free, sigma)
+    better = dict(zip(np.array(point)[more].tolist(), again, strict=True))
+    return [better.get(k, one) for k, one in enumerate(fits)]
+
+
+def _wall_seeds(
+    walls: Float[np.ndarray, "walls 2 2"], robot: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, "walls 2"], Float[np.ndarray, " walls"]]:
+    """Centers and radii of large circles that touch walls from behind, as seen from a position of the robot."""
+    radius = SETTINGS.fit.plane_radius
+    normal = perpendicular(walls[:, 1] - walls[:, 0]) / np.maximum(lengths(walls), 1e-9)[:, None]
+    middle = walls.mean(axis=1)
+    side = np.where(((middle - robot) * normal).sum(-1) < 0, -1.0, 1.0)
+    return middle + radius * side[:, None] * normal, np.full(len(walls), radius)
 
 
 def _with_own_echoes(close: Bool[np.ndarray, "seeds free"], left: Bool[np.ndarray, " seeds"]) -> Int[np.ndarray, " _"]:

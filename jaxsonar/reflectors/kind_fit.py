@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import betaln
 
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
-from jaxsonar.reflectors.circle_model import circle_range
+from jaxsonar.reflectors.circle_ranges import circle_ranges
 from jaxsonar.reflectors.explained_echoes import hidden_by_walls
 from jaxsonar.reflectors.range_measurements import RangeMeasurements
 from jaxsonar.reflectors.settings import SETTINGS
@@ -87,12 +87,16 @@ def fit_kinds(
         sigma: standard deviation of ranges, metres.
     """
     settings = SETTINGS.fit
+    if not len(centers):
+        return []
     # The echoes of each seed, padded to a common length.
     count = near.sum(axis=1)
     order = np.argsort(~near, axis=1, kind="stable")[:, : int(count.max(initial=1))]
     rows, valid = free[order], np.take_along_axis(near, order, axis=1)
     w = np.where(valid, weight[rows], 0.0)[:, None]
-    distance, midpoint, half = (x[rows] for x in (measurements.distance, measurements.origin, measurements.half_baseline))
+    distance, midpoint, half = (
+        x[rows] for x in (measurements.distance, measurements.origin, measurements.half_baseline)
+    )
     mean = (midpoint * valid[..., None]).sum(axis=1, keepdims=True) / count[:, None, None]
     away = np.where(valid, ((midpoint - mean) ** 2).sum(-1), np.inf)
     origin = np.take_along_axis(midpoint, away.argmin(axis=1)[:, None, None], axis=1)
@@ -141,9 +145,12 @@ def fit_kinds(
     volume = 0.5 * np.linalg.slogdet(2 * pi * cov[..., :2, :2])[1]
     evidence = log_ratio - log(measurements.max_range * 2 * pi) + np.minimum(volume, 0.0)
     # The radius has a scale-invariant prior; one that the echoes hardly determine counts as the whole prior.
-    given = cov[..., CIRCLE:, 2, 2] - (
-        cov[..., CIRCLE:, 2, None, :2] @ np.linalg.inv(cov[..., CIRCLE:, :2, :2]) @ cov[..., CIRCLE:, :2, 2, None]
-    )[..., 0, 0]
+    given = (
+        cov[..., CIRCLE:, 2, 2]
+        - (cov[..., CIRCLE:, 2, None, :2] @ np.linalg.inv(cov[..., CIRCLE:, :2, :2]) @ cov[..., CIRCLE:, :2, 2, None])[
+            ..., 0, 0
+        ]
+    )
     prior_density = 1 / (p[:, CIRCLE:, 2] * log(settings.max_radius / settings.min_radius))
     evidence[:, CIRCLE:] += np.minimum(0.5 * np.log(2 * pi * np.maximum(given, 1e-18)) + np.log(prior_density), 0.0)
     best = np.tile(np.arange(4), (len(centers), 1))
@@ -157,7 +164,9 @@ def fit_kinds(
         parameters, own = p[k, chosen], residual[k, chosen, of_seed]
         parameters[:CIRCLE, 2] = 0.0
         inside = np.abs(own) < settings.gate * sigma
-        fits.append(KindFits(origin[k, 0], parameters, cov[k, chosen], evidence[k, chosen], rows[k, of_seed], own, inside))
+        fits.append(
+            KindFits(origin[k, 0], parameters, cov[k, chosen], evidence[k, chosen], rows[k, of_seed], own, inside)
+        )
     return fits
 
 
@@ -166,6 +175,8 @@ def near_echoes(
     free: Int[np.ndarray, " free"],
     centers: Float[np.ndarray, "seeds 2"],
     radii: Float[np.ndarray, " seeds"],
+    *,
+    close: float = SETTINGS.fit.close,
 ) -> tuple[Bool[np.ndarray, "seeds free"], Bool[np.ndarray, "seeds free"]]:
     """Echoes that take part in the fit at a seed, and those that are so close that they probably belong to it.
 
@@ -174,6 +185,7 @@ def near_echoes(
         free: rows of the echoes.
         centers: centers of circles, metres.
         radii: their radii, metres.
+        close: largest deviation of those that probably belong to it, metres.
     """
     settings = SETTINGS.fit
     away = centers[:, None] - measurements.origin[free]
@@ -184,7 +196,7 @@ def near_echoes(
     away = away[seed, echo]
     angle = np.abs(wrap_angle(np.arctan2(away[:, 1], away[:, 0]) - measurements.axis[free[echo]]))
     near[seed, echo] = angle < measurements.half_width[free[echo]] + settings.view_margin
-    return near, near & (deviation < settings.close)
+    return near, near & (deviation < close)
 
 
 def _predicted(
@@ -198,8 +210,8 @@ def _predicted(
     radius = np.where(kind == PLANE, SETTINGS.fit.plane_radius, p[..., 2])
     reach = p[..., 0] + radius
     baseline = np.where(kind == CORNER, 0.0, 1.0)[:, None, None] * half_baseline[:, None]
-    center = reach[..., None] * normal
-    distance, slope, by_radius = circle_range(center[..., None, :], radius[..., None], midpoint[:, None], baseline)
+    center = (reach[..., None] * normal)[..., None, :]
+    distance, slope, by_radius = circle_ranges(center, radius[..., None], midpoint[:, None], baseline)
     jacobian = np.empty((*distance.shape, 3))
     jacobian[..., 0] = (slope @ normal[..., None])[..., 0]
     jacobian[..., 1] = reach[..., None] * (slope @ tangent[..., None])[..., 0]

@@ -10,7 +10,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class PlaceSettings:
+class KeptScanSettings:
     """Scans that are kept for the search."""
 
     cell: float = 0.05
@@ -22,7 +22,7 @@ class PlaceSettings:
 
 
 @dataclass(frozen=True)
-class VotingSettings:
+class CenterVotingSettings:
     """Votes of echoes for centers of circles."""
 
     cell: float = 0.05
@@ -42,7 +42,7 @@ class VotingSettings:
 
 
 @dataclass(frozen=True)
-class FitSettings:
+class KindFitSettings:
     """Joint fit of a reflector over all its echoes."""
 
     iterations: int = 9
@@ -63,8 +63,8 @@ class FitSettings:
     """Radii at which the fit of a circle starts, metres."""
     min_radius: float = 0.01
     """Smallest radius of a circle, metres: about a wavelength. A thinner column is a pole, which answers as an edge."""
-    max_radius: float = 2.0
-    """Largest radius of a circle, metres."""
+    max_radius: float = 1.0
+    """Largest radius of a circle, metres; thicker columns are rare, and hardly differ from walls."""
     view_margin: float = float(np.radians(15.0))
     """Echoes belong to a reflector up to this far outside of the nominal beam, radians."""
     gate: float = 3.5
@@ -73,6 +73,8 @@ class FitSettings:
     """Prior share of the echoes of a reflector among those near it."""
     max_step: float = 0.1
     """Largest correction of a distance in one iteration, metres."""
+    more_echoes: float = 1.15
+    """A fit is repeated if this many times its echoes are near its result."""
     damping: float = 1e-3
     """Damping of the iterations, as a share of the diagonal, ..."""
     floor: tuple[float, float, float] = (1.0, 0.1, 1e-3)
@@ -84,7 +86,7 @@ class FitSettings:
 
 
 @dataclass(frozen=True)
-class DecisionSettings:
+class ReflectorDecisionSettings:
     """Acceptance and kinds of reflectors."""
 
     min_echoes: int = 6
@@ -110,14 +112,14 @@ class DecisionSettings:
     """Probability of a kind from which on it is decided."""
     min_claim: float = 0.01
     """A reflector claims the echoes that it would cause as a kind of at least this probability."""
-    prior: tuple[float, float, float, float] = (0.25, 0.25, 0.25, 0.25)
-    """Prior probabilities of plane, corner, edge and circle."""
+    prior: tuple[float, float, float, float] = (0.5, 0.15, 0.15, 0.2)
+    """Prior probabilities of plane, corner, edge and circle: most reflectors of rooms are walls."""
     hidden: float = 0.05
     """A reflector farther behind a wall than this is not visible, metres."""
 
 
 @dataclass(frozen=True)
-class ExplanationSettings:
+class ExplainedEchoSettings:
     """Echoes that the walls and points of a map explain."""
 
     gate: float = 3.5
@@ -141,7 +143,7 @@ class ExplanationSettings:
     vertex_distance: float = 0.1
     """A point this close to the end of a wall, or to where two walls meet, belongs to them; one this close to a found
     reflector is the same, metres."""
-    min_wall_probability: float = 0.2
+    min_wall_probability: float = 0.03
     """A short wall of the map remains if it may be a plane with this probability: most walls of maps are walls."""
     replaced_share: float = 0.5
     """Share of the echoes of a short wall that other reflectors must explain before they replace it."""
@@ -154,20 +156,20 @@ class ExplanationSettings:
 
 
 @dataclass(frozen=True)
-class ReflectorSettings:
+class ReflectorSearchSettings:
     """All settings of the search for reflectors."""
 
-    places: PlaceSettings = field(default_factory=PlaceSettings)
+    places: KeptScanSettings = field(default_factory=KeptScanSettings)
     """Scans that are kept."""
-    voting: VotingSettings = field(default_factory=VotingSettings)
+    voting: CenterVotingSettings = field(default_factory=CenterVotingSettings)
     """Votes for centers."""
-    fit: FitSettings = field(default_factory=FitSettings)
+    fit: KindFitSettings = field(default_factory=KindFitSettings)
     """Joint fits."""
-    decision: DecisionSettings = field(default_factory=DecisionSettings)
+    decision: ReflectorDecisionSettings = field(default_factory=ReflectorDecisionSettings)
     """Acceptance and kinds."""
-    explanation: ExplanationSettings = field(default_factory=ExplanationSettings)
+    explanation: ExplainedEchoSettings = field(default_factory=ExplainedEchoSettings)
     """What a map explains."""
 
 
-SETTINGS = ReflectorSettings()
+SETTINGS = ReflectorSearchSettings()
 """The settings in use."""

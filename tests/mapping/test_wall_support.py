@@ -93,7 +93,7 @@ def test_predicted_ranges_are_those_of_the_simulator():
     ring = Ring.circular(count=24, radius=0.3, neighbors=3, max_range=3.0)
     wall = Room(np.array([[[-9.0, 1.4], [9.0, 1.4]]]))
     pose = np.array([[0.2, 0.1, 0.3]])
-    log = simulate(ring, wall, pose).as_log(ring, pose)
+    log = simulate(ring, wall, pose, beams="hard").as_log(ring, pose)
     came = RangeMeasurements.from_log(ring, log)
     heard = came.take(np.isfinite(came.distance))
     assert len(heard) > 10
