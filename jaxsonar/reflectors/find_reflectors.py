@@ -105,8 +105,8 @@ def find_reflectors(
         left = np.flatnonzero(~explained)
         left = left[~explained_by_points(echoes.take(left), vertices, wide)]
         left = left[~explained_by_two_walls(echoes.take(left), fixed, wide)]
-        seeds = _wall_seeds(walls[~long], echoes.origin.mean(axis=0))
         on_walls = np.abs(residual[np.ix_(left, ~long)].T) < SETTINGS.fit.start_gate
+        seeds = _wall_seeds(walls[~long], echoes.origin[left], on_walls)
         found = _search(measurements, heard[left], fixed, sigma, seeds, on_walls)
         # Without long walls only the reflectors show the scatter of the ranges.
         squared = np.concatenate([one.residual for one in found] or [np.zeros(0)]) ** 2
@@ -152,7 +152,11 @@ def _search(
     is_free, left = np.ones(len(free), dtype=bool), np.ones(len(centers), dtype=bool)
     while True:
         left &= (close & is_free).sum(axis=1) >= SETTINGS.decision.min_echoes
-        chosen = _with_own_echoes(close & is_free, left)
+        # Short walls come first: a circle that touches several of them must not take their echoes.
+        count = len(wall_seeds[1])
+        chosen = _with_own_echoes(
+            close & is_free, left & (np.arange(len(left)) < count) if left[:count].any() else left
+        )
         if not len(chosen):
             return found
         left[chosen] = False
@@ -191,13 +195,22 @@ def _refitted(
 
 
 def _wall_seeds(
-    walls: Float[np.ndarray, "walls 2 2"], robot: Float[np.ndarray, "2"]
+    walls: Float[np.ndarray, "walls 2 2"],
+    origin: Float[np.ndarray, "free 2"],
+    on_walls: Bool[np.ndarray, "walls free"],
 ) -> tuple[Float[np.ndarray, "walls 2"], Float[np.ndarray, " walls"]]:
-    """Centers and radii of large circles that touch walls from behind, as seen from a position of the robot."""
+    """Centers and radii of large circles that touch walls from behind.
+
+    Args:
+        walls: both ends, metres.
+        origin: midpoints of the sensors of the echoes, metres.
+        on_walls: echoes near each wall; most of them are in front of it.
+    """
     radius = SETTINGS.fit.plane_radius
     normal = perpendicular(walls[:, 1] - walls[:, 0]) / np.maximum(lengths(walls), 1e-9)[:, None]
     middle = walls.mean(axis=1)
-    side = np.where(((middle - robot) * normal).sum(-1) < 0, -1.0, 1.0)
+    ahead = np.sign(((middle[:, None] - origin) * normal[:, None]).sum(-1))
+    side = np.where((ahead * on_walls).sum(axis=1) < 0, -1.0, 1.0)
     return middle + radius * side[:, None] * normal, np.full(len(walls), radius)
 
 
@@ -221,7 +234,7 @@ def _decided(
 ) -> Reflector | None:
     """The reflector of the most likely kind, undecided if it is not much more likely; None without enough evidence."""
     settings = SETTINGS.decision
-    evidence, count = add_silences(measurements, weight, fits, sigma, walls)
+    evidence, count, gone = add_silences(measurements, weight, fits, sigma, walls)
     odds = evidence + np.log(settings.prior)
     probability = np.exp(odds - odds.max())
     probability /= probability.sum()
@@ -255,7 +268,11 @@ def _decided(
         segment=fits.nearest[PLANE] + ends[:, None] * tangent_of(fits.parameters[PLANE, 1]),
         evidence=float(evidence[best]),
         residual=fits.residual[best, fits.inlier[best]],
-        is_visible=bool(count[best, 0] >= settings.min_heard_share * count[best].sum() and hidden.mean() <= 0.5),
+        is_visible=bool(
+            count[best, 0] >= settings.min_heard_share * count[best].sum()
+            and hidden.mean() <= 0.5
+            and gone[best] < settings.most_missed
+        ),
     )
 
 

@@ -225,10 +225,11 @@ def add_silences(
     fits: KindFits,
     sigma: float,
     walls: Float[np.ndarray, "walls 2 2"],
-) -> tuple[Float[np.ndarray, "4"], Int[np.ndarray, "4 2"]]:
-    """Evidence of each kind with that of the measurements that should hear it, and how many do and do not.
+) -> tuple[Float[np.ndarray, "4"], Int[np.ndarray, "4 2"], Int[np.ndarray, "4"]]:
+    """Evidence of each kind with that of the measurements that should hear it, how many do and do not, and gone.
 
-    The probability of an echo is unknown; it is integrated out (beta-binomial distribution).
+    The probability of an echo is unknown; it is integrated out (beta-binomial distribution). Only measurements from the
+    first to the last echo count. The third result is the number of later scans that should have heard it.
 
     Args:
         measurements: echoes and silences.
@@ -249,7 +250,7 @@ def add_silences(
     origin = measurements.origin[near] - fits.origin
     predicted, _ = _predicted(fits.parameters[None], origin[None], measurements.half_baseline[near][None])
     predicted = predicted[0]
-    count, value = np.zeros((4, 2), dtype=np.int64), fits.evidence.copy()
+    count, value, gone = np.zeros((4, 2), dtype=np.int64), fits.evidence.copy(), np.zeros(4, dtype=np.int64)
     begin, end = fits.plane_extent(measurements.origin[fits.rows])
     tangent = tangent_of(fits.parameters[PLANE, 1])
     for kind in range(4):
@@ -265,10 +266,14 @@ def add_silences(
             asked &= (foot >= begin) & (foot <= end)
         is_heard = np.zeros(int(measurements.measurement.max(initial=0)) + 1, dtype=bool)
         is_heard[measurements.measurement[fits.rows[fits.inlier[kind]]]] = True
-        hears = is_heard[measurements.measurement[near[asked]]]
-        w = weight[near[asked]]
+        time = measurements.time[fits.rows[fits.inlier[kind]]]
+        first, last = time.min(initial=np.inf), time.max(initial=-np.inf)
+        rows = near[asked]
+        gone[kind] = len(np.unique(measurements.scan[rows[measurements.time[rows] > last]]))
+        rows = rows[(measurements.time[rows] >= first) & (measurements.time[rows] <= last)]
+        hears, w = is_heard[measurements.measurement[rows]], weight[rows]
         count[kind] = np.count_nonzero(hears), np.count_nonzero(~hears)
         h, m = float(w[hears].sum()), float(w[~hears].sum())
         a, b = decision.heard_prior
         value[kind] += betaln(h + a, m + b) - betaln(a, b)
-    return value, count
+    return value, count, gone

@@ -106,6 +106,8 @@ class ReflectorDecisionSettings:
     """Part of the beam in which a measurement must hear a reflector."""
     certain_range: float = 0.9
     """Part of the maximum range in which it must."""
+    most_missed: int = 3
+    """A reflector is gone if this many later scans should have heard it and did not, as a wall is."""
     heard_prior: tuple[float, float] = (3.0, 1.0)
     """Parameters of the beta distribution of the share that hears it."""
     min_probability: float = 0.9

@@ -16,8 +16,20 @@ from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_geojson import load_map, load_segments, load_walls, save_map
 from jaxsonar.simulation.office import load_office
 
-COLUMNS = ("segments", "rho", "theta", "sigma_rho", "sigma_theta", "echoes", "points", "point_cov", "point_echoes",
-           "point_radius", "point_circle_cov", "point_probabilities")
+COLUMNS = (
+    "segments",
+    "rho",
+    "theta",
+    "sigma_rho",
+    "sigma_theta",
+    "echoes",
+    "points",
+    "point_cov",
+    "point_echoes",
+    "point_radius",
+    "point_circle_cov",
+    "point_probabilities",
+)
 
 
 def some_map(rng, count):
