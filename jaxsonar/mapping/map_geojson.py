@@ -111,6 +111,35 @@ def load_walls(filename: str | os.PathLike[str]) -> Float[np.ndarray, "walls 2 2
     return segments[~np.isin(np.array(kinds, dtype=np.str_), NON_WALL_KINDS)]
 
 
+def load_points(
+    filename: str | os.PathLike[str], *, kinds: tuple[str, ...]
+) -> tuple[Float[np.ndarray, "points 2"], tuple[str, ...], Float[np.ndarray, " points"]]:
+    """The points of some kinds of any GeoJSON: a map, a floor plan.
+
+    Returns:
+        points: positions, metres.
+        kinds: their kinds.
+        radii: property ``radius`` of circles, metres; NaN for all other points.
+
+    Raises:
+        SonarError: the file cannot be read, or a circle has no radius.
+    """
+
+    def read(properties: dict[str, Any], form: str, coordinates: Any) -> list[tuple[Any, str, float]]:
+        kind, radius = properties.get("kind"), properties.get("radius")
+        if form != "Point" or kind not in kinds:
+            return []
+        if kind != "circle":
+            return [(positions([coordinates])[0], kind, float("nan"))]
+        if not _is_number(radius) or radius <= 0:
+            raise SonarError(f"radius {radius!r:.60}; allowed is a number above 0, metres")
+        return [(positions([coordinates])[0], kind, float(radius))]
+
+    found = [one for of_feature in read_features(filename, read, what="points") for one in of_feature]
+    position = np.array([position for position, _, _ in found], dtype=np.float64).reshape(-1, 2)
+    return position, tuple(kind for _, kind, _ in found), np.array([radius for *_, radius in found], dtype=np.float64)
+
+
 _WallRow = tuple[Float[np.ndarray, "2 2"], list[float], int, tuple[int, ...]]
 
 

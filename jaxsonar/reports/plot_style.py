@@ -38,7 +38,7 @@ WALL_COLOR = "#8C8C8C"
 FAINT_COLOR = "#DDDDDD"
 """Paths without an echo, and detection cones."""
 ROBOT_COLOR = "#222222"
-POINT_MARKERS = {"corner": "s", "edge": "D"}
+POINT_MARKERS = {"corner": "s", "edge": "D", "undecided": "*"}
 """Matplotlib markers of corners and edges."""
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -143,7 +143,7 @@ def draw_robot(axes: Axes, ring: Ring, pose: Float[np.ndarray, "3"]) -> None:
 def draw_map_points(
     axes: Axes, world: GlobalMap, *, sizes: Mapping[str, float], edge_width: float, zorder: int
 ) -> list[Line2D]:
-    """Draw the corners and edges of a map. Returns the legend handles.
+    """Draw the points of a map, circles with their true radius. Returns the legend handles.
 
     Args:
         axes: axes of a plan view.
@@ -153,11 +153,18 @@ def draw_map_points(
         zorder: drawing order.
     """
     handles = []
+    round_ones = world.with_kinds("circle")
+    for (x, y), radius in zip(round_ones.points.tolist(), round_ones.point_radius.tolist(), strict=True):
+        axes.add_patch(Circle((x, y), radius, fc="white", ec=POINT_COLOR, lw=edge_width + 0.8, zorder=zorder - 0.5))
+        axes.plot(x, y, "+", color=POINT_COLOR, ms=4, mew=edge_width, zorder=zorder)
+    if len(round_ones.points):
+        style = {"marker": "o", "ls": "", "ms": 8, "mfc": "white", "mec": POINT_COLOR, "mew": edge_width + 0.8}
+        handles.append(Line2D([], [], **style, label="circle"))
     for kind, marker in POINT_MARKERS.items():
         points = world.points[np.array(world.point_kinds, dtype=np.str_) == kind]
         if len(points):
             style: dict[str, Any] = {
-                "marker": marker, "ls": "", "ms": sizes[kind], "mfc": "white", "mec": POINT_COLOR, "mew": edge_width
+                "marker": marker, "ls": "", "ms": sizes.get(kind, 1.8 * max(sizes.values())), "mfc": "white", "mec": POINT_COLOR, "mew": edge_width
             }  # fmt: skip
             axes.plot(*points.T, **style, zorder=zorder)
             handles.append(Line2D([], [], **style, label=kind))
