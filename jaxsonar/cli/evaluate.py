@@ -40,8 +40,8 @@ def run(options: argparse.Namespace) -> None:
     import numpy as np
 
     from jaxsonar.evaluation.map_accuracy import evaluate as evaluate_map
-    from jaxsonar.fileio.atomic_files import check_outputs
     from jaxsonar.evaluation.point_accuracy import KIND_OF_REFERENCE, evaluate_points
+    from jaxsonar.fileio.atomic_files import check_outputs
     from jaxsonar.mapping.global_map import POINT_KINDS
     from jaxsonar.mapping.map_geojson import load_points, load_walls
     from jaxsonar.reports.terminal_tables import evaluation_table, point_table

@@ -116,9 +116,10 @@ def find_reflectors(
         if max(before / sigma, sigma / before) < settings.same_sigma:
             break
     found, replaced = _with_walls(residual, heard, long, found, sigma + settings.model_error / settings.gate)
-    position = np.array([one.position for one in found if not one.is_wall]).reshape(-1, 2)
-    replaced_points = np.zeros(len(points), dtype=bool)
-    replaced_points[near_points(points, position, settings.vertex_distance)] = True
+    points_found = [one for one in found if not one.is_wall]
+    position = np.array([one.position for one in points_found]).reshape(-1, 2)
+    reach = settings.vertex_distance + np.nan_to_num([one.radius for one in points_found])
+    replaced_points = (np.linalg.norm(points[:, None] - position, axis=-1) < reach).any(axis=1)
     replaced_points[at_walls] = False
     return FoundReflectors(tuple(found), replaced, replaced_points, sigma)
 
