@@ -61,8 +61,9 @@ class EvidenceSettings:
     max_gap: float = 0.7
     """Upper limit of the gap that fusion closes between two segments, metres; more than two neighboring scans leave
     unobserved of a wall between them."""
-    bridged_gap: float = 1.0
-    """Largest part of a wall that may be occluded, metres. A gap that was seen through stays open, however small."""
+    bridged_gap: float = 1.5
+    """Largest part of a wall that may be occluded or unobserved, metres, as ``max_extension``. A gap that was seen
+    through stays open, however small."""
     inner_share: float = 0.8
     """No wall comes closer to the center of the robot than this share of the distance of its innermost sensor, ..."""
     max_half_width: float = 0.1

@@ -60,7 +60,7 @@ class FoundReflectors:
     reflectors: tuple[Reflector, ...]
     """Those with most evidence first found first."""
     replaced_walls: Bool[np.ndarray, " walls"]
-    """Short walls whose echoes a reflector of another kind explains."""
+    """Short walls whose echoes a reflector of another kind explains, and mirror images behind other walls."""
     replaced_points: Bool[np.ndarray, " points"]
     """Points at the position of a reflector."""
     sigma: float
@@ -83,12 +83,14 @@ def find_reflectors(
         sigma: standard deviation of ranges if the walls do not show it, metres.
     """
     settings = SETTINGS.explanation
-    long = lengths(walls) >= settings.released_length
     heard = np.flatnonzero(np.isfinite(measurements.distance))
     if not len(heard):
         return FoundReflectors((), np.zeros(len(walls), dtype=bool), np.zeros(len(points), dtype=bool), sigma)
     echoes = measurements.take(heard)
     residual = wall_residuals(echoes, walls)
+    ghosts = _ghost_walls(echoes, walls, residual, sigma)
+    walls, residual = walls[~ghosts], residual[:, ~ghosts]
+    long = lengths(walls) >= settings.released_length
     for chosen in (residual[:, long], residual):
         scatter = range_scatter(chosen)
         if not np.isnan(scatter):
@@ -121,7 +123,41 @@ def find_reflectors(
     reach = settings.vertex_distance + np.nan_to_num([one.radius for one in points_found])
     replaced_points = (np.linalg.norm(points[:, None] - position, axis=-1) < reach).any(axis=1)
     replaced_points[at_walls] = False
-    return FoundReflectors(tuple(found), replaced, replaced_points, sigma)
+    removed = ghosts.copy()
+    removed[~ghosts] = replaced
+    return FoundReflectors(tuple(found), removed, replaced_points, sigma)
+
+
+def _ghost_walls(
+    echoes: RangeMeasurements,
+    walls: Float[np.ndarray, "walls 2 2"],
+    residual: Float[np.ndarray, "rows walls"],
+    sigma: float,
+) -> Bool[np.ndarray, " walls"]:
+    """Walls behind other walls whose echoes two other walls in turn explain.
+
+    Args:
+        echoes: all echoes.
+        walls: both ends, metres.
+        residual: as from ``wall_residuals``.
+        sigma: standard deviation of ranges if the walls do not show it, metres.
+    """
+    settings = SETTINGS.explanation
+    scatter = range_scatter(residual)
+    wide = max(sigma if np.isnan(scatter) else scatter, settings.min_sigma) + settings.model_error / settings.gate
+    fits = np.abs(residual) < settings.gate * wide
+    ghosts = np.zeros(len(walls), dtype=bool)
+    for wall in np.argsort(fits.sum(axis=0), kind="stable").tolist():
+        rows, others = np.flatnonzero(fits[:, wall]), ~ghosts
+        others[wall] = False
+        if not len(rows) or not others.any():
+            continue
+        own = echoes.take(rows)
+        tangent = (walls[wall, 1] - walls[wall, 0]) / max(float(lengths(walls[wall : wall + 1])[0]), 1e-9)
+        foot = walls[wall, 0] + ((own.origin - walls[wall, 0]) @ tangent)[:, None] * tangent
+        if hidden_by_walls(own.origin, foot, walls[others]).mean() > settings.ghost_share:
+            ghosts[wall] = explained_by_two_walls(own, walls[others], wide).mean() > settings.ghost_share
+    return ghosts
 
 
 def _search(

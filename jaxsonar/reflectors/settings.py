@@ -142,6 +142,9 @@ class ExplainedEchoSettings:
     """Echoes within this distance of a wall determine the scatter of the ranges, metres."""
     model_error: float = 0.005
     """Error of the walls that is added to the gate, metres."""
+    ghost_share: float = 0.7
+    """Share of the echoes of a wall that other walls must hide, and explain by two reflections, before it counts as a
+    mirror image."""
     vertex_distance: float = 0.1
     """A point this close to the end of a wall, or to where two walls meet, belongs to them; one this close to a found
     reflector is the same, metres."""
