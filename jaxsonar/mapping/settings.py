@@ -153,6 +153,11 @@ class EndpointSettings:
     """Standard deviation that a corner adds when it constrains a wall's line, metres."""
     max_point_sd: float = 0.1
     """A point with a larger standard deviation ends no wall, metres."""
+    max_unobserved: float = 0.3
+    """Largest distance from the last footpoint of a wall to the edge that ends it, if nothing else shows that the wall
+    goes on until there, metres."""
+    min_end_probability: float = 0.8
+    """Probability of corner or edge from which on an undecided reflector ends a wall."""
     face_margin: float = 0.1
     """Distance from the ends of a wall, and from other walls, at which its face begins, metres."""
     face_depth: float = 0.03
