@@ -17,7 +17,7 @@ from jaxsonar.reflectors.explained_echoes import (
     range_scatter,
     wall_residuals,
 )
-from jaxsonar.reflectors.kind_fit import CIRCLE, PLANE, KindFits, add_silences, fit_kinds, near_echoes
+from jaxsonar.reflectors.kind_fit import CIRCLE, EDGE, PLANE, KindFits, add_silences, fit_kinds, near_echoes
 from jaxsonar.reflectors.range_measurements import RangeMeasurements, independent_weights
 from jaxsonar.reflectors.settings import SETTINGS
 
@@ -109,7 +109,7 @@ def find_reflectors(
         left = left[~explained_by_two_walls(echoes.take(left), fixed, wide)]
         on_walls = np.abs(residual[np.ix_(left, ~long)].T) < SETTINGS.fit.start_gate
         seeds = _wall_seeds(walls[~long], echoes.origin[left], on_walls)
-        found = _search(measurements, heard[left], fixed, sigma, seeds, on_walls)
+        found = _search(measurements, heard[left], fixed, sigma, walls.reshape(-1, 2), seeds, on_walls)
         # Without long walls only the reflectors show the scatter of the ranges.
         squared = np.concatenate([one.residual for one in found] or [np.zeros(0)]) ** 2
         if long.any() or len(squared) < settings.min_scatter_echoes:
@@ -165,6 +165,7 @@ def _search(
     free: Int[np.ndarray, " free"],
     walls: Float[np.ndarray, "walls 2 2"],
     sigma: float,
+    ends: Float[np.ndarray, "ends 2"],
     wall_seeds: tuple[Float[np.ndarray, "short 2"], Float[np.ndarray, " short"]],
     on_walls: Bool[np.ndarray, "short free"],
 ) -> list[Reflector]:
@@ -175,6 +176,7 @@ def _search(
         free: rows of the echoes that nothing explains.
         walls: both ends of the walls that hide what is behind them, metres.
         sigma: standard deviation of ranges, metres.
+        ends: ends of all walls, metres.
         wall_seeds: centers and radii of circles that touch the short walls, metres.
         on_walls: echoes near each of these.
     """
@@ -200,7 +202,7 @@ def _search(
         wave = fit_kinds(measurements, free, weight, centers[chosen], radii[chosen], near[chosen] & is_free, sigma)
         wave = _refitted(measurements, free, is_free, weight, wave, sigma)
         for fits in sorted(wave, key=lambda fits: -np.inf if fits is None else -float(fits.evidence.max())):
-            one = None if fits is None else _decided(measurements, weight, fits, sigma, walls)
+            one = None if fits is None else _decided(measurements, weight, fits, sigma, walls, ends)
             if one is not None and is_free[np.searchsorted(free, one.echoes)].mean() > SETTINGS.decision.min_free_share:
                 # What is hidden by a wall, or heard at one place only, is an artifact; its echoes are used up, too.
                 is_free[np.searchsorted(free, one.echoes)] = False
@@ -268,11 +270,14 @@ def _decided(
     fits: KindFits,
     sigma: float,
     walls: Float[np.ndarray, "walls 2 2"],
+    ends: Float[np.ndarray, "ends 2"],
 ) -> Reflector | None:
     """The reflector of the most likely kind, undecided if it is not much more likely; None without enough evidence."""
     settings = SETTINGS.decision
     evidence, count, gone = add_silences(measurements, weight, fits, sigma, walls)
     odds = evidence + np.log(settings.prior)
+    if len(near_points(fits.nearest[[EDGE]], ends, settings.end_distance)):
+        odds[EDGE] += np.log(settings.end_odds)
     probability = np.exp(odds - odds.max())
     probability /= probability.sum()
     best = int(np.argmax(probability))

@@ -65,7 +65,7 @@ class KindFitSettings:
     """Smallest radius of a circle, metres: about a wavelength. A thinner column is a pole, which answers as an edge."""
     max_radius: float = 1.0
     """Largest radius of a circle, metres; thicker columns are rare, and hardly differ from walls."""
-    view_margin: float = float(np.radians(30.0))
+    view_margin: float = float(np.radians(20.0))
     """Echoes belong to a reflector up to this far outside of the nominal beam, radians; near reflectors are loud."""
     gate: float = 3.5
     """Largest residual of an echo of a reflector, standard deviations."""
@@ -105,8 +105,8 @@ class ReflectorDecisionSettings:
     certain_view: float = 0.6
     """Part of the beam in which a measurement must hear a reflector."""
     certain_quantile: float = 0.5
-    """A measurement must hear a corner, an edge or a circle that is nearer than this quantile of its echoes: edges are
-    weak, and are heard from nearby only."""
+    """A measurement must hear a reflector that is nearer than this quantile of its echoes: edges are weak, and are heard
+    from nearby only."""
     certain_range: float = 0.9
     """Part of the maximum range in which it must."""
     most_missed: int = 3
@@ -119,6 +119,10 @@ class ReflectorDecisionSettings:
     """A reflector claims the echoes that it would cause as a kind of at least this probability."""
     prior: tuple[float, float, float, float] = (0.5, 0.15, 0.15, 0.2)
     """Prior probabilities of plane, corner, edge and circle: most reflectors of rooms are walls."""
+    end_distance: float = 0.15
+    """An edge this close to the end of a wall, metres, ..."""
+    end_odds: float = 100.0
+    """... is more likely by this factor: where a wall ends there is an edge, hardly ever a column."""
     hidden: float = 0.05
     """A reflector farther behind a wall than this is not visible, metres."""
 

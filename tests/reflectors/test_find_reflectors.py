@@ -93,7 +93,8 @@ def test_the_order_of_scans_does_not_matter_and_places_keep_their_latest_scans()
     whole = PosedScans.of(RING, scans)
     parts = PosedScans.of(RING, scans[3:]).union(PosedScans.of(RING, scans[:3]))
     one, two = whole.measurements(), parts.measurements()
-    assert one is not None and two is not None
+    assert one is not None
+    assert two is not None
     np.testing.assert_array_equal(one.distance, two.distance)
     again = whole.union(whole)
     assert sum(len(of_place) for of_place in again.places.values()) <= 3 * len(whole.places)
