@@ -277,7 +277,7 @@ def _decided(
     evidence, count, gone = add_silences(measurements, weight, fits, sigma, walls)
     odds = evidence + np.log(settings.prior)
     if len(near_points(fits.nearest[[EDGE]], ends, settings.end_distance)):
-        odds[EDGE] += np.log(settings.end_odds)
+        odds[CIRCLE] -= np.log(settings.end_odds)
     probability = np.exp(odds - odds.max())
     probability /= probability.sum()
     best = int(np.argmax(probability))

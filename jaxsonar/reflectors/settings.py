@@ -105,8 +105,8 @@ class ReflectorDecisionSettings:
     certain_view: float = 0.6
     """Part of the beam in which a measurement must hear a reflector."""
     certain_quantile: float = 0.5
-    """A measurement must hear a reflector that is nearer than this quantile of its echoes: edges are weak, and are heard
-    from nearby only."""
+    """A measurement must hear a reflector that is nearer than this quantile of its echoes: edges are heard from nearby
+    only."""
     certain_range: float = 0.9
     """Part of the maximum range in which it must."""
     most_missed: int = 3
@@ -120,9 +120,9 @@ class ReflectorDecisionSettings:
     prior: tuple[float, float, float, float] = (0.5, 0.15, 0.15, 0.2)
     """Prior probabilities of plane, corner, edge and circle: most reflectors of rooms are walls."""
     end_distance: float = 0.15
-    """An edge this close to the end of a wall, metres, ..."""
+    """A reflector this close to the end of a wall, metres, ..."""
     end_odds: float = 100.0
-    """... is more likely by this factor: where a wall ends there is an edge, hardly ever a column."""
+    """... is less likely to be a circle by this factor: where a wall ends there is an edge, hardly ever a column."""
     hidden: float = 0.05
     """A reflector farther behind a wall than this is not visible, metres."""
 
