@@ -53,5 +53,6 @@ from .simulation.random_rooms import random_pose as random_pose
 from .simulation.random_rooms import random_room as random_room
 from .simulation.simulator import Simulation as Simulation
 from .simulation.simulator import simulate as simulate
+from .simulation.walker import Walker as Walker
 from .smoothing.smooth_log import Smoothed as Smoothed
 from .smoothing.smooth_log import smooth as smooth

@@ -2,10 +2,14 @@
 
 import argparse
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import numpy as np
+
+    from jaxsonar.sensors.ring import Ring
+    from jaxsonar.simulation.walker import Walker
 
 from jaxsonar.cli.arguments import RING_HELP, filename, finite, number, odometry_error
 from jaxsonar.cli.console import print_status, progress_bar, settings_filename
@@ -16,7 +20,9 @@ SUMMARY = "Simulate the echoes of a ring along a trajectory through a room."
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``jaxsonar simulate``."""
-    parser.add_argument("room", metavar="ROOM", help="room GeoJSON: walls, polygons, points of kind pole; metres")
+    parser.add_argument(
+        "room", metavar="ROOM", help="room GeoJSON: walls, polygons, points of kind pole or circle; metres"
+    )
     parser.add_argument("--ring", required=True, help=RING_HELP)
     parser.add_argument("--path", required=True, metavar="CSV", help="poses: columns x, y (m), theta (rad), [stamp]")
     parser.add_argument("-o", "--output", metavar="LOG", required=True, help=".csv or .parquet; - = CSV on stdout")
@@ -35,6 +41,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("soft", "hard"),
         default="soft",
         help="soft: by amplitude, also outside of the cones; hard: only within both cones (default: soft)",
+    )
+    parser.add_argument(
+        "--no-crosstalk",
+        action="store_true",
+        help="no echoes of other sensors of the firing group; with hard beams there are none anyway",
+    )
+    parser.add_argument(
+        "--walker",
+        action="append",
+        default=None,
+        metavar="CSV[:RADIUS]",
+        help="a walking person: columns stamp (s), x, y (m); radius in metres (default: 0.2); may come several times",
     )
     parser.add_argument("--seed", type=number(int, 0, 2**32 - 1), default=0, help="seed of the noise (default: 0)")
     parser.add_argument(
@@ -67,10 +85,12 @@ def run(options: argparse.Namespace) -> None:
     from jaxsonar.scans.scan_log import log_format
     from jaxsonar.simulation.poses_csv import load_poses
     from jaxsonar.simulation.simulator import simulate as simulate_scans
+    from jaxsonar.simulation.walker import load_walker
 
     settings_file = settings_filename(options.output)
     outputs = {"-o": options.output, "settings beside the log:": settings_file, "--truth": options.truth}
-    check_outputs(outputs, [options.room, options.ring, options.path])
+    sources = [_walker_source(text) for text in options.walker or ()]
+    check_outputs(outputs, [options.room, options.ring, options.path, *(file for file, _ in sources)])
     if options.output == "-" and options.truth == "-":
         raise SonarError("--truth -: the log goes to standard output, too; allowed are different places")
     if options.output != "-":
@@ -79,6 +99,10 @@ def run(options: argparse.Namespace) -> None:
     ring, room = load_checked_ring(options.ring, messages), load_room(options.room)
     poses, stamps = load_poses(options.path)
     messages.warn_of_room(room, poses, stamps)
+    walkers = [load_walker(*source) for source in sources]
+    for (file, _), walker in zip(sources, walkers, strict=True):
+        _warn_of_walker(messages, file, walker, ring, poses, stamps)
+    _warn_of_columns(messages, room.circles, ring, poses)
     messages.warn_of_noise(options.sigma, drift=options.drift, clutter=options.clutter)
     messages.check()
     with progress_bar("scans", len(poses)) as show:
@@ -92,7 +116,9 @@ def run(options: argparse.Namespace) -> None:
             clutter=options.clutter,
             seed=options.seed,
             beams=options.beams,
+            crosstalk=False if options.no_crosstalk else None,
             max_echoes=options.max_echoes,
+            walkers=walkers,
             stamps=stamps,
             progress=lambda done, _: show(done),
         )
@@ -115,6 +141,60 @@ def run(options: argparse.Namespace) -> None:
             settings_file,
         )
     print_status(f"{len(log)} scans, {len(log.range)} echoes")
+
+
+def _walker_source(text: str) -> tuple[str, float]:
+    """File and radius (metres) of ``--walker CSV[:RADIUS]``."""
+    from jaxsonar.fileio.atomic_files import shown
+    from jaxsonar.hardware.errors import SonarError
+    from jaxsonar.simulation.walker import WALKER_RADIUS
+
+    file, colon, radius = text.rpartition(":")
+    if not (colon and file) or Path(text).exists():
+        return text, WALKER_RADIUS
+    try:
+        return file, float(radius)
+    except ValueError:
+        came = f"--walker {shown(text)}: radius {shown(radius, 40)!r} came"
+        raise SonarError(f"{came}; allowed is CSV or CSV:RADIUS, the radius a number of metres") from None
+
+
+def _warn_of_columns(messages: InputMessages, circles: "np.ndarray", ring: "Ring", poses: "np.ndarray") -> None:
+    """Warn of circles of the room (x, y, radius) that overlap the robot; those in another unit have a warning."""
+    import numpy as np
+
+    from jaxsonar.plausibility.implausible_room import ROOM_SETTINGS
+
+    reach = float(np.linalg.norm(np.asarray(ring.position), axis=-1).max())
+    for x, y, radius in circles.tolist():
+        inside = np.flatnonzero(np.hypot(*(poses[:, :2] - (x, y)).T) < radius + reach)
+        if len(inside) and radius <= ROOM_SETTINGS.column:
+            found = f"the robot overlaps the circle at ({x:g}, {y:g}) in {len(inside)} of {len(poses)} scans"
+            cause = "sensors inside of it detect nothing; room and path are probably not in one frame"
+            messages.warn(f"{found}, first in scan {inside[0]}; {cause}; give both in one frame")
+
+
+def _warn_of_walker(
+    messages: InputMessages, file: str, walker: "Walker", ring: "Ring", poses: "np.ndarray", stamps: "np.ndarray"
+) -> None:
+    """Warn of a person who overlaps the robot, never comes near it, or walks at another time."""
+    import numpy as np
+
+    from jaxsonar.fileio.atomic_files import shown
+    from jaxsonar.simulation.walker import distances_to_robot
+
+    distance = distances_to_robot(walker, poses, stamps)
+    reach = float(np.linalg.norm(np.asarray(ring.position), axis=-1).max())
+    inside = np.flatnonzero(distance < reach)
+    if len(inside):
+        found = f"the robot overlaps the person in {len(inside)} of {len(poses)} scans, first in scan {inside[0]}"
+        messages.warn(f"{shown(file)}: {found}; sensors inside of a person detect nothing")
+    elif distance.min() > reach + ring.max_range:
+        found = f"the person stays {distance.min():g} m or more from the robot, out of range"
+        messages.warn(f"{shown(file)}: {found}; give positions in metres, in the frame of the room")
+    if len(walker.stamps) > 1 and (walker.stamps[0] > stamps[-1] or walker.stamps[-1] < stamps[0]):
+        when = f"{walker.stamps[0]:g} to {walker.stamps[-1]:g} s, the scans last from {stamps[0]:g} to {stamps[-1]:g} s"
+        messages.warn(f"{shown(file)}: the person walks from {when}; give stamps of the same clock")
 
 
 def _logged_poses(poses: "np.ndarray", options: argparse.Namespace) -> "np.ndarray":

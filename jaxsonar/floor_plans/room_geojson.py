@@ -109,6 +109,8 @@ def _round(properties: dict[str, Any], position: np.ndarray) -> np.ndarray:
         if radius is not None:
             raise SonarError("radius of a pole; allowed is it with kind circle, because poles have no thickness")
         return np.append(position, 0.0)
+    if radius is None:
+        raise SonarError("circle without radius; allowed is a number above 0, metres")
     if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0 < radius < 1e6:
         raise SonarError(f"circle of radius {radius!r:.60}; allowed is a number above 0, metres")
     return np.append(position, float(radius))

@@ -17,12 +17,12 @@ def trace_circles(scene: TracingScene) -> TracedEchoes:
     The path over this point is the shortest one between the sensors over the circle. The point lies between the
     directions of the two sensors from the center, and is found by bisection.
     """
-    center, radius = scene.circles[:, :2], scene.circles[:, 2]
+    center, radius = scene.circles[..., :2], scene.circles[..., 2]
     away = np.linalg.norm(scene.hub[:, None] - center, axis=-1) - radius
     group, circle = np.nonzero(away <= scene.max_range + scene.radius[:, None])
     i, j = scene.pairs.T
-    offset = scene.sensors[group] - center[circle, None]
-    r = radius[circle, None]
+    offset = scene.sensors[group] - center[group, circle, None]
+    r = radius[group, circle, None]
     angle = np.arctan2(offset[..., 1], offset[..., 0])
     begin, turn = angle[:, i], wrap_angle(angle[:, j] - angle[:, i])
     low, high = np.zeros_like(turn), np.ones_like(turn)
@@ -38,7 +38,7 @@ def trace_circles(scene: TracingScene) -> TracedEchoes:
     for k in (i, j):
         valid &= ((offset[:, k] - point) * normal).sum(-1) > TOLERANCE
     row, pair = np.nonzero(valid)
-    hit = point[row, pair] + center[circle[row]]
+    hit = point[row, pair] + center[group[row], circle[row]]
     return scene.audible(
         TracedEchoes.of_kind(EchoKind.CIRCLE, group[row], pair, circle[row], length[row, pair], hit, hit)
     )

@@ -26,6 +26,7 @@ def trace_echoes(
     axis: Float[np.ndarray, "groups sensors 2"] | None = None,
     half_beam: Float[np.ndarray, " sensors"] | None = None,
     acoustics: Acoustics | None = None,
+    moving: Float[np.ndarray, "groups moving 3"] | None = None,
 ) -> TracedEchoes:
     """All echoes between pairs of sensors, for many poses of one array at once.
 
@@ -50,8 +51,10 @@ def trace_echoes(
         axis: (groups, sensors, 2) unit vectors of the sensor axes, world frame; requires half_beam.
         half_beam: (sensors,) half the width of each cone, radians.
         acoustics: amplitudes and threshold for soft beams; requires axis and half_beam.
+        moving: (groups, moving, 3) centers x, y and radii of circles that move, metres. A radius is the same in all
+            groups. Their indices as reflectors follow those of the circles of the room.
     """
-    scene = TracingScene.of(room, sensors, pairs, max_range, axis, half_beam, acoustics)
+    scene = TracingScene.of(room, sensors, pairs, max_range, axis, half_beam, acoustics, moving)
     junctions = room.junctions
     found = TracedEchoes.concatenate(
         [

@@ -19,9 +19,12 @@ def trace_planes(scene: TracingScene) -> TracedEchoes:
     for rows in row_slices(len(group), len(i)):
         g, w = group[rows], wall[rows]
         along, across = scene.walls.coordinates(w, scene.sensors[g])
-        row, pair, position, length = _reflect(
-            scene, w, scene.baseline2[g], along[:, i], across[:, i], along[:, j], across[:, j]
+        row, pair = scene.candidates(g, w, w)
+        tx, rx = (row, i[pair]), (row, j[pair])
+        echo, position, length = _reflect(
+            scene, w[row], scene.baseline2[g[row], pair], along[tx], across[tx], along[rx], across[rx]
         )
+        row, pair = row[echo], pair[echo]
         hit = scene.walls.point_at(w[row], position)
         found = TracedEchoes.of_kind(EchoKind.PLANE, g[row], pair, scene.index[w[row]], length, hit, hit)
         parts.append(scene.audible(found))
@@ -43,10 +46,13 @@ def trace_second_order(scene: TracingScene, right_angled: Bool[np.ndarray, "wall
             images = sensors - 2 * across_b[..., None] * scene.walls.normal(b)[:, None]
             along_image, across_image = scene.walls.coordinates(a, images)
             # The path tx -> a -> b -> rx equals tx -> a -> image of rx in b, with one reflection at a.
-            baseline2 = scene.baseline2[g] + 4 * across_b[:, i] * across_b[:, j]
-            row, pair, position, length = _reflect(
-                scene, a, baseline2, along_a[:, i], across_a[:, i], along_image[:, j], across_image[:, j]
+            row, pair = scene.candidates(g, a, b)
+            tx, rx = (row, i[pair]), (row, j[pair])
+            baseline2 = scene.baseline2[g[row], pair] + 4 * across_b[tx] * across_b[rx]
+            echo, position, length = _reflect(
+                scene, a[row], baseline2, along_a[tx], across_a[tx], along_image[rx], across_image[rx]
             )
+            row, pair = row[echo], pair[echo]
             first = scene.walls.point_at(a[row], position)
             along_first, across_first = (x[:, 0] for x in scene.walls.coordinates(b[row], first[:, None]))
             along_rx, across_rx = along_b[row, j[pair]], across_b[row, j[pair]]
@@ -125,20 +131,18 @@ def _drop_reversed_duplicates(found: TracedEchoes) -> TracedEchoes:
 def _reflect(
     scene: TracingScene,
     wall: Int[np.ndarray, " rows"],
-    baseline2: Float[np.ndarray, "rows pairs"],
-    along_tx: Float[np.ndarray, "rows pairs"],
-    across_tx: Float[np.ndarray, "rows pairs"],
-    along_rx: Float[np.ndarray, "rows pairs"],
-    across_rx: Float[np.ndarray, "rows pairs"],
-) -> tuple[
-    Int[np.ndarray, " found"], Int[np.ndarray, " found"], Float[np.ndarray, " found"], Float[np.ndarray, " found"]
-]:
-    """Reflections at a wall between two points in its frame: row, pair, position along the wall, path length."""
+    baseline2: Float[np.ndarray, " rows"],
+    along_tx: Float[np.ndarray, " rows"],
+    across_tx: Float[np.ndarray, " rows"],
+    along_rx: Float[np.ndarray, " rows"],
+    across_rx: Float[np.ndarray, " rows"],
+) -> tuple[Int[np.ndarray, " found"], Float[np.ndarray, " found"], Float[np.ndarray, " found"]]:
+    """Reflections at a wall between two points in its frame: row, position along the wall, path length."""
     product = across_tx * across_rx
     length2 = baseline2 + 4 * product
     with np.errstate(divide="ignore", invalid="ignore"):
         position = (along_tx * across_rx + along_rx * across_tx) / (across_tx + across_rx)
     valid = (product > 0) & (length2 <= (2 * scene.max_range) ** 2)
-    valid &= (position >= -TOLERANCE) & (position <= scene.walls.length[wall, None] + TOLERANCE)
-    row, pair = np.nonzero(valid)
-    return row, pair, position[row, pair], np.sqrt(length2[row, pair])
+    valid &= (position >= -TOLERANCE) & (position <= scene.walls.length[wall] + TOLERANCE)
+    row = np.flatnonzero(valid)
+    return row, position[row], np.sqrt(length2[row])

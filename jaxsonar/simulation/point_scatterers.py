@@ -63,5 +63,5 @@ def _trace_points(
     needed = np.zeros_like(visible)
     needed[row, i[pair]] = needed[row, j[pair]] = True
     at_row, sensor = np.nonzero(needed)
-    needed[at_row, sensor] = ~scene.block(scene.sensors[g[at_row], sensor], points[point[at_row]])
+    needed[at_row, sensor] = ~scene.block(g[at_row], scene.sensors[g[at_row], sensor], points[point[at_row]])
     return found[needed[row, i[pair]] & needed[row, j[pair]]]

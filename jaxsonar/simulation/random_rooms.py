@@ -7,6 +7,13 @@ from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.segments import crossings, point_to_segments
 from jaxsonar.hardware.errors import SonarError
 
+MAX_COLUMNS = 8
+"""Largest number of columns of a random room; more seldom fit into it."""
+COLUMN_RADIUS = (0.05, 0.3)
+"""Smallest and largest radius of a random column, metres: from a pipe to a pillar."""
+COLUMN_GAP = 0.1
+"""Smallest distance of a random column from walls, poles and other columns, metres, as of other obstacles."""
+
 
 def random_room(
     rng: np.random.Generator,
@@ -15,6 +22,7 @@ def random_room(
     box: float = 0.3,
     segment: float = 0.4,
     pole: float = 0.3,
+    columns: float = 0.0,
 ) -> Room:
     """A random closed room, 3 to 6 m wide, with 4 to 7 walls in any orientation; a ring of 2 m range detects walls.
 
@@ -26,7 +34,15 @@ def random_room(
         box: probability that the room contains a box (0.3 to 0.6 m).
         segment: probability that the room contains a free-standing wall (0.3 to 0.8 m).
         pole: probability that the room contains a pole.
+        columns: expected number of round columns of 0.05 to 0.3 m radius: 0.5 is one column in half of the rooms, 3 are
+            three in each. Many columns make the search long.
+
+    Raises:
+        SonarError: a number of columns out of range.
     """
+    if not 0 <= columns <= MAX_COLUMNS:
+        raise SonarError(f"random_room: columns {columns:g}; allowed is 0 to {MAX_COLUMNS}")
+    count = int(columns) + int(columns % 1 > 0 and rng.random() < columns % 1)
     while True:
         outline = _rectangle(rng.uniform(3.0, 5.0, 2)) if rng.random() < 0.5 else _polygon(rng)
         if rng.random() < recess:
@@ -47,7 +63,8 @@ def random_room(
             names += ("segment",)
         if rng.random() < pole:
             poles = rng.uniform(low, high, (1, 2))
-        room = Room(np.concatenate(parts), names, poles)
+        circles = np.column_stack([rng.uniform(low, high, (count, 2)), rng.uniform(*COLUMN_RADIUS, count)])
+        room = Room(np.concatenate(parts), names, poles, circles)
         if _is_usable(room, len(shell), rng):
             return room
 
@@ -60,7 +77,7 @@ def random_pose(rng: np.random.Generator, room: Room, *, clearance: float = 0.45
     Args:
         rng: random generator.
         room: the floor plan.
-        clearance: smallest distance of the robot's center from any wall or pole, metres.
+        clearance: smallest distance of the robot's center from any wall, pole or circle, metres.
 
     Raises:
         SonarError: no such pose was found, because the room is open or too small.
@@ -101,8 +118,23 @@ def _is_usable(room: Room, shell: int, rng: np.random.Generator) -> bool:
     obstacles = np.concatenate([room.walls[shell:].reshape(-1, 2), room.poles])
     if len(obstacles) and not _free(outer, obstacles, 0.1).all():
         return False
+    if len(room.circles) and not _columns_apart(outer, room):
+        return False
     points = rng.uniform(room.walls.min((0, 1)), room.walls.max((0, 1)), (256, 2))
     return int(np.count_nonzero(_free(room, points, 0.5))) >= 16
+
+
+def _columns_apart(outer: Room, room: Room) -> bool:
+    """Whether all columns stand inside the outer walls, and COLUMN_GAP from walls, poles and each other."""
+    center, radius = room.circles[:, :2], room.circles[:, 2]
+    apart = np.linalg.norm(center[:, None] - center, axis=-1) - radius - radius[:, None]
+    np.fill_diagonal(apart, np.inf)
+    gaps = (
+        point_to_segments(center, room.walls) - radius[:, None],
+        np.linalg.norm(center[:, None] - room.poles, axis=-1) - radius[:, None],
+        apart,
+    )
+    return all((gap >= COLUMN_GAP).all() for gap in gaps) and bool(_free(outer, center, COLUMN_GAP).all())
 
 
 def _rectangle(size: np.ndarray) -> np.ndarray:

@@ -3,27 +3,24 @@
 The geometry is exact (``echo_tracing``). Amplitudes determine which echoes a threshold detector reports.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsonar.floor_plans.room import Room
-from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.hardware.messages import REFERENCE_SPEED_OF_SOUND
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
-from jaxsonar.simulation.acoustics import Acoustics, amplitudes, ranks, unblanked
-from jaxsonar.simulation.echo_tracing import trace_echoes
-from jaxsonar.simulation.traced_echoes import EchoKind
+from jaxsonar.simulation.acoustics import Acoustics, ranks
+from jaxsonar.simulation.echo_detection import BEAMS, detect_echoes
+from jaxsonar.simulation.traced_echoes import EchoColumns, EchoKind
+from jaxsonar.simulation.transducer_array import TransducerArray
+from jaxsonar.simulation.walker import Walker, circles_of_walkers
 
 SCAN_PERIOD = 0.1
 """Time between scans without stamps, seconds: about the period of the paper's ring (8 firing groups of 11.7 ms)."""
-Beams = Literal["soft", "hard"]
-"""Models of the beams; see ``simulate``."""
 MIN_CLUTTER_RANGE = 0.1
 """Smallest range of false echoes, metres; chosen by hand."""
 
@@ -41,10 +38,15 @@ class Simulation:
     amplitude: Float[np.ndarray, " echoes"]
     """Relative to a wall on the axis at 1 m (``Acoustics``)."""
     kind: Int[np.ndarray, " echoes"]
-    """Ground truth: reflector type, a value of ``EchoKind``."""
+    """Ground truth: type of the reflector or of the false echo, a value of ``EchoKind``."""
     reflector: Int[np.ndarray, " echoes"]
-    """Ground truth: wall (the first of two for second order), vertex of ``Room.junctions`` (corner, edge) or pole; -1
-    for clutter."""
+    """Ground truth: wall (the first of two for second order), vertex of ``Room.junctions`` (corner, edge), pole or
+    circle (those of the room, then the walkers); -1 for clutter."""
+    reflector_kind: Int[np.ndarray, " echoes"]
+    """Ground truth: type of the reflector; as ``kind``, except that crosstalk has the type of its reflector."""
+    transmitter: Int[np.ndarray, " echoes"]
+    """Ground truth: sensor whose sound it was. It is the transmitter of the path, also for clutter, but for crosstalk
+    another sensor of the same firing group."""
     stamps: Float[np.ndarray, " scans"]
     """Seconds, one for every pose."""
 
@@ -85,7 +87,9 @@ def simulate(
     max_echoes: int = 3,
     blanking: float = 0.03,
     acoustics: Acoustics | None = None,
-    beams: Beams = "soft",
+    beams: str = "soft",
+    crosstalk: bool | None = None,
+    walkers: Sequence[Walker] = (),
     stamps: Float[np.ndarray, " scans"] | None = None,
     progress: Callable[[int, int], None] | None = None,
     chunk: int = 128,
@@ -104,9 +108,9 @@ def simulate(
             is the mean of its two sensors.
         drift_time: correlation time of the drift (to 1/e), seconds.
         dropout: probability that an echo is lost, 0 to 1.
-        clutter: expected number of false echoes per true echo of the scan before dropout. Their number is Poisson
-            distributed; they occur on paths with overlapping cones, with uniform ranges from 0.1 m and amplitudes up to
-            ten thresholds.
+        clutter: expected number of false echoes per true echo of the scan before dropout; crosstalk does not count.
+            Their number is Poisson distributed; they occur on paths with overlapping cones, with uniform ranges from
+            0.1 m and amplitudes up to ten thresholds.
         seed: seed of all random streams.
         max_echoes: a path reports at most this many echoes, the nearest ones, clutter included.
         blanking: an echo that is less than this behind the previous reported one is not detected (half path length,
@@ -114,7 +118,12 @@ def simulate(
         acoustics: amplitudes and detection threshold; ``Acoustics()`` if omitted.
         beams: "soft": a path detects every echo whose amplitude reaches the threshold, also outside of the nominal
             cones, up to 90 deg off the axes. "hard": only echoes within both cones.
-        stamps: (scans,) seconds, not decreasing; 0.1 s apart if omitted. Only the drift depends on them.
+        crosstalk: whether a receiver also detects echoes of the other transmitters of the firing group
+            (``Ring.firing_groups``). They are reported on its path of this group, with half the true path length from
+            their transmitter; their kind is ``EchoKind.CROSSTALK``. Default: with soft beams.
+        walkers: walking persons. Each is a circle at its position at the stamp of the scan; their indices as reflectors
+            follow those of the circles of the room. Sensors inside of a person detect nothing.
+        stamps: (scans,) seconds, not decreasing; 0.1 s apart if omitted. Only drift and walkers depend on them.
         progress: called with (scans done, all scans) from time to time.
         chunk: number of scans that are traced at once; does not change the result.
 
@@ -123,169 +132,64 @@ def simulate(
     """
     acoustics = Acoustics() if acoustics is None else acoustics
     times = np.arange(len(poses)) * SCAN_PERIOD if stamps is None else np.array(stamps, dtype=np.float64)
-    if beams not in get_args(Beams):
-        raise SonarError(f"simulate: beams {beams!r}; allowed is {' or '.join(get_args(Beams))}")
+    if beams not in BEAMS:
+        raise SonarError(f"simulate: beams {beams!r}; allowed is {' or '.join(BEAMS)}")
     _check(poses, times, sigma, drift, drift_time, dropout, clutter, seed, max_echoes, blanking, chunk)
     # Trace the echoes and detect those above the threshold.
-    array = _TransducerArray.of(ring)
-    parts = [_Echoes.empty()]
+    array = TransducerArray.of(ring, crosstalk=beams == "soft" if crosstalk is None else crosstalk)
+    parts = [EchoColumns.empty()]
     for begin in range(0, len(poses), chunk):
-        detected = _detect(array, room, poses[begin : begin + chunk], acoustics, beams, max_echoes, blanking)
-        parts.append(_both_directions(array, detected._replace(scan=detected.scan + begin)))
+        detected = detect_echoes(
+            array,
+            room,
+            poses[begin : begin + chunk],
+            circles_of_walkers(walkers, times[begin : begin + chunk]),
+            acoustics=acoustics,
+            beams=beams,
+            max_echoes=max_echoes,
+            blanking=blanking,
+        )
+        parts.append(detected._replace(scan=detected.scan + begin))
         if progress is not None:
             progress(min(begin + chunk, len(poses)), len(poses))
-    echoes = _Echoes.concatenate(parts).sorted()
+    echoes = EchoColumns.concatenate(parts).sorted()
     # Draw all errors at once in the order of the sorted echoes, so that chunks do not influence them.
     noise_rng, drift_rng, dropout_rng, clutter_rng = np.random.default_rng(seed).spawn(4)
     false = _clutter(array, echoes, len(poses), clutter, acoustics.threshold, clutter_rng)
     sensor_drift = _drift(times, len(array.heading), drift, drift_time, drift_rng)
-    tx, rx = array.paths[echoes.path].T
-    error = (sensor_drift[echoes.scan, tx] + sensor_drift[echoes.scan, rx]) / 2
+    rx = array.paths[echoes.path, 1]
+    error = (sensor_drift[echoes.scan, echoes.transmitter] + sensor_drift[echoes.scan, rx]) / 2
     error += sigma * noise_rng.standard_normal(len(error))
     received = dropout_rng.random(len(error)) >= dropout
     # Convert to reported ranges, lose echoes, add clutter.
-    echoes = _Echoes(*(column[received] for column in array.reported(echoes, error)))
-    echoes = _Echoes.concatenate([echoes, array.reported(false, 0.0)]).sorted()
+    echoes = EchoColumns(*(column[received] for column in array.reported(echoes, error)))
+    echoes = EchoColumns.concatenate([echoes, array.reported(false, 0.0)]).sorted()
     # A path reports at most max_echoes echoes, and none with a negative time of flight.
     kept = (ranks(echoes.scan * len(array.paths) + echoes.path) < max_echoes) & (echoes.range > 0)
-    scan, path, reported, amplitude, kind, reflector, _ = (column[kept] for column in echoes)
-    return Simulation(scan, path, reported, amplitude, kind, reflector, times)
-
-
-class _Echoes(NamedTuple):
-    """Columns of echoes."""
-
-    scan: Int[np.ndarray, " echoes"]
-    path: Int[np.ndarray, " echoes"]
-    """At first an unordered pair of sensors, later a row of ``Ring.paths``."""
-    range: Float[np.ndarray, " echoes"]
-    """At first half the true path length, later the reported range, metres."""
-    amplitude: Float[np.ndarray, " echoes"]
-    kind: Int[np.ndarray, " echoes"]
-    reflector: Int[np.ndarray, " echoes"]
-    second: Int[np.ndarray, " echoes"]
-    """Second wall; the first one in the opposite direction."""
-
-    @classmethod
-    def empty(cls) -> "_Echoes":
-        """No echoes."""
-        index, real = np.zeros(0, dtype=int), np.zeros(0)
-        return cls(index, index, real, real, index, index, index)
-
-    @classmethod
-    def concatenate(cls, parts: list["_Echoes"]) -> "_Echoes":
-        """All echoes of several parts."""
-        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-    def sorted(self) -> "_Echoes":
-        """The echoes by scan, path and range; ties by the reflector."""
-        order = np.lexsort((self.second, self.reflector, self.kind, self.range, self.path, self.scan))
-        return _Echoes(*(column[order] for column in self))
-
-
-class _TransducerArray(NamedTuple):
-    """A ring as plain arrays. (i, j) and (j, i) give the same echoes, so each unordered pair is traced once."""
-
-    position: Float[np.ndarray, "sensors 2"]
-    heading: Float[np.ndarray, " sensors"]
-    half_beam: Float[np.ndarray, " sensors"]
-    max_range: float
-    speed: float
-    paths: Int[np.ndarray, "paths 2"]
-    offset: Float[np.ndarray, " paths"]
-    overlapping: Int[np.ndarray, " overlapping"]
-    """Paths whose cones overlap."""
-    pairs: Int[np.ndarray, "pairs 2"]
-    """Unordered pairs of sensors."""
-    paths_of_pair: Int[np.ndarray, "pairs 2"]
-    """Paths in both directions; -1 if the ring has none."""
-
-    @classmethod
-    def of(cls, ring: Ring) -> "_TransducerArray":
-        heading, beam, offset = (np.asarray(x, dtype=np.float64) for x in (ring.heading, ring.beam, ring.range_offset))
-        tx, rx = ring.paths.T
-        pairs, pair = np.unique(np.sort(ring.paths, axis=1), axis=0, return_inverse=True)
-        paths_of_pair = np.full((len(pairs), 2), -1)
-        paths_of_pair[pair, (tx > rx).astype(int)] = np.arange(len(tx))
-        between_axes = np.abs(wrap_angle(heading[tx] - heading[rx]))
-        return cls(
-            position=np.asarray(ring.position, dtype=np.float64),
-            heading=heading,
-            half_beam=beam / 2,
-            max_range=ring.max_range,
-            speed=float(ring.speed_of_sound),
-            paths=ring.paths,
-            offset=(offset[tx] + offset[rx]) / 2,
-            overlapping=np.flatnonzero(between_axes < (beam[tx] + beam[rx]) / 2),
-            pairs=pairs,
-            paths_of_pair=paths_of_pair,
-        )
-
-    def reported(self, echoes: _Echoes, error: Float[np.ndarray, " echoes"] | float) -> _Echoes:
-        """Echoes with reported ranges instead of half path lengths."""
-        scale = REFERENCE_SPEED_OF_SOUND / self.speed
-        return echoes._replace(range=echoes.range * scale + self.offset[echoes.path] + error)
-
-
-def _detect(
-    array: _TransducerArray,
-    room: Room,
-    poses: Float[np.ndarray, "scans 3"],
-    acoustics: Acoustics,
-    beams: Beams,
-    max_echoes: int,
-    blanking: float,
-) -> _Echoes:
-    """Echoes that a threshold detector reports in some scans, with exact ranges."""
-    cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
-    x, y = array.position.T
-    sensors = poses[:, None, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-    heading = poses[:, 2, None] + array.heading
-    axis = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    found = trace_echoes(
-        room,
-        sensors,
-        array.pairs,
-        max_range=array.max_range,
-        axis=axis,
-        half_beam=array.half_beam,
-        acoustics=acoustics if beams == "soft" else None,
-    )
-    amplitude = amplitudes(found, array.pairs, sensors, axis, array.half_beam, acoustics, room.circles[:, 2])
-    loud = amplitude >= acoustics.threshold
-    found, amplitude = found[loud], amplitude[loud]
-    order = np.lexsort((found.second, found.reflector, found.kind, found.length, found.pair, found.group))
-    found, amplitude = found[order], amplitude[order]
-    kept = unblanked(found.group * len(array.pairs) + found.pair, found.length / 2, blanking, max_echoes)
-    found, amplitude = found[kept], amplitude[kept]
-    return _Echoes(found.group, found.pair, found.length / 2, amplitude, found.kind, found.reflector, found.second)
-
-
-def _both_directions(array: _TransducerArray, echoes: _Echoes) -> _Echoes:
-    """Echoes of pairs as echoes of both paths; in the opposite direction the order of the walls is reversed."""
-    forward, backward = array.paths_of_pair[echoes.path].T
-    last_wall = np.where(echoes.kind == EchoKind.SECOND_ORDER, echoes.second, echoes.reflector)
-    reverse = echoes._replace(path=backward, reflector=last_wall)
-    both = _Echoes.concatenate([echoes._replace(path=forward), reverse])
-    return _Echoes(*(column[both.path >= 0] for column in both))
+    columns = {name: column[kept] for name, column in echoes._asdict().items() if name != "second"}
+    return Simulation(**columns, stamps=times)
 
 
 def _clutter(
-    array: _TransducerArray, echoes: _Echoes, scans: int, clutter: float, threshold: float, rng: np.random.Generator
-) -> _Echoes:
+    array: TransducerArray, echoes: EchoColumns, scans: int, clutter: float, threshold: float, rng: np.random.Generator
+) -> EchoColumns:
     """False echoes of all scans."""
     if not len(array.overlapping):
-        return _Echoes.empty()
-    count = rng.poisson(clutter * np.bincount(echoes.scan, minlength=scans))
+        return EchoColumns.empty()
+    own = echoes.kind != EchoKind.CROSSTALK
+    count = rng.poisson(clutter * np.bincount(echoes.scan[own], minlength=scans))
     total = int(count.sum())
     nearest = min(MIN_CLUTTER_RANGE, array.max_range)
-    return _Echoes(
+    path = rng.choice(array.overlapping, total)
+    return EchoColumns(
         scan=np.repeat(np.arange(scans), count),
-        path=rng.choice(array.overlapping, total),
+        path=path,
         range=rng.uniform(nearest, array.max_range, total),
         amplitude=threshold * 10 ** rng.random(total),
         kind=np.full(total, int(EchoKind.CLUTTER)),
         reflector=np.full(total, -1),
+        reflector_kind=np.full(total, int(EchoKind.CLUTTER)),
+        transmitter=array.paths[path, 0],
         second=np.full(total, -1),
     )
 

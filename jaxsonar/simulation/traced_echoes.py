@@ -1,8 +1,9 @@
-"""Containers of traced echoes: exact lengths of sound paths with the reflector that caused each of them."""
+"""Containers of traced echoes, and of the echoes that paths report, with the reflector that caused each of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,6 +26,8 @@ class EchoKind(IntEnum):
     """False echo without any reflector."""
     CIRCLE = 6
     """One reflection at a circle."""
+    CROSSTALK = 7
+    """Echo of another transmitter of the same firing group, from any reflector."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,3 +83,35 @@ class TracedEchoes:
         """No entries."""
         index, points = np.zeros(0, dtype=int), np.zeros((0, 2))
         return cls.of_kind(EchoKind.PLANE, index, index, index, np.zeros(0), points, points)
+
+
+class EchoColumns(NamedTuple):
+    """Columns of echoes; ``Simulation`` describes them."""
+
+    scan: Int[np.ndarray, " echoes"]
+    path: Int[np.ndarray, " echoes"]
+    range: Float[np.ndarray, " echoes"]
+    """At first half the true path length, later the reported range, metres."""
+    amplitude: Float[np.ndarray, " echoes"]
+    kind: Int[np.ndarray, " echoes"]
+    reflector: Int[np.ndarray, " echoes"]
+    reflector_kind: Int[np.ndarray, " echoes"]
+    transmitter: Int[np.ndarray, " echoes"]
+    second: Int[np.ndarray, " echoes"]
+    """Second wall; the first one in the opposite direction."""
+
+    @classmethod
+    def empty(cls) -> "EchoColumns":
+        """No echoes."""
+        index, real = np.zeros(0, dtype=int), np.zeros(0)
+        return cls(index, index, real, real, index, index, index, index, index)
+
+    @classmethod
+    def concatenate(cls, parts: list["EchoColumns"]) -> "EchoColumns":
+        """All echoes of several parts."""
+        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def sorted(self) -> "EchoColumns":
+        """The echoes by scan, path and range; ties by the reflector."""
+        order = np.lexsort((self.second, self.reflector, self.kind, self.range, self.path, self.scan))
+        return EchoColumns(*(column[order] for column in self))

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.segments import crossings, point_to_segments
 from jaxsonar.simulation.acoustics import Acoustics, amplitudes
+from jaxsonar.simulation.beam_bounds import largest_loss, least_wall_losses
 from jaxsonar.simulation.traced_echoes import TracedEchoes
 
 TOLERANCE = 1e-9
@@ -81,8 +82,8 @@ class TracingScene:
     """Walls within range of any group."""
     index: Int[np.ndarray, " walls"]
     """Their indices in the room."""
-    circles: Float[np.ndarray, "circles 3"]
-    """Center and radius of circles."""
+    circles: Float[np.ndarray, "groups circles 3"]
+    """Center x, y and radius of round columns, and then of moving circles, in each group."""
     separation: Float[np.ndarray, "walls walls"]
     """Distance between two walls, metres."""
     distance: Float[np.ndarray, "groups walls"]
@@ -105,6 +106,8 @@ class TracingScene:
     """Half the nominal width of each cone, radians."""
     cos_limit: Float[np.ndarray, " sensors"]
     """Cosine of the largest off-axis angle: the border of the cone (hard beams) or 90 deg (soft beams)."""
+    wall_loss: Float[np.ndarray, "groups walls sensors"] | None
+    """Smallest one-way loss of each beam towards each wall, dB; None for omnidirectional sensors."""
     acoustics: Acoustics | None
     """Soft beams: echoes must reach the threshold of this model; None for hard beams."""
 
@@ -118,6 +121,7 @@ class TracingScene:
         axis: Float[np.ndarray, "groups sensors 2"] | None,
         half_beam: Float[np.ndarray, " sensors"] | None,
         acoustics: Acoustics | None = None,
+        moving: Float[np.ndarray, "groups moving 3"] | None = None,
     ) -> "TracingScene":
         """Prepare a room and groups of sensors in the world frame; arguments as ``echo_tracing.trace_echoes``."""
         corners = np.concatenate([room.walls.reshape(-1, 2), room.poles, room.circles[:, :2]])
@@ -134,11 +138,13 @@ class TracingScene:
         share_a, share_b = crossings(walls, walls)
         crossed = (share_a >= 0) & (share_a <= 1) & (share_b >= 0) & (share_b <= 1)
         half_beam = np.full(sensors.shape[1], np.pi) if half_beam is None else half_beam
+        circles = np.broadcast_to(room.circles, (len(sensors), *room.circles.shape))
+        circles = circles if moving is None else np.concatenate([circles, moving], axis=1)
         return cls(
             origin=origin,
             walls=WallFrames.of(walls),
             index=index,
-            circles=room.circles - np.append(origin, 0.0),
+            circles=circles - np.append(origin, 0.0),
             separation=np.where(crossed, 0.0, np.minimum(ends, ends.T)),
             distance=distance[:, index],
             sensors=sensors,
@@ -150,39 +156,77 @@ class TracingScene:
             axis=axis,
             half_beam=half_beam,
             cos_limit=np.cos(half_beam) if acoustics is None else np.zeros(len(half_beam)),
+            wall_loss=None if axis is None else least_wall_losses(sensors, axis, walls, half_beam, acoustics),
             acoustics=acoustics,
         )
 
+    def candidates(
+        self, group: Int[np.ndarray, " rows"], first: Int[np.ndarray, " rows"], last: Int[np.ndarray, " rows"]
+    ) -> tuple[Int[np.ndarray, " found"], Int[np.ndarray, " found"]]:
+        """(row, pair) that can give an echo over a first and a last wall (equal for one reflection), by the beams.
+
+        Args:
+            group: index of the group of sensors.
+            first: wall that tx must reach.
+            last: wall from which rx must hear.
+        """
+        if self.wall_loss is None:
+            row, pair = np.divmod(np.arange(len(group) * len(self.pairs)), len(self.pairs))
+            return row, pair
+        legs = self.distance[group, first] + self.separation[first, last] + self.distance[group, last]
+        limit = largest_loss(legs / 2 - self.radius[group], self.acoustics)
+        i, j = self.pairs.T
+        loss = self.wall_loss[group, first][:, i] + self.wall_loss[group, last][:, j]
+        row, pair = np.nonzero(loss <= limit[:, None])
+        return row, pair
+
     def audible(self, found: TracedEchoes) -> TracedEchoes:
         """Echoes within the beams with no wall or circle across any leg; the cheapest test comes first."""
-        for side, point in ((0, "first"), (1, "last")):
-            if self.axis is not None:
-                sensor = self.pairs[found.pair, side]
-                leg = getattr(found, point) - self.sensors[found.group, sensor]
-                found = found[in_cone(leg, self.axis[found.group, sensor], self.cos_limit[sensor])]
+        if self.axis is not None:
+            kept = np.arange(len(found))
+            for side, point in ((0, found.first), (1, found.last)):
+                group, sensor = found.group[kept], self.pairs[found.pair[kept], side]
+                leg = point[kept] - self.sensors[group, sensor]
+                kept = kept[in_cone(leg, self.axis[group, sensor], self.cos_limit[sensor])]
+            found = found[kept]
         found = found[self.loud(found)]
         for side, point in ((0, "first"), (1, "last")):
             start = self.sensors[found.group, self.pairs[found.pair, side]]
-            found = found[~self.block(start, getattr(found, point))]
-        return found[~self.block(found.first, found.last)]
+            found = found[~self.block(found.group, start, getattr(found, point))]
+        return found[~self.block(found.group, found.first, found.last)]
 
     def loud(self, found: TracedEchoes) -> Bool[np.ndarray, " found"]:
         """Whether each echo reaches the threshold with soft beams; all do with hard beams and without axes."""
         if self.axis is None or self.acoustics is None:
             return np.ones(len(found), dtype=bool)
         amplitude = amplitudes(
-            found, self.pairs, self.sensors, self.axis, self.half_beam, self.acoustics, self.circles[:, 2]
+            found, self.pairs, self.sensors, self.axis, self.half_beam, self.acoustics, self.circle_radius
         )
         # The caller decides about echoes at the threshold, in the coordinates of the world.
         return amplitude >= self.acoustics.threshold * (1 - LOUDNESS_MARGIN)
 
-    def block(self, p: Float[np.ndarray, "legs 2"], q: Float[np.ndarray, "legs 2"]) -> Bool[np.ndarray, " legs"]:
-        """Legs from p to q that a wall or a circle intersects; one that ends on it is not blocked by it."""
+    @property
+    def circle_radius(self) -> Float[np.ndarray, " circles"]:
+        """Radii of the circles, metres; the same in every group."""
+        return self.circles[0, :, 2] if len(self.circles) else np.zeros(self.circles.shape[1])
+
+    def block(
+        self, group: Int[np.ndarray, " legs"], p: Float[np.ndarray, "legs 2"], q: Float[np.ndarray, "legs 2"]
+    ) -> Bool[np.ndarray, " legs"]:
+        """Legs from p to q that a wall or a circle intersects; a leg that ends on one is not blocked by it.
+
+        Args:
+            group: index of the group of sensors; circles may be at another place in each group.
+            p: starts of the legs, metres from the origin of the scene.
+            q: their ends.
+        """
         blocked = self.walls.block(p, q)
-        for x, y, radius in self.circles:
-            leg, to = q - p, np.array([x, y]) - p
+        for rows in row_slices(len(p), self.circles.shape[1]):
+            leg, circles = (q - p)[rows, None], self.circles[group[rows]]
+            to = circles[..., :2] - p[rows, None]
             share = np.clip((leg * to).sum(-1) / np.maximum((leg**2).sum(-1), TOLERANCE**2), 0, 1)
-            blocked |= np.linalg.norm(share[:, None] * leg - to, axis=-1) < radius - TOLERANCE
+            distance = np.linalg.norm(share[..., None] * leg - to, axis=-1)
+            blocked[rows] |= (distance < circles[..., 2] - TOLERANCE).any(axis=1)
         return blocked
 
     def points_in_range(

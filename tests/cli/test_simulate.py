@@ -126,3 +126,101 @@ def test_a_path_in_another_number_format_is_named(separator, capsys):
     assert f"{came} between the columns came; allowed are commas between columns and points, not decimal commas" in (
         capsys.readouterr().err
     )
+
+
+def test_soft_beams_and_crosstalk_are_options():
+    for name, options in {
+        "soft.csv": [],
+        "quiet.csv": ["--no-crosstalk"],
+        "hard.csv": ["--beams", "hard"],
+        "explicit.csv": ["--beams", "soft"],
+    }.items():
+        assert call("-o", name, *options) == 0
+    count = {name: len(load_log(f"{name}.csv").range) for name in ("soft", "quiet", "hard", "explicit")}
+    assert count["hard"] < count["quiet"] < count["soft"] == count["explicit"]
+    settings = tomllib.loads(Path("quiet.settings.toml").read_text())
+    assert settings["beams"] == "soft"
+    assert settings["no_crosstalk"] is True
+    assert call("-o", "a.csv", "--beams", "wide") == 2
+
+
+BESIDE = [0.6, 1.0]
+"""A place in the office, 1 m beside the path."""
+
+
+def save_walk(file, positions, stamps=(0.0, 1e4)):
+    rows = np.column_stack([stamps, np.asarray(positions, dtype=np.float64)])
+    np.savetxt(file, rows, delimiter=",", header="stamp,x,y", comments="")
+
+
+def test_a_person_walks_through_the_room(capsys):
+    save_walk("walk.csv", [BESIDE, BESIDE])
+    save_room(Room(OFFICE.room.walls, (), OFFICE.room.poles, np.array([[*BESIDE, 0.3]])), "column.geojson")
+    assert call("-o", "empty.csv") == 0
+    assert call("-o", "walk.log.csv", "--walker", "walk.csv:0.3") == 0
+    assert capsys.readouterr().err.count("warning") == 0
+    walked, empty = load_log("walk.log.csv"), load_log("empty.csv")
+    assert not np.array_equal(walked.range, empty.range)
+    arguments = ["column.geojson", "--ring", "faw", "--path", DATA / "office-path.csv", "--seed", "5", "-o", "col.csv"]
+    assert cli.main(["simulate", *map(str, arguments)]) == 0
+    columns = load_log("col.csv")
+    np.testing.assert_array_equal(columns.start, walked.start)
+    np.testing.assert_allclose(columns.range, walked.range, atol=1e-9)
+    settings = tomllib.loads(Path("walk.log.settings.toml").read_text())
+    assert settings["walker"] == ["walk.csv:0.3"]
+    save_walk("other.csv", [[-0.2, 0.8], [0.0, 0.9]])
+    assert call("-o", "two.csv", "--walker", "walk.csv:0.3", "--walker", "other.csv") == 0
+
+
+BAD_WALKS = {
+    "no file": (["--walker", "no.csv"], ["no.csv"]),
+    "no radius": (["--walker", "walk.csv:wide"], ["radius 'wide' came", "CSV:RADIUS"]),
+    "zero radius": (["--walker", "walk.csv:0"], ["radius 0 m", "more than 0"]),
+    "large radius": (["--walker", "walk.csv:300"], ["radius 300 m", "mm or cm"]),
+    "no number": (["--walker", "walk.csv:nan"], ["radius nan m"]),
+    "columns": (["--walker", "columns.csv"], ["columns.csv: row 1: x,y came", "stamp, x, y"]),
+    "stamps": (["--walker", "back.csv"], ["back.csv: row 3, column stamp", "later"]),
+    "over the walk": (["--walker", "own.csv", "-o", "own.csv"], ["-o", "input"]),
+}
+
+
+@pytest.mark.parametrize("mistake", BAD_WALKS)
+def test_a_wrong_person_is_answered_in_one_line(mistake, capsys):
+    save_walk("walk.csv", [[0.8, 0.0], [0.8, 0.0]])
+    save_walk("back.csv", [[0.8, 0.0], [0.8, 0.0]], stamps=(1.0, 0.0))
+    save_walk("own.csv", [[0.8, 0.0], [0.8, 0.0]])
+    Path("columns.csv").write_text("x,y\n0,0\n")
+    arguments, said = BAD_WALKS[mistake]
+    assert call("-o", "out.csv", *arguments) == 2
+    shown = capsys.readouterr().err
+    assert len(shown.splitlines()) == 1
+    for word in said:
+        assert word in shown
+
+
+def test_a_column_in_the_way_of_the_robot_is_a_warning(capsys):
+    save_room(Room(OFFICE.room.walls, circles=np.array([[0.6, 0.0, 0.2], [*BESIDE, 0.2]])), "room.geojson")
+    arguments = ["room.geojson", "--ring", "faw", "--path", DATA / "office-path.csv", "-o", "a.csv"]
+    assert cli.main(["simulate", *map(str, arguments)]) == 0
+    warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning")]
+    assert len(warnings) == 1
+    assert "the robot overlaps the circle at (0.6, 0) in" in warnings[0]
+
+
+PROBABLE = {
+    "inside": ([[0.1, 0.0], [0.1, 0.0]], (0.0, 1e4), "the robot overlaps the person in"),
+    "millimetres": ([[800.0, 0.0], [900.0, 0.0]], (0.0, 1e4), "out of range; give positions in metres"),
+    "clock": ([BESIDE, BESIDE], (1.7e9, 1.7e9 + 9), "give stamps of the same clock"),
+}
+
+
+@pytest.mark.parametrize("name", PROBABLE)
+def test_an_improbable_person_is_a_warning_and_strictly_an_error(name, capsys):
+    positions, stamps, words = PROBABLE[name]
+    save_walk("walk.csv", positions, stamps)
+    assert call("-o", "out.csv", "--walker", "walk.csv", "--strict") == 2
+    warning, error = capsys.readouterr().err.splitlines()
+    assert warning.startswith("warning: walk.csv: ")
+    assert words in warning
+    assert "--strict" in error
+    assert call("-o", "out.csv", "--walker", "walk.csv") == 0

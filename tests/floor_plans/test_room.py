@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsonar import Room, load_room, random_pose, random_room, save_room
-from jaxsonar.floor_plans.room import walls_in_robot_frame
+from jaxsonar.floor_plans.room import laser_ranges, walls_in_robot_frame
 from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.hardware.errors import SonarError
 
@@ -196,7 +196,7 @@ GOOD = feature("LineString", [[0, 0], [1, 0]])
         (feature("Point", "here", kind="pole"), "here"),
         (feature("Circle", [0, 0]), "Circle"),
         (feature("MultiPoint", [[0, 0]]), "MultiPoint"),
-        (feature("Point", [0, 0], kind="circle"), "circle of radius None"),
+        (feature("Point", [0, 0], kind="circle"), "circle without radius"),
         (feature("Point", [0, 0], kind="circle", radius=0), "circle of radius 0"),
         (feature("Point", [0, 0], kind="pole", radius=0.1), "radius of a pole"),
         (feature("LineString", [[0, 0], [0, 1]], radius=0.1), "radius of a LineString"),
@@ -344,3 +344,40 @@ def test_clearance_is_checked():
 def test_rooms_and_tracing_do_not_import_jax():
     code = "import sys, jaxsonar.floor_plans.room, jaxsonar.simulation.echo_tracing; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_random_columns_are_apart_from_everything_and_change_nothing_else():
+    for seed in range(8):
+        room = random_room(np.random.default_rng(seed), box=1.0, pole=1.0, columns=3.0)
+        assert len(room.circles) == 3
+        center, radius = room.circles[:, :2], room.circles[:, 2]
+        assert ((radius >= 0.05) & (radius <= 0.3)).all()
+        for k in range(3):
+            along = np.linspace(0, 1, 500)[:, None, None]
+            points = room.walls[:, 0] + along * (room.walls[:, 1] - room.walls[:, 0])
+            others = np.delete(center, k, axis=0), np.delete(radius, k)
+            assert np.linalg.norm(points - center[k], axis=-1).min() > radius[k] + 0.09
+            assert np.linalg.norm(room.poles - center[k], axis=-1).min() > radius[k] + 0.09
+            assert (np.linalg.norm(others[0] - center[k], axis=-1) > radius[k] + others[1] + 0.09).all()
+            assert np.isfinite(laser_ranges(room, np.append(center[k], 0.0), np.linspace(-3, 3, 9))).all()  # inside
+        pose = random_pose(np.random.default_rng(seed), room, clearance=0.4)
+        assert (np.linalg.norm(center - pose[:2], axis=-1) >= radius + 0.4).all()
+        plain, none = (random_room(np.random.default_rng(seed), **options) for options in ({}, {"columns": 0.0}))
+        assert np.array_equal(plain.walls, none.walls)
+        assert not len(plain.circles)
+    count = [len(random_room(np.random.default_rng(seed), columns=1.5).circles) for seed in range(20)]
+    assert set(count) == {1, 2}
+
+
+@pytest.mark.parametrize("columns", [-1.0, 9.0, np.nan])
+def test_a_number_of_columns_out_of_range_is_an_error(columns):
+    with pytest.raises(SonarError, match=r"columns .*; allowed is 0 to 8"):
+        random_room(np.random.default_rng(0), columns=columns)
+
+
+def test_without_columns_a_seed_gives_the_rooms_that_it_always_gave():
+    """The generator draws nothing for columns: its state after a room does not depend on them."""
+    one, other = np.random.default_rng(3), np.random.default_rng(3)
+    random_room(one)
+    random_room(other, columns=0.0)
+    assert one.random() == other.random()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.rooms import loop
+from support.rooms import loop, turned
 
 from jaxsonar import Ring, Room, simulate
 from jaxsonar.floor_plans.room import laser_ranges
@@ -79,3 +79,39 @@ def test_circles_in_files_and_for_lasers(tmp_path):
     assert np.array_equal(again.poles, room.poles)
     seen = laser_ranges(room, np.array([1.0, 1.5, 0.0]), np.array([0.0, np.pi / 2, np.pi]))
     np.testing.assert_allclose(seen, [0.75, 1.5, 1.0])
+
+
+@pytest.mark.slow
+def test_many_circles_block_as_segments_and_disks_of_shapely_do(rng):
+    shapely = pytest.importorskip("shapely")
+    circles = np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(0.02, 0.15, 40)])
+    poles = rng.uniform(-2, 2, (30, 2))
+    poles = poles[(np.linalg.norm(poles[:, None] - circles[:, :2], axis=-1) > circles[:, 2]).all(axis=1)]
+    sensors = rng.uniform(-2, 2, (12, 2))
+    room = Room(np.zeros((0, 2, 2)), (), poles, circles)
+    found = trace_echoes(room, sensors[:, None], np.array([[0, 0]]))
+    heard = set(
+        zip(found.group[found.kind == EchoKind.POLE], found.reflector[found.kind == EchoKind.POLE], strict=True)
+    )
+    centers = shapely.points(circles[:, :2])
+    for k, pole in np.ndindex(len(sensors), len(poles)):
+        leg = shapely.LineString([sensors[k], poles[pole]])
+        free = (shapely.distance(leg, centers) >= circles[:, 2]).all()
+        assert ((k, pole) in heard) == free
+    assert 0 < len(heard) < len(sensors) * len(poles)
+
+
+def test_echoes_of_circles_are_invariant_under_a_motion_of_the_room(rng):
+    ring = Ring.circular(count=12, beam=1.2, neighbors=2)
+    walls = loop([(-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5)])
+    circles = np.array([[0.9, 0.2, 0.1], [-0.6, -0.7, 0.25]])
+    pose = np.array([[0.1, 0.0, 0.3]])
+    angle, at = 0.8, np.array([30.0, -7.0])
+    here = simulate(ring, Room(walls, circles=circles), pose)
+    moved = np.column_stack([turned(circles[:, :2], angle, at), circles[:, 2]])
+    there = np.column_stack([turned(pose[:, :2], angle, at), pose[:, 2] + angle])
+    again = simulate(ring, Room(turned(walls, angle, at), circles=moved), there)
+    np.testing.assert_array_equal(here.reflector, again.reflector)
+    np.testing.assert_allclose(here.range, again.range, atol=1e-9)
+    np.testing.assert_allclose(here.amplitude, again.amplitude, atol=1e-9)
+    assert set(here.reflector[here.kind == EchoKind.CIRCLE].tolist()) == {0, 1}
