@@ -273,7 +273,7 @@ def reflector_echo(kind: Int[Array, ""], reflector: Float[Array, "2"], path: Ech
 # Circles
 
 
-class Arc(NamedTuple):
+class CircularArc(NamedTuple):
     """A curve of constant curvature: foot + (speed / rate) (sin(rate u) t + (1 - cos(rate u)) n) at the coordinate u.
 
     Rate 1 and speed a give a circle of radius a, for which u is an angle, and which may shrink to a point. Rate kappa
@@ -290,10 +290,10 @@ class Arc(NamedTuple):
     """Length of the curve per unit of u, metres."""
 
 
-def circle_arc(center: Float[Array, "2"], radius: Float[Array, ""], midpoint: Float[Array, "2"]) -> Arc:
+def circle_arc(center: Float[Array, "2"], radius: Float[Array, ""], midpoint: Float[Array, "2"]) -> CircularArc:
     """A circle by its center and radius, with the foot nearest to a path's midpoint."""
     towards = length_and_direction(center - midpoint)[1]
-    return Arc(center - radius * towards, towards, jnp.ones_like(radius), radius)
+    return CircularArc(center - radius * towards, towards, jnp.ones_like(radius), radius)
 
 
 class ArcReflection(NamedTuple):
@@ -309,7 +309,7 @@ class ArcReflection(NamedTuple):
     exists: Bool[Array, ""]
 
 
-def reflection_on_arc(arc: Arc, tx: Float[Array, "2"], rx: Float[Array, "2"]) -> ArcReflection:
+def reflection_on_arc(arc: CircularArc, tx: Float[Array, "2"], rx: Float[Array, "2"]) -> ArcReflection:
     """Shortest path tx -> arc -> rx, where the angles of incidence and reflection are equal.
 
     The path is stationary, so that its derivatives do not depend on the solver's. The last step of Newton's method is
@@ -328,7 +328,7 @@ def reflection_on_arc(arc: Arc, tx: Float[Array, "2"], rx: Float[Array, "2"]) ->
 
 
 def _first_coordinate(
-    arc: Arc, tx: Float[Array, "2"], rx: Float[Array, "2"]
+    arc: CircularArc, tx: Float[Array, "2"], rx: Float[Array, "2"]
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""]], Bool[Array, ""]]:
     """First estimate of the point of reflection, exact for a line, a point and nearby sensors.
 
@@ -346,7 +346,7 @@ def _first_coordinate(
 
 
 def _polar(
-    arc: Arc, rate: Float[Array, ""], sensor: Float[Array, "2"]
+    arc: CircularArc, rate: Float[Array, ""], sensor: Float[Array, "2"]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Distance of a sensor from the center times the rate, its distance from the arc, and its angle rate * u."""
     along, height = _in_frame(arc, sensor - arc.foot)
@@ -359,13 +359,13 @@ def _polar(
     return q, h, jnp.arctan2(across, depth)
 
 
-def _in_frame(arc: Arc, vector: Float[Array, "2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _in_frame(arc: CircularArc, vector: Float[Array, "2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Components of a vector along the tangent and the normal at the arc's foot."""
     n = arc.normal
     return n[0] * vector[1] - n[1] * vector[0], dot(n, vector)
 
 
-def _point_on_arc(arc: Arc, u: Float[Array, ""]) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+def _point_on_arc(arc: CircularArc, u: Float[Array, ""]) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """Point of an arc at a coordinate, and the unit normal there."""
     n, t = arc.normal, jnp.stack([-arc.normal[1], arc.normal[0]])
     angle = arc.rate * u
@@ -374,7 +374,9 @@ def _point_on_arc(arc: Arc, u: Float[Array, ""]) -> tuple[Float[Array, "2"], Flo
     return point, jnp.cos(angle) * n - jnp.sin(angle) * t
 
 
-def _newton_step(arc: Arc, tx: Float[Array, "2"], rx: Float[Array, "2"], u: Float[Array, ""]) -> Float[Array, ""]:
+def _newton_step(
+    arc: CircularArc, tx: Float[Array, "2"], rx: Float[Array, "2"], u: Float[Array, ""]
+) -> Float[Array, ""]:
     """One step towards the coordinate at which the length of the path is stationary."""
     point, n = _point_on_arc(arc, u)
     (out, e_tx), (back, e_rx) = length_and_direction(point - tx), length_and_direction(point - rx)
@@ -418,7 +420,7 @@ def curved_echo(parameters: Float[Array, "3"], path: EchoPaths) -> CurvedEcho:
     rho, theta, kappa = parameters[0], parameters[1], parameters[2]
     n = normal(theta)
     tx, rx = path.midpoint - path.half_baseline, path.midpoint + path.half_baseline
-    found = reflection_on_arc(Arc(rho * n, n, kappa, jnp.ones_like(kappa)), tx, rx)
+    found = reflection_on_arc(CircularArc(rho * n, n, kappa, jnp.ones_like(kappa)), tx, rx)
     cosine = dot(found.departure + found.arrival, found.normal) / 2
     u, angle = found.coordinate, kappa * found.coordinate
     half = u * sinc(angle / 2)

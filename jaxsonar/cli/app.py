@@ -22,6 +22,7 @@ COMMANDS = (
     "simulate",
     "calibrate",
     "check",
+    "ring",
     "convert",
     "slam",
     "localize",

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -120,3 +121,45 @@ def odometry_noise(error: tuple[float, float] | None) -> "OdometryNoise":
     return OdometryNoise(
         position_per_meter=position, heading_per_meter=heading, heading_per_radian=max(position, heading)
     )
+
+
+def add_grid_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add ``--grid`` and its options."""
+    parser.add_argument(
+        "--grid",
+        type=filename_ending_in(".yaml", ".yml"),
+        metavar="YAML",
+        help="occupancy grid for Nav2, with a .pgm or .png beside",
+    )
+    parser.add_argument(
+        "--grid-method",
+        choices=("counts", "elfes", "wilkes", "logodds", "em"),
+        help="how echoes become obstacles: those that no wall explains (counts, default); log-odds of the first "
+        "(elfes) or all (wilkes) direct echoes, or of all echoes (logodds); all echoes, iterated (em)",
+    )
+    parser.add_argument(
+        "--grid-mode",
+        choices=("trinary", "scale"),
+        help="trinary (default), or scale: a .png with probabilities of the undecided cells",
+    )
+
+
+def grid_outputs(options: argparse.Namespace) -> "dict[str, str | os.PathLike[str] | None]":
+    """The files of the grid, for ``check_outputs``.
+
+    Raises:
+        SonarError: options of a grid without ``--grid``.
+    """
+    from jaxsonar.hardware.errors import SonarError
+    from jaxsonar.occupancy.nav2_map import grid_image_filename
+
+    if options.grid is None:
+        for name in ("grid_method", "grid_mode"):
+            if getattr(options, name) is not None:
+                option = "--" + name.replace("_", "-")
+                raise SonarError(f"{option} came without --grid; allowed is it with --grid")
+        return {}
+    return {
+        "--grid": options.grid,
+        "--grid's image": grid_image_filename(options.grid, mode=options.grid_mode or "trinary"),
+    }

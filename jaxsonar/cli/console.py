@@ -1,5 +1,6 @@
-"""Output shared by the commands: status lines, progress, tables, figures and JSON; and shared checks of options."""
+"""Output shared by the commands: status, progress, tables, figures, JSON and grids; and shared checks of options."""
 
+import argparse
 import json
 import signal
 import sys
@@ -12,6 +13,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
+
+    from jaxsonar.mapping.global_map import GlobalMap
+    from jaxsonar.occupancy.occupancy_grid import OccupancyGrid
+    from jaxsonar.scans.scan_log import Log
+    from jaxsonar.sensors.ring import Ring
 
 Item = TypeVar("Item")
 PIPE_WIDTH = 140
@@ -181,3 +187,30 @@ def stopped_by_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def grid_of(options: argparse.Namespace, ring: "Ring", log: "Log", world: "GlobalMap") -> "OccupancyGrid | None":
+    """The grid that the options ask for; None without ``--grid``."""
+    if options.grid is None:
+        return None
+    from jaxsonar.occupancy.direct_readings import certain_angle
+    from jaxsonar.occupancy.incremental_grid import occupancy
+    from jaxsonar.occupancy.known_reflectors import KnownReflectors
+    from jaxsonar.occupancy.nav2_map import check_grid
+    from jaxsonar.sensors.ring_toml import load_detection
+
+    detection = load_detection(options.ring)
+    certain = None if detection is None else certain_angle(*detection)
+    with errors_in(f"--grid {options.grid}"):
+        known, method = KnownReflectors.of_map(world), options.grid_method or "counts"
+        grid = occupancy(ring, log, walls=known, method=method, certain=certain)
+        check_grid(grid)
+    return grid
+
+
+def save_grid(options: argparse.Namespace, grid: "OccupancyGrid | None") -> None:
+    """Write the files of a grid."""
+    if grid is not None:
+        from jaxsonar.occupancy.nav2_map import save_nav2
+
+        save_nav2(grid, options.grid, mode=options.grid_mode or "trinary")

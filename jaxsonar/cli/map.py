@@ -17,23 +17,26 @@ if TYPE_CHECKING:
 
 from jaxsonar.cli.arguments import (
     add_detection_arguments,
+    add_grid_arguments,
     figure_filename,
     filename,
     filename_ending_in,
     finite,
+    grid_outputs,
 )
 from jaxsonar.cli.console import (
     ascii_name,
     check_sigma_is_used,
     errors_in,
+    grid_of,
     laser_files,
     print_left_out,
     print_status,
+    save_grid,
     settings_filename,
     stage_status,
     write_figure,
 )
-from jaxsonar.cli.grid_output import add_grid_arguments, grid_of, grid_outputs, save_grid
 from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 

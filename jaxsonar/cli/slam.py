@@ -3,23 +3,26 @@
 import argparse
 
 from jaxsonar.cli.arguments import (
+    add_grid_arguments,
     add_slam_arguments,
     figure_filename,
     filename,
     filename_ending_in,
     finite,
+    grid_outputs,
     odometry_noise,
 )
 from jaxsonar.cli.console import (
     ascii_name,
     errors_in,
+    grid_of,
     print_left_out,
     print_status,
+    save_grid,
     stage_status,
     write_figure,
     write_json,
 )
-from jaxsonar.cli.grid_output import add_grid_arguments, grid_of, grid_outputs, save_grid
 from jaxsonar.cli.inputs import LOG_HELP, InputMessages, add_log_arguments, load_inputs, nothing_used
 from jaxsonar.reports.text import plural
 

@@ -18,14 +18,15 @@ if TYPE_CHECKING:
 from jaxsonar.cli.arguments import (
     ODOMETRY_HELP,
     add_detection_arguments,
+    add_grid_arguments,
     filename_ending_in,
     finite,
+    grid_outputs,
     number,
     odometry_error,
     odometry_noise,
 )
 from jaxsonar.cli.console import check_sigma_is_used, print_status, stopped_by_signals
-from jaxsonar.cli.grid_output import add_grid_arguments, grid_outputs
 from jaxsonar.cli.inputs import InputMessages, add_strict, load_checked_ring
 
 TERMINAL_INTERVAL, LOG_INTERVAL = 1.0, 10.0

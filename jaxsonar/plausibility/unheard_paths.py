@@ -25,8 +25,8 @@ SETTINGS = UnheardPathSettings()
 def neighbor_offsets(ring: Ring) -> Int[np.ndarray, " paths"]:
     """Distance between transmitter and receiver of each path, in sensors, on either side; 0: a direct echo."""
     tx, rx = ring.paths.T
-    offset = (rx - tx) % ring.count
-    return np.minimum(offset, ring.count - offset)
+    offset = np.abs(rx - tx)
+    return np.minimum(offset, ring.count - offset) if ring.closed else offset
 
 
 def unheard_offsets(ring: Ring, log: Log) -> list[int]:

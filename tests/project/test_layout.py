@@ -36,7 +36,7 @@ LAYERS = (
     ("simulation", "detection"),
     ("reflectors",),
     ("occupancy", "mapping", "registration", "batch_jobs"),
-    ("diagnostics", "estimation"),
+    ("diagnostics", "estimation", "observability"),
     ("loop_closure", "smoothing", "calibration", "evaluation"),
     ("graph_slam", "reports"),
     ("localization", "live"),
@@ -435,8 +435,8 @@ def test_help_imports_nothing_heavy():
     code = f"""
 import sys
 from jaxsonar.cli import main
-for call in ["", "lines", "demo", "simulate", "convert", "map", "slam", "localize", "calibrate", "check", "reference",
-             "evaluate", "stream", "emulate", "batch"]:
+for call in ["", "lines", "demo", "simulate", "convert", "map", "slam", "localize", "calibrate", "check", "ring",
+             "reference", "evaluate", "stream", "emulate", "batch"]:
     try:
         main([*call.split(), "--help"])
     except SystemExit as end:
