@@ -145,6 +145,7 @@ def add_reflectors(
     if not new:
         return end_walls(world)
     cov = np.array([one.cov for one in new])
+    circle_cov = np.where(np.isfinite([one.radius for one in new])[:, None, None], cov, np.nan)
     kinds = (*world.point_kinds, *("undecided" if one.kind < 0 else REFLECTOR_KINDS[one.kind] for one in new))
     points = np.concatenate([world.points, [one.position for one in new]])
     echoes = np.append(world.point_echoes, [len(one.echoes) for one in new])
@@ -157,7 +158,7 @@ def add_reflectors(
         point_echoes=echoes[order],
         point_scans=tuple(scans[k] for k in order),
         point_radius=np.append(world.point_radius, [one.radius for one in new])[order],
-        point_circle_cov=np.concatenate([world.point_circle_cov, cov])[order],
+        point_circle_cov=np.concatenate([world.point_circle_cov, circle_cov])[order],
         point_probabilities=np.concatenate([world.point_probabilities, [one.probability for one in new]])[order],
     )
     return end_walls(world)

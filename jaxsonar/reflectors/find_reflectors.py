@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.se2 import perpendicular, tangent_of, unit
-from jaxsonar.geometry.segments import lengths
+from jaxsonar.geometry.segments import lengths, point_to_segments
 from jaxsonar.reflectors.center_votes import center_seeds
 from jaxsonar.reflectors.explained_echoes import (
     explained_by_points,
@@ -117,7 +117,7 @@ def find_reflectors(
         before, sigma = sigma, max(1.4826 * float(np.sqrt(np.median(squared))), settings.min_sigma)
         if max(before / sigma, sigma / before) < settings.same_sigma:
             break
-    found, replaced = _with_walls(residual, heard, long, found, sigma + settings.model_error / settings.gate)
+    found, replaced = _with_walls(walls, residual, heard, long, found, sigma + settings.model_error / settings.gate)
     points_found = [one for one in found if not one.is_wall]
     position = np.array([one.position for one in points_found]).reshape(-1, 2)
     reach = settings.vertex_distance + np.nan_to_num([one.radius for one in points_found])
@@ -319,6 +319,7 @@ def _decided(
 
 
 def _with_walls(
+    walls: Float[np.ndarray, "walls 2 2"],
     residual: Float[np.ndarray, "rows walls"],
     heard: Int[np.ndarray, " rows"],
     long: Bool[np.ndarray, " walls"],
@@ -328,6 +329,7 @@ def _with_walls(
     """The reflectors, those marked that short walls of the map describe, and the short walls that others replace.
 
     Args:
+        walls: both ends, metres.
         residual: as from ``wall_residuals``, one row per echo.
         heard: rows of the measurements that are echoes.
         long: walls that cannot be replaced.
@@ -341,7 +343,9 @@ def _with_walls(
     for one in found:
         rows = np.searchsorted(heard, one.echoes)
         share = fits[rows].mean(axis=0).max(initial=0.0)
-        is_wall = one.probability[PLANE] >= settings.min_wall_probability and share > settings.replaced_share
+        on_wall = point_to_segments(one.position[None], walls).min(initial=np.inf) < settings.on_wall
+        known = share > settings.replaced_share or (one.kind < 0 and on_wall)
+        is_wall = known and one.probability[PLANE] >= settings.min_wall_probability
         is_wall |= one.kind == PLANE
         by_other[rows] = not is_wall
         marked.append(replace(one, is_wall=bool(is_wall)))

@@ -157,6 +157,8 @@ class ExplainedEchoSettings:
     reflector is the same, metres."""
     min_wall_probability: float = 0.003
     """A short wall of the map remains if it may be a plane with this probability: most walls of maps are walls."""
+    on_wall: float = 0.03
+    """An undecided reflector that may be a plane belongs to a wall that is this close, metres."""
     replaced_share: float = 0.5
     """Share of the echoes of a short wall that other reflectors must explain before they replace it."""
     sigma_iterations: int = 3
