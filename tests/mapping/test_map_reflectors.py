@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.patches import Circle
 
 from jaxsonar import Mapper, Ring, Room, build_map, simulate
 from jaxsonar.mapping.map_geojson import load_map, load_points, save_map
@@ -63,7 +64,7 @@ def test_files_keep_circles_and_ends(world, tmp_path):
 
 def test_the_figure_shows_circles_with_their_radius(world):
     (axes,) = map_figure(world).axes
-    radii = [patch.get_radius() for patch in axes.patches if hasattr(patch, "get_radius")]
+    radii = [patch.get_radius() for patch in axes.patches if isinstance(patch, Circle)]
     np.testing.assert_allclose(radii, world.with_kinds("circle").point_radius)
 
 
