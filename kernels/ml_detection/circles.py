@@ -117,7 +117,7 @@ def _fit_circle(
     mean, sd = settings.circle_shape
     prior_information = jnp.zeros((3, 3), start.rho.dtype).at[2, 2].set(1 / sd**2)
 
-    def linearize(at: TangentCircle) -> _LinearizedEchoes:
+    def linearize(at: TangentCircle, sigma: Float[Array, ""]) -> _LinearizedEchoes:
         def one(path: EchoPaths):
             echo = at.echo(path)
             d_curvature_d_shape = 1 / (at.scale * (1 - at.shape) ** 2)
@@ -127,24 +127,26 @@ def _fit_circle(
 
         distance, jacobian, visible = jax.vmap(one, in_axes=-1, out_axes=-1)(scan.echo_paths)
         detection, residual = scene.detection_probability * visible, scan.ranges - distance
-        odds = jnp.log(detection / (1 - detection) + 1e-9) + log_normal(residual, scene.sigma) - clutter
+        odds = jnp.log(detection / (1 - detection) + 1e-9) + log_normal(residual, sigma) - clutter
         return _LinearizedEchoes(jacobian, residual, jnp.where(left, odds, -jnp.inf))
 
-    def normal_equations(at: TangentCircle, echoes: _LinearizedEchoes):
-        weighted = echoes.jacobian * (jax.nn.sigmoid(echoes.log_ratio) / scene.sigma**2)[None]
+    def normal_equations(at: TangentCircle, echoes: _LinearizedEchoes, sigma: Float[Array, ""]):
+        weighted = echoes.jacobian * (jax.nn.sigmoid(echoes.log_ratio) / sigma**2)[None]
         gradient = weighted @ echoes.residual - prior_information[2] * (at.shape - mean)
         return _covariance(weighted @ echoes.jacobian.T + prior_information), gradient
 
-    def step(at: TangentCircle, _: None):
-        covariance, gradient = normal_equations(at, linearize(at))
+    def step(at: TangentCircle, sigma: Float[Array, ""]):
+        covariance, gradient = normal_equations(at, linearize(at, sigma), sigma)
         largest = jnp.asarray([settings.max_refinement, settings.max_refinement, settings.max_shape_step])
         rho, theta, shape = jnp.clip(covariance @ gradient, -largest, largest)
         shape = jnp.clip(at.shape + shape, *settings.circle_bounds)
         return at._replace(rho=at.rho + rho, theta=at.theta + theta, shape=shape), None
 
-    fitted, _ = jax.lax.scan(step, start, None, length=settings.circle_steps)
-    echoes = linearize(fitted)
-    covariance, _ = normal_equations(fitted, echoes)
+    # The first steps also reach echoes that the plane or the point did not explain.
+    scales = settings.circle_initial_scale * 0.5 ** jnp.arange(settings.circle_steps, dtype=start.rho.dtype)
+    fitted, _ = jax.lax.scan(step, start, jnp.maximum(scales, scene.sigma))
+    echoes = linearize(fitted, scene.sigma)
+    covariance, _ = normal_equations(fitted, echoes, scene.sigma)
     circle, jacobian = fitted.as_circle()
     return CircleFit(
         circle=circle,

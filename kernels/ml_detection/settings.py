@@ -163,8 +163,11 @@ class DetectionSettings:
     """Bounds of the shape."""
     circle_starts: tuple[float, float, float] = (0.4, 0.6, 0.8)
     """First guesses of the shape of what was selected as plane, corner and edge; chosen by hand."""
-    circle_steps: int = 6
+    circle_steps: int = 8
     """Gauss-Newton steps of the fit of a circle; chosen by hand."""
+    circle_initial_scale: float = 0.01
+    """Standard deviation of the ranges in the first of these steps, metres; it is halved from step to step down to that
+    of the ranges. Chosen by hand."""
     max_shape_step: float = 0.3
     """Largest change of the shape in a step; chosen by hand."""
     circle_strength_sd: float = 3.0
