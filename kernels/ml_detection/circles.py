@@ -78,7 +78,8 @@ def fit_circles(
         scene: detection probability, sigma and thresholds.
         settings: prior and steps.
     """
-    taken = jnp.cumsum(selection.involved, axis=0) - selection.involved > 0
+    involved = selection.involved.astype(jnp.int32)
+    taken = jnp.cumsum(involved, axis=0) > involved
     left = scan.valid[None] & ~taken
     is_plane, first, second = selection.kind == PLANE, *selected.parameters.T
     rho = jnp.where(is_plane, first, jnp.sqrt(first**2 + second**2))
