@@ -40,9 +40,11 @@ def run(options: argparse.Namespace) -> None:
     import numpy as np
 
     from jaxsonar.evaluation.map_accuracy import evaluate as evaluate_map
+    from jaxsonar.evaluation.point_accuracy import KIND_OF_REFERENCE, evaluate_points
     from jaxsonar.fileio.atomic_files import check_outputs
-    from jaxsonar.mapping.map_geojson import load_walls
-    from jaxsonar.reports.terminal_tables import evaluation_table
+    from jaxsonar.mapping.global_map import POINT_KINDS
+    from jaxsonar.mapping.map_geojson import load_points, load_walls
+    from jaxsonar.reports.terminal_tables import evaluation_table, point_table
 
     check_outputs({"--json": options.json}, [options.map, options.reference])
     messages = InputMessages(strict=options.strict)
@@ -56,7 +58,13 @@ def run(options: argparse.Namespace) -> None:
         gate_distance=options.gate,
         gate_angle=float(np.radians(options.gate_deg)),
     )
+    # Poles and circles of a room, against the points of the map.
+    points = load_points(options.map, kinds=(*POINT_KINDS, "pole"))
+    there, kinds, radii = load_points(options.reference, kinds=tuple(KIND_OF_REFERENCE))
+    of_points = evaluate_points(*points, walls, there, kinds, np.nan_to_num(radii), reference, gate=options.gate)
+    has_points = bool(len(there) or len(of_points.false))
     if options.json:
-        write_json(evaluation.as_json(), options.json)
+        more = {"points": of_points.as_json()} if has_points else {}
+        write_json(evaluation.as_json() | more, options.json)
     if options.json != "-":
-        print_tables(evaluation_table(evaluation))
+        print_tables(evaluation_table(evaluation), *([point_table(of_points)] if has_points else []))

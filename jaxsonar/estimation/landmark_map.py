@@ -1,7 +1,7 @@
 """Landmarks of a map, and the reflections at them that echoes can be associated with."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -69,15 +69,14 @@ def map_with_tentative_points(
     """
     if window is not None:
         # An adjustment needs lines that local models determine, rather than long ones.
-        return build_map(ring, log, window=window, grow=False)
+        return build_map(ring, log, window=window, grow=False, reflectors=False)
     evidence = gather_evidence(ring, log, local_models(ring, log) if models is None else models)
     map_ = assemble_map(evidence)
     found, _ = cluster_points(merge_cells(evidence.points))
     distance = np.linalg.norm(found.position[:, None] - map_.points[None], axis=-1).min(axis=1, initial=np.inf)
     more = found.take((found.scan_counts() >= settings.min_point_scans) & (distance > settings.corner_radius))
-    return replace(
-        map_,
-        points=np.concatenate([map_.points, more.position]),
+    return map_.with_points(
+        np.concatenate([map_.points, more.position]),
         point_kinds=(*map_.point_kinds, *more.kinds),
         point_cov=np.concatenate([map_.point_cov, more.inflated_cov]),
         point_echoes=np.concatenate([map_.point_echoes, more.echoes]),
@@ -140,7 +139,8 @@ def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> Landmark
     parts: list[kernels.Landmarks] = []
     map_index: list[Int[np.ndarray, " landmarks"]] = [np.zeros(0, int)]
     wall_pairs: list[tuple[int, int, int]] = []  # first wall, second wall, map
-    for number, map_ in enumerate(maps):
+    for number, whole in enumerate(maps):
+        map_ = whole.with_kinds("corner", "edge")
         pairs, is_intersection = _wall_intersections(map_)
         first = sum(len(part.kind) for part in parts)
         kept = np.append(np.ones(len(map_), bool), ~is_intersection | (not tie_corners))
@@ -152,7 +152,8 @@ def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> Landmark
 
 
 def map_landmarks(map_: GlobalMap) -> kernels.Landmarks:
-    """The walls, then the points of a map as landmarks, each anchored at its middle."""
+    """The walls, then the corners and edges of a map as landmarks, each anchored at its middle."""
+    map_ = map_.with_kinds("corner", "edge")
     kinds = [kernels.CORNER if kind == "corner" else kernels.EDGE for kind in map_.point_kinds]
     points = landmarks_from_points(np.array(kinds, np.int32), map_.points)
     return concatenate_landmarks([landmarks_from_segments(map_.rho, map_.theta, map_.segments), points])

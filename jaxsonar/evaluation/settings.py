@@ -28,6 +28,8 @@ class MapMatchSettings:
     """Largest angle between them, radians."""
     min_overlap: float = 0.05
     """Shorter overlaps give no deviation, metres."""
+    wall_samples: int = 21
+    """Points of a wall of the map that are compared with poles and circles."""
 
 
 @dataclass(frozen=True)

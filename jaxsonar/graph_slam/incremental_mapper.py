@@ -17,7 +17,13 @@ from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.graph_slam.submap_evidence import SubmapEvidence
 from jaxsonar.graph_slam.tracker import Tracker
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.mapping.build_map import assemble_map, check_merging, required_scans
+from jaxsonar.mapping.build_map import (
+    add_reflectors,
+    assemble_map,
+    check_merging,
+    required_scans,
+    seeks_reflectors,
+)
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence
 from jaxsonar.scans.scan_log import Log, Scan
@@ -167,7 +173,10 @@ class Mapper:
         evidence = state.evidence
         if state.submap_evidence is not None:
             evidence = state.submap_evidence.evidence(self.ring) or evidence
-        return assemble_map(evidence, merging=self.merging, min_scans=required_scans(self.window))
+        world = assemble_map(evidence, merging=self.merging, min_scans=required_scans(self.window))
+        if not seeks_reflectors(self.method, self.window, self.merging):
+            return world
+        return add_reflectors(world, evidence.scans.measurements(), sigma=self.sigma)
 
     def trajectory(self, state: MapState) -> tuple[Float[np.ndarray, "scans 3"], Float[np.ndarray, "scans 3 3"]]:
         """With pose estimation: poses of all scans so far, and their covariances with respect to the first one."""

@@ -20,10 +20,11 @@ from jaxsonar.graph_slam.initial_poses import InitialPoses, LoopClosure, detect,
 from jaxsonar.graph_slam.interrupted_odometry import InterruptedOdometryNoise, continue_odometry
 from jaxsonar.graph_slam.slipped_odometry import SlippedOdometryNoise, repair_heading_slips
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.mapping.build_map import assemble_map, build_map
+from jaxsonar.mapping.build_map import add_reflectors, assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.plausibility.odometry_jumps import OdometryJump
+from jaxsonar.reflectors.posed_scans import PosedScans
 from jaxsonar.registration.heading_slips import HeadingSlip
 from jaxsonar.scans.measured_paths import echoes_of_long_wall
 from jaxsonar.scans.scan_log import Log
@@ -206,6 +207,9 @@ def slam(
             f"slam: poses and map {explained.shortfall}: is it the right ring, are ranges and odometry in metres and "
             "radians?"
         )
+    # 5. Reflectors beside the walls, from all scans at their poses.
+    posed = PosedScans.of(ring, replace(log, pose=poses))
+    world = add_reflectors(world, posed.measurements(), sigma=sigma)
     stamp, closures = stamps_of(log), initial.closures
     jumps, step_ms = continued.jumps, initial.step_ms
     return Slam(poses, covariance, stamp, world, odometry, closures, step_ms, smoothed, explained, jumps, slips)
@@ -260,7 +264,9 @@ def _explained_share(ring: Ring, log: Log, world: GlobalMap) -> float:
 
 def _map_at(ring: Ring, log: Log, models: Sequence[LocalModel] | None, window: float | None) -> GlobalMap:
     """The map of a log at its poses."""
-    return build_map(ring, log, window=window) if models is None else assemble_map(gather_evidence(ring, log, models))
+    if models is None:
+        return build_map(ring, log, window=window, reflectors=False)
+    return assemble_map(gather_evidence(ring, log, models))
 
 
 def _is_smoothed_by_default(initial: InitialPoses, has_odometry: Bool[np.ndarray, " scans"], speed: bool) -> bool:

@@ -38,6 +38,7 @@ class KnownMap:
             map_sd: least standard deviations of its walls: across (m), direction (rad); None: those of a floor plan if
                 it is one, else those of the map.
         """
+        world = world.with_kinds("corner", "edge")
         if map_sd is None:
             map_sd = SETTINGS.plan_sd if is_floor_plan(world) else SETTINGS.min_map_sd
         wall_covariance = _wall_covariances(world, map_sd)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxsonar import kernels
 from jaxsonar.detection.extract import local_models
 from jaxsonar.detection.local_model import LocalModel
-from jaxsonar.detection.settings import hough_settings, widened
+from jaxsonar.detection.settings import DEFAULT_SIGMA, hough_settings, widened
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.mapping.artifact_removal import (
@@ -18,7 +18,7 @@ from jaxsonar.mapping.artifact_removal import (
     remove_driven_through,
     remove_seen_through,
 )
-from jaxsonar.mapping.global_map import GlobalMap
+from jaxsonar.mapping.global_map import REFLECTOR_KINDS, GlobalMap
 from jaxsonar.mapping.hough_merging import merge_by_hough
 from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence_of_each
 from jaxsonar.mapping.observations import concatenate, merge_cells
@@ -28,7 +28,8 @@ from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_endpoints import blocks_gap, detached_points, snap_endpoints, spurious_walls
 from jaxsonar.mapping.wall_growth import grow_walls
 from jaxsonar.mapping.wall_segments import WallSegments
-from jaxsonar.mapping.wall_support import RangeMeasurements
+from jaxsonar.reflectors.find_reflectors import find_reflectors
+from jaxsonar.reflectors.range_measurements import RangeMeasurements
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import group_firings
 from jaxsonar.scans.sliding_windows import window_lengths
@@ -48,6 +49,7 @@ def build_map(
     window: float | None = None,
     merging: str = "fused",
     grow: bool = True,
+    reflectors: bool = True,
     on_left_out: Callable[[int], None] | None = None,
     on_observed: Callable[[Sequence[LocalModel], MapEvidence], None] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
@@ -67,6 +69,8 @@ def build_map(
         merging: "fused", or "paper" for the paper's method.
         grow: with windows and merging "fused": whether to use several lengths and growth. False: the walls of windows
             of one length, as ``Mapper`` finds them scan by scan.
+        reflectors: whether to seek circles and other reflectors beside the walls (``add_reflectors``); not with
+            method "hough" for single scans, nor with merging "paper".
         on_left_out: called with the number of echoes on pairs of sensors that this ring does not listen to.
         on_observed: called with the local models and their evidence; with windows, those of the given length.
         progress: called with the stage and (scans done, scans); 0 scans if the stage does not count them.
@@ -106,8 +110,56 @@ def build_map(
         on_observed(models[0], evidence[0])
     # Merge the observations of each wall and point.
     if is_grown:
-        return assemble_grown_map(ring, log, evidence, sigma=sigma)
-    return assemble_map(evidence[0], merging=merging, min_scans=required_scans(window))
+        world = assemble_grown_map(ring, log, evidence, sigma=sigma)
+    else:
+        world = assemble_map(evidence[0], merging=merging, min_scans=required_scans(window))
+    if not reflectors or not seeks_reflectors(method, window, merging):
+        return world
+    return add_reflectors(world, evidence[0].scans.measurements(), sigma=sigma)
+
+
+def seeks_reflectors(method: str, window: float | None, merging: str) -> bool:
+    """Whether maps of a method contain reflectors beside walls; arguments as for ``build_map``."""
+    return merging == "fused" and (method == "ml" or window is not None)
+
+
+def add_reflectors(
+    world: GlobalMap, measurements: RangeMeasurements | None, *, sigma: float | None = None
+) -> GlobalMap:
+    """A map with the reflectors that answer from several places and that its walls do not explain.
+
+    They are corners, edges, circles, or of undecided kind. Short walls and points that such a reflector explains better
+    are replaced by it.
+
+    Args:
+        world: walls, corners and edges.
+        measurements: echoes and silences of all scans with poses; None: no scan.
+        sigma: standard deviation of the ranges, metres, if the walls do not show it.
+    """
+    if measurements is None:
+        return world
+    assumed = DEFAULT_SIGMA if sigma is None else sigma
+    found = find_reflectors(measurements, np.array(world.segments), np.array(world.points), sigma=assumed)
+    world = world.take_walls(~found.replaced_walls).take_points(~found.replaced_points)
+    new = [one for one in found.reflectors if not one.is_wall]
+    if not new:
+        return world
+    cov = np.array([one.cov for one in new])
+    kinds = (*world.point_kinds, *("undecided" if one.kind < 0 else REFLECTOR_KINDS[one.kind] for one in new))
+    points = np.concatenate([world.points, [one.position for one in new]])
+    echoes = np.append(world.point_echoes, [len(one.echoes) for one in new])
+    order = np.lexsort((points[:, 1], points[:, 0], -echoes))
+    scans = (*world.point_scans, *(one.scans for one in new))
+    return world.with_points(
+        points[order],
+        point_kinds=tuple(kinds[k] for k in order),
+        point_cov=np.concatenate([world.point_cov, cov[:, :2, :2]])[order],
+        point_echoes=echoes[order],
+        point_scans=tuple(scans[k] for k in order),
+        point_radius=np.append(world.point_radius, [one.radius for one in new])[order],
+        point_circle_cov=np.concatenate([world.point_circle_cov, cov])[order],
+        point_probabilities=np.concatenate([world.point_probabilities, [one.probability for one in new]])[order],
+    )
 
 
 def assemble_grown_map(

@@ -11,11 +11,15 @@ from jaxsonar.mapping.global_map import GlobalMap
 
 LAYER = "WALLS"
 """Name of the layer that contains the walls."""
+CIRCLE_LAYER = "CIRCLES"
+"""Name of the layer that contains the circles."""
 _METRES = 6  # code of metres in $INSUNITS
 
 
 def save_dxf(world: GlobalMap, filename: str | os.PathLike[str]) -> None:
-    """Write the walls of a map as a drawing: a LINE for each wall on the layer WALLS, in metres, world frame.
+    """Write the walls and circles of a map as a drawing, in metres, world frame.
+
+    Each wall is a LINE on the layer WALLS, each circle a CIRCLE on the layer CIRCLES.
 
     The same map gives the same bytes: the drawing has fixed dates and no random identifiers.
 
@@ -33,6 +37,11 @@ def save_dxf(world: GlobalMap, filename: str | os.PathLike[str]) -> None:
         space = drawing.modelspace()
         for start, end in world.segments.astype(float).tolist():
             space.add_line(start, end, dxfattribs={"layer": LAYER})
+        round_ones = world.with_kinds("circle")
+        if len(round_ones.points):
+            drawing.layers.add(CIRCLE_LAYER)
+        for center, radius in zip(round_ones.points.tolist(), round_ones.point_radius.tolist(), strict=True):
+            space.add_circle(center, radius, dxfattribs={"layer": CIRCLE_LAYER})
         if len(world):
             low, high = world.segments.min(axis=(0, 1)), world.segments.max(axis=(0, 1))
             # The initial view shows the whole map with a margin.

@@ -1,7 +1,7 @@
 """The evidence that scans contribute to a map. Evidence adds up in any order, so maps can be built scan by scan."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,6 +14,7 @@ from jaxsonar.mapping.observations import concatenate, merge_cells
 from jaxsonar.mapping.point_landmarks import PointLandmarks, aggregate_points
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_segments import WallSegments, aggregate_segments
+from jaxsonar.reflectors.posed_scans import PosedScans
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
@@ -40,6 +41,8 @@ class MapEvidence:
     """Number of local models with a pose."""
     driven: DrivenSpace
     """Where the robot itself was."""
+    scans: PosedScans = field(default_factory=PosedScans)
+    """The scans, for reflectors that answer from several of them."""
 
     @classmethod
     def empty(cls) -> "MapEvidence":
@@ -57,6 +60,7 @@ class MapEvidence:
             np.unique(np.concatenate([self.robot_cells, other.robot_cells]), axis=0),
             self.models + other.models,
             self.driven.union(other.driven),
+            self.scans.union(other.scans),
         )
 
     def condensed(self) -> "MapEvidence":
@@ -108,6 +112,8 @@ def gather_evidence_of_each(ring: Ring, log: Log, models: Sequence[Sequence[Loca
     observations = [_observations(of_one, log.pose[at]) for of_one, at in zip(models, rows, strict=True)]
     # Free space, limited by the walls that each model shows.
     free_spaces = _free_spaces(ring, log, rows, [walls for _, _, walls in observations])
+    until = max((int(at.max(initial=-1)) for at in rows), default=-1)
+    scans = PosedScans.of(ring, (log[row] for row in np.flatnonzero(np.isfinite(log.pose).all(axis=1)) if row <= until))
     evidence = []
     for at, (segments, points, _), free_space in zip(rows, observations, free_spaces, strict=True):
         # Where the robot was.
@@ -116,7 +122,7 @@ def gather_evidence_of_each(ring: Ring, log: Log, models: Sequence[Sequence[Loca
         before = np.arange(len(log)) <= at.max(initial=-1)
         driven = DrivenSpace.of(ring, log.pose[before], scan_times(log)[before])
         evidence.append(
-            MapEvidence(segments, points, free_space, np.unique(robot_cells, axis=0), len(position), driven)
+            MapEvidence(segments, points, free_space, np.unique(robot_cells, axis=0), len(position), driven, scans)
         )
     return evidence
 

@@ -1,14 +1,14 @@
 """Global maps as GeoJSON, world frame, metres; and segments from any GeoJSON, to evaluate maps."""
 
 import os
-from typing import Any, TypeGuard
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxsonar.fileio.geojson import feature, lines_of, positions, read_features, write_features
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.mapping.global_map import POINT_KINDS, GlobalMap
+from jaxsonar.mapping.global_map import POINT_KINDS, REFLECTOR_KINDS, GlobalMap
 
 NON_WALL_KINDS = ("pseudo", "intersection")
 """Kinds of features in a reference that are not walls: limits of visibility, and corners."""
@@ -19,7 +19,8 @@ _NUMBERS = {"rho": False, "theta": False, "sigma_rho": True, "sigma_theta": True
 def save_map(world: GlobalMap, filename: str | os.PathLike[str]) -> None:
     """Write a global map; ``-`` is standard output.
 
-    A wall is a LineString of kind "segment", a corner or an edge a Point of that kind. Numbers have full precision, so
+    A wall is a LineString of kind "segment", a corner, an edge, a circle or an undecided reflector a Point of that
+    kind. Numbers have full precision, so
     that loading gives the same map. Unknown values (NaN) are null.
 
     Raises:
@@ -32,10 +33,15 @@ def save_map(world: GlobalMap, filename: str | os.PathLike[str]) -> None:
         seen = {"echoes": int(world.echoes[index]), "scans": list(world.scans[index])}
         features.append(feature("LineString", ends, kind="segment", **line, **seen))
     for index, (position, kind) in enumerate(zip(world.points.tolist(), world.point_kinds, strict=True)):
-        cov = world.point_cov[index]
+        is_circle = kind == "circle"
+        cov = world.point_circle_cov[index] if is_circle else world.point_cov[index]
+        more: dict[str, Any] = {"radius": float(world.point_radius[index])} if is_circle else {}
+        if np.isfinite(world.point_probabilities[index]).all():
+            probability = world.point_probabilities[index].tolist()
+            more["probability"] = dict(zip(REFLECTOR_KINDS, probability, strict=True))
         seen = {"echoes": int(world.point_echoes[index]), "scans": list(world.point_scans[index])}
         known = cov.tolist() if np.isfinite(cov).all() else None
-        features.append(feature("Point", position, kind=kind, cov=known, **seen))
+        features.append(feature("Point", position, kind=kind, **more, cov=known, **seen))
     write_features(features, filename)
 
 
@@ -49,27 +55,32 @@ def load_map(filename: str | os.PathLike[str]) -> GlobalMap:
             and property.
     """
     found = read_features(filename, _parse_feature, what="a global map")
-    walls = [row for row in found if len(row) == 4]
-    points = [row for row in found if len(row) == 5]
+    walls = [row for row in found if not isinstance(row, _MapPoint)]
+    points = [row for row in found if isinstance(row, _MapPoint)]
     segments = np.array([ends for ends, _, _, _ in walls]).reshape(-1, 2, 2)
     numbers = np.array([line for _, line, _, _ in walls], dtype=np.float64).reshape(-1, len(_NUMBERS))
     echoes = np.array([count for _, _, count, _ in walls], dtype=np.int64)
     columns = dict(zip(_NUMBERS, numbers.T.copy(), strict=True))
-    position = np.array([position for position, *_ in points], dtype=np.float64).reshape(-1, 2)
-    cov = np.array([cov for _, _, cov, _, _ in points], dtype=np.float64).reshape(-1, 2, 2)
-    point_echoes = np.array([count for *_, count, _ in points], dtype=np.int64)
-    for column in (segments, echoes, *columns.values(), position, cov, point_echoes):
+    is_circle = np.array([one.kind == "circle" for one in points], dtype=bool)
+    cov = np.array([one.cov for one in points], dtype=np.float64).reshape(-1, 3, 3)
+    of_points = {
+        "points": np.array([one.position for one in points], dtype=np.float64).reshape(-1, 2),
+        "point_cov": cov[:, :2, :2].copy(),
+        "point_echoes": np.array([one.echoes for one in points], dtype=np.int64),
+        "point_radius": np.array([one.radius for one in points], dtype=np.float64),
+        "point_circle_cov": np.where(is_circle[:, None, None], cov, np.nan),
+        "point_probabilities": np.array([one.probability for one in points], dtype=np.float64).reshape(-1, 4),
+    }
+    for column in (segments, echoes, *columns.values(), *of_points.values()):
         column.setflags(write=False)
     return GlobalMap(
         segments=segments,
         **columns,
         echoes=echoes,
         scans=tuple(scans for *_, scans in walls),
-        points=position,
-        point_kinds=tuple(kind for _, kind, *_ in points),
-        point_cov=cov,
-        point_echoes=point_echoes,
-        point_scans=tuple(scans for *_, scans in points),
+        **of_points,
+        point_kinds=tuple(one.kind for one in points),
+        point_scans=tuple(one.scans for one in points),
     )
 
 
@@ -100,16 +111,67 @@ def load_walls(filename: str | os.PathLike[str]) -> Float[np.ndarray, "walls 2 2
     return segments[~np.isin(np.array(kinds, dtype=np.str_), NON_WALL_KINDS)]
 
 
+def load_points(
+    filename: str | os.PathLike[str], *, kinds: tuple[str, ...]
+) -> tuple[Float[np.ndarray, "points 2"], tuple[str, ...], Float[np.ndarray, " points"]]:
+    """The points of some kinds of any GeoJSON: a map, a floor plan.
+
+    Returns:
+        points: positions, metres.
+        kinds: their kinds.
+        radii: property ``radius`` of circles, metres; NaN for all other points.
+
+    Raises:
+        SonarError: the file cannot be read, or a circle has no radius.
+    """
+
+    def read(properties: dict[str, Any], form: str, coordinates: Any) -> list[tuple[Any, str, float]]:
+        kind, radius = properties.get("kind"), properties.get("radius")
+        if form != "Point" or kind not in kinds:
+            return []
+        if kind != "circle":
+            return [(positions([coordinates])[0], kind, float("nan"))]
+        if not _is_number(radius) or radius <= 0:
+            raise SonarError(f"radius {radius!r:.60}; allowed is a number above 0, metres")
+        return [(positions([coordinates])[0], kind, float(radius))]
+
+    found = [one for of_feature in read_features(filename, read, what="points") for one in of_feature]
+    position = np.array([position for position, _, _ in found], dtype=np.float64).reshape(-1, 2)
+    return position, tuple(kind for _, kind, _ in found), np.array([radius for *_, radius in found], dtype=np.float64)
+
+
 _WallRow = tuple[Float[np.ndarray, "2 2"], list[float], int, tuple[int, ...]]
-_PointRow = tuple[Float[np.ndarray, " 2"], str, Float[np.ndarray, "2 2"], int, tuple[int, ...]]
 
 
-def _parse_feature(properties: dict[str, Any], form: str, coordinates: Any) -> _WallRow | _PointRow:
-    """Ends, numbers, echoes and scans of a wall; or position, kind, covariance, echoes and scans of a point."""
+class _MapPoint(NamedTuple):
+    """A point of the file."""
+
+    position: Float[np.ndarray, " 2"]
+    kind: str
+    radius: float
+    """NaN unless it is a circle."""
+    cov: Float[np.ndarray, "3 3"]
+    """Of (x, y, radius); NaN where unknown."""
+    probability: list[float]
+    echoes: int
+    scans: tuple[int, ...]
+
+
+def _parse_feature(properties: dict[str, Any], form: str, coordinates: Any) -> _WallRow | _MapPoint:
+    """Ends, numbers, echoes and scans of a wall; or a point."""
     kind = properties.get("kind")
     if form == "Point" and kind in POINT_KINDS:
         position, defaults = positions([coordinates])[0], {"echoes": 0, "scans": []}
-        return position, kind, _parse_covariance(properties.get("cov")), *_parse_echoes_and_scans(defaults | properties)
+        radius, size = float("nan"), 2
+        if kind == "circle":
+            radius, size = properties.get("radius"), 3
+            if not _is_number(radius) or radius <= 0:
+                raise SonarError(f"radius {radius!r:.60}; allowed is a number above 0, metres")
+        cov = np.full((3, 3), np.nan)
+        cov[:size, :size] = _parse_covariance(properties.get("cov"), size)
+        probability = _parse_probability(properties.get("probability"))
+        seen = _parse_echoes_and_scans(defaults | properties)
+        return _MapPoint(position, kind, float(radius), cov, probability, *seen)
     if form != "LineString" or kind != "segment":
         raise SonarError(f'{form:.60} of kind {kind!r:.60}; allowed is a LineString of kind "segment"')
     ends = positions(coordinates)
@@ -127,18 +189,30 @@ def _parse_feature(properties: dict[str, Any], form: str, coordinates: Any) -> _
     return ends, numbers, *_parse_echoes_and_scans(properties)
 
 
-def _parse_covariance(value: Any) -> Float[np.ndarray, "2 2"]:
-    """A covariance from its two rows; NaN if it is unknown."""
+def _parse_covariance(value: Any, size: int) -> Float[np.ndarray, "size size"]:
+    """A covariance from its rows; NaN if it is unknown."""
     if value is None:
-        return np.full((2, 2), np.nan)
+        return np.full((size, size), np.nan)
     rows = value if isinstance(value, list) else []
-    if len(rows) == 2 and all(isinstance(r, list) and len(r) == 2 and all(map(_is_number, r)) for r in rows):
+    if len(rows) == size and all(isinstance(r, list) and len(r) == size and all(map(_is_number, r)) for r in rows):
         cov = np.array(rows, dtype=np.float64)
-        symmetric = cov[0, 1] == cov[1, 0]
-        semidefinite = cov.diagonal().min() >= 0 and np.linalg.det(cov) >= -1e-9 * np.prod(cov.diagonal())
-        if symmetric and semidefinite:
+        largest = float(np.abs(cov).max())
+        if (cov == cov.T).all() and np.linalg.eigvalsh(cov).min() >= -1e-9 * largest:
             return cov
-    raise SonarError(f"cov {value!r:.60}; allowed are two rows of two numbers, a covariance, or null = not known")
+    many = {2: "two rows of two", 3: "three rows of three"}[size]
+    raise SonarError(f"cov {value!r:.60}; allowed are {many} numbers, a covariance, or null = not known")
+
+
+def _parse_probability(value: Any) -> list[float]:
+    """Probability of each of ``REFLECTOR_KINDS``; NaN if unknown."""
+    if value is None:
+        return [float("nan")] * len(REFLECTOR_KINDS)
+    if isinstance(value, dict) and sorted(value) == sorted(REFLECTOR_KINDS):
+        found = [value[kind] for kind in REFLECTOR_KINDS]
+        if all(_is_number(one) and 0 <= one <= 1 for one in found):
+            return [float(one) for one in found]
+    allowed = f"an object with a number from 0 to 1 for each of {', '.join(REFLECTOR_KINDS)}"
+    raise SonarError(f"probability {value!r:.60}; allowed is {allowed}")
 
 
 def _parse_echoes_and_scans(properties: dict[str, Any]) -> tuple[int, tuple[int, ...]]:

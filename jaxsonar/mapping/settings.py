@@ -237,10 +237,6 @@ class SupportSettings:
     """Share of the measurements without a wall that hear something within the maximum range."""
     certain: float = 0.9
     """Fraction of the maximum range within which a wall is observed."""
-    section: float = 0.1
-    """Measurements of one path within this length of the trajectory count as one, metres."""
-    arm: float = 0.57
-    """Length of trajectory that corresponds to a rotation, metres per radian: 10 degrees are 0.1 m."""
     min_distance: float = 0.05
     """Smallest distance between a sensor and a wall, metres."""
 

@@ -18,13 +18,8 @@ from jaxsonar.mapping.driven_space import DrivenSpace
 from jaxsonar.mapping.observations import unique_pairs
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_segments import WallSegments
-from jaxsonar.mapping.wall_support import (
-    EchoModel,
-    MeasurementIndex,
-    RangeMeasurements,
-    independent_weights,
-    line_evidence,
-)
+from jaxsonar.mapping.wall_support import EchoModel, MeasurementIndex, line_evidence
+from jaxsonar.reflectors.range_measurements import RangeMeasurements, independent_weights
 
 
 @dataclass(frozen=True, eq=False)

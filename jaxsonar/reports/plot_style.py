@@ -38,8 +38,10 @@ WALL_COLOR = "#8C8C8C"
 FAINT_COLOR = "#DDDDDD"
 """Paths without an echo, and detection cones."""
 ROBOT_COLOR = "#222222"
-POINT_MARKERS = {"corner": "s", "edge": "D"}
-"""Matplotlib markers of corners and edges."""
+POINT_MARKERS = {"corner": "s", "edge": "D", "undecided": "*"}
+"""Matplotlib markers of corners, edges and undecided reflectors."""
+_LARGER = 1.8
+"""Size of stars, in sizes of the largest other marker."""
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -143,7 +145,7 @@ def draw_robot(axes: Axes, ring: Ring, pose: Float[np.ndarray, "3"]) -> None:
 def draw_map_points(
     axes: Axes, world: GlobalMap, *, sizes: Mapping[str, float], edge_width: float, zorder: int
 ) -> list[Line2D]:
-    """Draw the corners and edges of a map. Returns the legend handles.
+    """Draw the points of a map, circles with their true radius. Returns the legend handles.
 
     Args:
         axes: axes of a plan view.
@@ -152,13 +154,19 @@ def draw_map_points(
         edge_width: line width of the markers, points.
         zorder: drawing order.
     """
-    handles = []
+    handles, style = [], dict[str, Any]()
+    round_ones = world.with_kinds("circle")
+    for (x, y), radius in zip(round_ones.points.tolist(), round_ones.point_radius.tolist(), strict=True):
+        axes.add_patch(Circle((x, y), radius, fc="white", ec=POINT_COLOR, lw=edge_width + 0.8, zorder=zorder - 0.5))
+        axes.plot(x, y, "+", color=POINT_COLOR, ms=4, mew=edge_width, zorder=zorder)
+    if len(round_ones.points):
+        style = {"marker": "o", "ls": "", "ms": 8, "mfc": "white", "mec": POINT_COLOR, "mew": edge_width + 0.8}
+        handles.append(Line2D([], [], **style, label="circle"))
     for kind, marker in POINT_MARKERS.items():
         points = world.points[np.array(world.point_kinds, dtype=np.str_) == kind]
         if len(points):
-            style: dict[str, Any] = {
-                "marker": marker, "ls": "", "ms": sizes[kind], "mfc": "white", "mec": POINT_COLOR, "mew": edge_width
-            }  # fmt: skip
+            size = sizes.get(kind, _LARGER * max(sizes.values()))
+            style = {"marker": marker, "ls": "", "ms": size, "mfc": "white", "mec": POINT_COLOR, "mew": edge_width}
             axes.plot(*points.T, **style, zorder=zorder)
             handles.append(Line2D([], [], **style, label=kind))
     return handles

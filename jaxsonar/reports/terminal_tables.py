@@ -9,6 +9,7 @@ from rich.table import Table
 
 from jaxsonar.diagnostics.health_report import Health
 from jaxsonar.evaluation.map_accuracy import Evaluation, max_abs, rms
+from jaxsonar.evaluation.point_accuracy import PointEvaluation
 from jaxsonar.reports.text import fixed, with_error
 
 LINE_COLUMNS = (
@@ -126,6 +127,30 @@ def evaluation_table(evaluation: Evaluation) -> Table:
     for name, statistic in (("largest", max_abs), ("RMS", rms)):
         distance, angle = 1e3 * statistic(evaluation.distance), math.degrees(statistic(evaluation.angle))
         table.add_row(name, "", "", fixed(distance, 1), fixed(angle, 2))
+    return table
+
+
+def point_table(evaluation: PointEvaluation) -> Table:
+    """Points of a map against the poles and circles of a reference, one row each."""
+    count = len(evaluation.match)
+    table = Table(
+        title="Points against poles and circles of the reference",
+        caption=f"recall: {fixed(evaluation.recall, 3)} of {count}; right kind: {int(evaluation.right_kind.sum())}; "
+        f"walls instead: {int(evaluation.as_wall.sum())}; missing: {int(evaluation.missing.sum())}; "
+        f"false points: {len(evaluation.false)}",
+    )
+    for heading in ("reference\n(index)", "kind", "in the map", "Δ position\n(mm)", "Δ radius\n(mm)"):
+        table.add_column(heading, justify="right")
+    for k in range(count):
+        found = evaluation.match_kinds[k] or "nothing"
+        wall = "wall" if evaluation.match[k] < 0 else f"{found}, wall"
+        table.add_row(
+            str(k),
+            evaluation.reference_kinds[k],
+            wall if evaluation.as_wall[k] else found,
+            fixed(1e3 * float(evaluation.position_error[k]), 1),
+            fixed(1e3 * float(evaluation.radius_error[k]), 1),
+        )
     return table
 
 

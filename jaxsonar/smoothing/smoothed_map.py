@@ -35,7 +35,13 @@ def adjusted_map(world: GlobalMap, adjustment: AdjustmentResult, cov: Float[np.n
     rho_variance = cov[wall, 0, 0] + 2 * arm * cov[wall, 0, 1] + arm**2 * theta_variance
     kinds = {kernels.CORNER: "corner", kernels.EDGE: "edge"}
     return replace(
-        world,
+        world.with_points(
+            landmark_positions(points),
+            point_kinds=tuple(kinds[kind] for kind in points.kind.tolist()),
+            point_cov=cov[point],
+            point_echoes=echoes[point],
+            point_scans=tuple(world.point_scans[row - wall_count] for row in point),
+        ),
         segments=wall_segments(walls),
         rho=np.abs(rho),
         theta=wrap_angle(np.where(rho < 0, theta + np.pi, theta)),
@@ -43,9 +49,4 @@ def adjusted_map(world: GlobalMap, adjustment: AdjustmentResult, cov: Float[np.n
         sigma_theta=np.sqrt(theta_variance),
         echoes=echoes[wall],
         scans=tuple(world.scans[row] for row in wall),
-        points=landmark_positions(points),
-        point_kinds=tuple(kinds[kind] for kind in points.kind.tolist()),
-        point_cov=cov[point],
-        point_echoes=echoes[point],
-        point_scans=tuple(world.point_scans[row - wall_count] for row in point),
     )

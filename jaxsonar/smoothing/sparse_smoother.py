@@ -132,7 +132,7 @@ class SparseSmoother:
 
     def _map_at(self, state: AdjustmentState, data: BatchData) -> GlobalMap:
         log = data.logs_with_poses([self.log], state.poses)[0]
-        return build_map(self.ring_of(state), log, window=self.window, sigma=self.sigma)
+        return build_map(self.ring_of(state), log, window=self.window, sigma=self.sigma, reflectors=False)
 
     def _batch_data(self, log: Log) -> BatchData:
         """Echoes, odometry and priors: one pose is fixed, all others and the walls are free."""

@@ -11,7 +11,7 @@ from support import oracles
 from jaxsonar import Log, Ring, Room, SonarError, load_log, local_models, random_pose, random_room, save_log, simulate
 from jaxsonar.detection.settings import METHODS
 from jaxsonar.geometry.se2 import rotation
-from jaxsonar.mapping.build_map import MERGING_METHODS, assemble_map, build_map
+from jaxsonar.mapping.build_map import MERGING_METHODS, add_reflectors, assemble_map, build_map
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.mapping.settings import SETTINGS
@@ -440,4 +440,5 @@ def test_progress_counts_scans_and_the_observed_evidence_gives_the_map(office_lo
     ((models, evidence),) = observed
     assert len(models) == len(office_log)
     assert steps[: len(models)] == [("local models", k + 1, len(office_log)) for k in range(len(models))]
-    np.testing.assert_array_equal(assemble_map(evidence).segments, world.segments)
+    again = add_reflectors(assemble_map(evidence), evidence.scans.measurements())
+    np.testing.assert_array_equal(again.segments, world.segments)

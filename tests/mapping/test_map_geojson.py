@@ -1,7 +1,6 @@
 """Global maps as GeoJSON: lossless round trip, errors for malformed files, and segments of any GeoJSON."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +16,20 @@ from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.map_geojson import load_map, load_segments, load_walls, save_map
 from jaxsonar.simulation.office import load_office
 
-COLUMNS = ("segments", "rho", "theta", "sigma_rho", "sigma_theta", "echoes", "points", "point_cov", "point_echoes")
+COLUMNS = (
+    "segments",
+    "rho",
+    "theta",
+    "sigma_rho",
+    "sigma_theta",
+    "echoes",
+    "points",
+    "point_cov",
+    "point_echoes",
+    "point_radius",
+    "point_circle_cov",
+    "point_probabilities",
+)
 
 
 def some_map(rng, count):
@@ -30,16 +42,24 @@ def some_map(rng, count):
 
 
 def with_points(rng, world, count):
-    roots = rng.normal(size=(count, 2, 2)) * 10.0 ** rng.integers(-6, 1, (count, 1, 1))
+    """Points of all kinds; unknown covariances and probabilities among them."""
+    roots = rng.normal(size=(count, 3, 3)) * 10.0 ** rng.integers(-6, 1, (count, 1, 1))
     cov = roots @ roots.swapaxes(1, 2)
+    cov = (cov + cov.swapaxes(1, 2)) / 2
     cov[1::3] = np.nan
-    return replace(
-        world,
-        points=rng.normal(size=(count, 2)),
-        point_kinds=tuple(rng.choice(["corner", "edge"], count).tolist()),
-        point_cov=(cov + cov.swapaxes(1, 2)) / 2,
+    kinds = rng.choice(["corner", "edge", "circle", "undecided"], count)
+    circle = kinds == "circle"
+    probability = rng.dirichlet(np.ones(4), count)
+    probability[::2] = np.nan
+    return world.with_points(
+        rng.normal(size=(count, 2)),
+        point_kinds=tuple(kinds.tolist()),
+        point_cov=cov[:, :2, :2],
         point_echoes=rng.integers(0, 500, count),
         point_scans=tuple(tuple(sorted(rng.integers(0, 99, k % 4).tolist())) for k in range(count)),
+        point_radius=np.where(circle, rng.uniform(0.01, 1.0, count), np.nan),
+        point_circle_cov=np.where(circle[:, None, None], cov, np.nan),
+        point_probabilities=probability,
     )
 
 
@@ -84,9 +104,12 @@ def test_points_need_only_kind_and_position(tmp_path, rng):
     assert (len(world), world.points.tolist(), world.point_kinds) == (1, [[1, 2]], ("edge",))
     assert (world.point_echoes.tolist(), world.point_scans) == ([0], ((),))
     assert np.isnan(world.point_cov).all()
-    save_map(with_points(rng, world, 2), tmp_path / "points.geojson")
+    assert np.isnan(world.point_probabilities).all()
+    save_map(with_points(rng, world, 4), tmp_path / "points.geojson")
     features = json.loads((tmp_path / "points.geojson").read_text())["features"][1:]
-    assert [list(entry["properties"]) for entry in features] == [["kind", "cov", "echoes", "scans"]] * 2
+    for entry, probability in zip(features, ([], ["probability"]) * 2, strict=True):
+        radius = ["radius"] if entry["properties"]["kind"] == "circle" else []
+        assert list(entry["properties"]) == ["kind", *radius, *probability, "cov", "echoes", "scans"]
     assert features[1]["properties"]["cov"] is None
 
 
@@ -125,6 +148,9 @@ def write(path, *features):
         (feature("Point", [0, 0], kind="edge", echoes=-2), "echoes -2"),
         (feature("Point", [0, 0], kind="corner", scans=[0.5]), "scans [0.5]"),
         (feature("Point", [0, 0], kind="corner", cov=[[1, 0]]), "cov [[1, 0]]; allowed are two rows"),
+        (feature("Point", [0, 0], kind="circle"), "radius None; allowed is a number above 0"),
+        (feature("Point", [0, 0], kind="circle", radius=1, cov=[[1, 0], [0, 1]]), "allowed are three rows"),
+        (feature("Point", [0, 0], kind="undecided", probability={"plane": 1}), "probability {'plane': 1}"),
         (feature("Point", [0, 0], kind="corner", cov=[[1, 2], [2, 1]]), "cov [[1, 2], [2, 1]]"),
         (feature("Point", [0, 0], kind="corner", cov=[[1, float("nan")], [0, 1]]), "cov [[1, nan], [0, 1]]"),
         ({"type": "Feature", "geometry": None}, "no geometry"),

@@ -18,7 +18,7 @@ from jaxsonar.mapping.driven_space import DrivenSpace
 from jaxsonar.mapping.observations import concatenate
 from jaxsonar.mapping.wall_growth import _best_intervals, grow_walls
 from jaxsonar.mapping.wall_segments import WallSegments
-from jaxsonar.mapping.wall_support import RangeMeasurements
+from jaxsonar.reflectors.range_measurements import RangeMeasurements
 
 SIGMA = 0.01
 SONARS = Ring.circular(count=8, radius=0.2, beam=math.radians(50.0), neighbors=0, max_range=3.0)
@@ -56,6 +56,7 @@ def upward(x, distance):
         scan=rows,
         time=rows.astype(np.float64),
         section=rows,
+        measurement=rows,
         max_range=3.0,
     )
 

@@ -9,13 +9,8 @@ import pytest
 from jaxsonar import Log, Ring, Room, simulate
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.mapping.settings import SETTINGS
-from jaxsonar.mapping.wall_support import (
-    EchoModel,
-    MeasurementIndex,
-    RangeMeasurements,
-    independent_weights,
-    line_evidence,
-)
+from jaxsonar.mapping.wall_support import EchoModel, MeasurementIndex, line_evidence
+from jaxsonar.reflectors.range_measurements import RangeMeasurements, independent_weights
 
 SONARS = Ring.circular(count=8, radius=0.2, beam=math.radians(30.0), neighbors=0, max_range=3.0)
 CENTER, NORMAL, SIGMA = np.array([0.3, 1.5]), math.pi / 2, 0.02
@@ -36,6 +31,7 @@ def measured(distance, *, origin=(0.0, 0.0), axis=math.pi / 2, is_first=True):
         scan=np.arange(rows),
         time=np.arange(rows, dtype=np.float64),
         section=np.arange(rows),
+        measurement=np.arange(rows),
         max_range=3.0,
     )
 
@@ -97,7 +93,7 @@ def test_predicted_ranges_are_those_of_the_simulator():
     ring = Ring.circular(count=24, radius=0.3, neighbors=3, max_range=3.0)
     wall = Room(np.array([[[-9.0, 1.4], [9.0, 1.4]]]))
     pose = np.array([[0.2, 0.1, 0.3]])
-    log = simulate(ring, wall, pose).as_log(ring, pose)
+    log = simulate(ring, wall, pose, beams="hard").as_log(ring, pose)
     came = RangeMeasurements.from_log(ring, log)
     heard = came.take(np.isfinite(came.distance))
     assert len(heard) > 10

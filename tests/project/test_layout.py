@@ -34,6 +34,7 @@ LAYERS = (
     ("recordings",),
     ("plausibility",),
     ("simulation", "detection"),
+    ("reflectors",),
     ("occupancy", "mapping", "registration", "batch_jobs"),
     ("diagnostics", "estimation", "observability"),
     ("loop_closure", "smoothing", "calibration", "evaluation"),

@@ -1,0 +1,52 @@
+"""Ranges to many circles at once, for rings whose sensors are close together compared with their distance.
+
+Fits evaluate them thousands of times. ``sensors.range_models.circle_range`` is exact for all arrays, and the oracle of
+this function in the tests; two Newton steps from the bisector suffice here, and take a fifth of the time.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+_NEWTON_STEPS = 2
+"""Error with baselines of 0.2 m and distances of 0.3 m: below 0.1 um."""
+
+
+def circle_ranges(
+    center: Float[np.ndarray, "*#batch 2"],
+    radius: Float[np.ndarray, "*#batch"],
+    midpoint: Float[np.ndarray, "*#batch 2"],
+    half_baseline: Float[np.ndarray, "*#batch 2"],
+) -> tuple[Float[np.ndarray, "*#batch"], Float[np.ndarray, "*#batch 2"], Float[np.ndarray, "*#batch"]]:
+    """Half path lengths over circles, metres, and their derivatives by the centers and by the radii.
+
+    Args:
+        center: centers of the circles, metres.
+        radius: their radii, metres, 0 or more.
+        midpoint: midpoints between transmitters and receivers, outside of the circles, metres.
+        half_baseline: half the vectors from transmitter to receiver, metres.
+    """
+    out, back = midpoint - half_baseline - center, midpoint + half_baseline - center
+    (tx, ty), (rx, ry) = np.moveaxis(out, -1, 0), np.moveaxis(back, -1, 0)
+    # Unit normal at the point of reflection; at first the bisector of the directions of both sensors.
+    out_length, back_length = np.sqrt(tx * tx + ty * ty), np.sqrt(rx * rx + ry * ry)
+    nx, ny = tx / out_length + rx / back_length, ty / out_length + ry / back_length
+    scale = 1 / np.sqrt(nx * nx + ny * ny)
+    nx, ny = nx * scale, ny * scale
+    for step in range(_NEWTON_STEPS + 1):
+        px, py = radius * nx, radius * ny
+        ax, ay, bx, by = tx - px, ty - py, rx - px, ry - py
+        a, b = np.sqrt(ax * ax + ay * ay), np.sqrt(bx * bx + by * by)
+        ax, ay, bx, by = ax / a, ay / a, bx / b, by / b
+        if step == _NEWTON_STEPS:
+            break
+        # First and second derivative of the path length by the direction of the point, divided by the radius.
+        a_along, b_along = ay * nx - ax * ny, by * nx - bx * ny
+        slope = a_along + b_along
+        curvature = (ax + bx) * nx + (ay + by) * ny
+        curvature = curvature + radius * ((1 - a_along * a_along) / a + (1 - b_along * b_along) / b)
+        turn = slope / np.maximum(curvature, 1e-9)
+        nx, ny = nx - turn * ny, ny + turn * nx
+        scale = 1 / np.sqrt(nx * nx + ny * ny)
+        nx, ny = nx * scale, ny * scale
+    x, y = -(ax + bx) / 2, -(ay + by) / 2
+    return (a + b) / 2, np.stack([x, y], axis=-1), x * nx + y * ny
