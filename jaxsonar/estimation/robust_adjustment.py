@@ -267,7 +267,7 @@ class RobustAdjustment:
             np.asarray(leaf)[candidate] for leaf in (of_candidates.kind, of_candidates.first, of_candidates.second)
         )
         if data.wall_explained is not None:
-            used &= ~(data.wall_explained & np.isin(kind, (kernels.CORNER, kernels.EDGE)))
+            used &= ~(data.wall_explained & np.isin(kind, (kernels.CORNER, kernels.EDGE, kernels.CIRCLE)))
         # 3. Landmarks with too few echoes, in a scan or in all.
         count = len(landmark_map.map_index)
         if data.min_echoes_per_landmark > 1:
