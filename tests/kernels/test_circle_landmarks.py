@@ -1,4 +1,4 @@
-"""Circles as landmarks: shortest paths, derivatives by differences, the limit of an edge, and scenes without circles."""
+"""Circles as landmarks: shortest paths, derivatives by differences, the limit of an edge, scenes without circles."""
 
 import dataclasses
 from functools import partial
@@ -18,7 +18,7 @@ from jaxsonar.geometry.landmarks import (
     pad_landmarks,
     transform_landmarks,
 )
-from jaxsonar.geometry.se2 import rotation, transform_points
+from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.kernels import CIRCLE, CORNER, EDGE, PLANE, Landmarks, Reflection
 from jaxsonar.kernels.landmarks import landmark_in_robot_frame
 
