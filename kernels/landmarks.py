@@ -1,14 +1,17 @@
 """Landmarks of a map and the echoes that they cause: from the world frame to ONE echo path in the robot frame."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .detection_cones import SETTINGS, visibility
+from .detection_cones import SETTINGS, echo_level, visibility
 from .measurement_model import (
     CIRCLE,
+    EDGE,
     PLANE,
     PredictedEcho,
     circle_echo,
@@ -106,9 +109,22 @@ def _or_circle(
     return jax.tree.map(lambda round_one, other: jnp.where(kind == CIRCLE, round_one, other), circle, echo)
 
 
+class PredictedReflection(NamedTuple):
+    """The echo of one reflection that one path receives."""
+
+    range: Float[Array, "*echoes"]
+    """Metres."""
+    visibility: Float[Array, "*echoes"]
+    """By the detection cones and, for planes, by the extent of the wall; 0: no echo."""
+    arrival: Float[Array, "*echoes 2"]
+    """Direction from which the echo arrives, a unit vector in the robot frame."""
+    level: Float[Array, "*echoes"]
+    """Level of the echo, dB relative to a wall on the axis at 1 m; -inf if it is not possible."""
+
+
 def predict_reflection(
     pose: Float[Array, "3"], reflection: Reflection, first: Landmarks, second: Landmarks, path: EchoPaths
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, "2"]]:
+) -> PredictedReflection:
     """Predict the echo of ONE reflection that ONE path receives.
 
     Args:
@@ -117,10 +133,6 @@ def predict_reflection(
         first: its first (or only) landmark.
         second: its second one.
         path: the echo path, robot frame.
-
-    Returns:
-        Range in metres; visibility by the detection cones and, for planes, by the extent of the wall (0: no echo); the
-        direction from which the echo arrives, a unit vector in the robot frame.
     """
     local, second_local = (landmark_in_robot_frame(pose, landmark) for landmark in (first, second))
     line, second_line = (jnp.stack(fold_line(*parameters)) for parameters in (local, second_local))
@@ -139,5 +151,19 @@ def predict_reflection(
     along = dot(tangent(first.parameters[1]), pose[:2] - first.anchor) + sign * wall.footpoint
     margin = SETTINGS.association_wall_margin
     beside = (along <= first.extent[0] - margin) | (along >= first.extent[1] + margin)
-    weight = jnp.where((kind == PLANE) & beside, 0, visibility(echo, path))
-    return echo.range, weight, echo.arrival
+    possible = echo.exists & ((kind != PLANE) | ~beside)
+    level = jnp.where(possible, echo_level(echo, path) + reflector_level(kind, first, echo.range), -jnp.inf)
+    return PredictedReflection(echo.range, jnp.where(possible, visibility(echo, path), 0), echo.arrival, level)
+
+
+def reflector_level(kind: Int[Array, ""], landmark: Landmarks, distance: Float[Array, ""]) -> Float[Array, ""]:
+    """Level of an echo relative to that of a wall at the same distance (metres), dB.
+
+    Edges return a cylindrical wave, circles a wave that their curvature has widened.
+    """
+    distance = jnp.maximum(distance, 1e-2)
+    level = jnp.where(kind == EDGE, SETTINGS.edge_level_db - 10 * jnp.log10(distance), 0)
+    if landmark.radius is None:
+        return level
+    radius = jnp.maximum(landmark.radius, 1e-4)
+    return jnp.where(kind == CIRCLE, 10 * jnp.log10(radius / (radius + distance)), level)
