@@ -339,7 +339,8 @@ def test_readings_refute_a_part_of_a_wall_and_echoes_confirm_it():
 
 def test_edges_near_each_other_may_be_the_ends_of_a_wall_that_no_sensor_faced():
     ends = np.array([[0.0, 1.0], [0.5, 1.0], [3.0, 1.0]])
-    known, none = KnownReflectors(np.zeros((0, 2, 2)), np.zeros((0, 2)), ends, np.zeros(3)), np.zeros((0, 2))
+    points = ends, np.zeros(3), np.zeros(3)
+    known, none = KnownReflectors(np.zeros((0, 2, 2)), np.zeros((0, 2)), *points), np.zeros((0, 2))
     found = hidden_walls(known, none, NOTHING, resolution=0.05)
     assert found[..., 0].min() == 0.0
     assert found[..., 0].max() == 0.5  # the third is too far away
