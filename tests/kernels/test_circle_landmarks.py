@@ -60,7 +60,7 @@ def predicted(poses, circles, tx, rx, kind=CIRCLE):
     reflection = Reflection(np.full(COUNT, kind, np.int32), rows, rows)
     paths = paths_between(tx, rx, heading=np.zeros((COUNT, 2)), half_beam=3.0)
     first = jax.tree.map(jnp.asarray, circles)
-    return jax.vmap(kernels.predict_reflection)(jnp.asarray(poses), reflection, first, first, paths)
+    return jax.vmap(kernels.predict_reflection)(jnp.asarray(poses), reflection, first, first, paths)[:3]
 
 
 def test_predicted_ranges_are_shortest_paths_over_the_circle(scene):

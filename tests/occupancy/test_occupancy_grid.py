@@ -29,7 +29,9 @@ RING = Ring.circular()
 @pytest.fixture(scope="module")
 def heard(office):
     """A log of the office."""
-    simulation = simulate(office.ring, office.room, office.poses, sigma=0.003, seed=1, stamps=office.stamps)
+    simulation = simulate(
+        office.ring, office.room, office.poses, sigma=0.003, seed=1, stamps=office.stamps, beams="hard"
+    )
     return simulation.as_log(office.ring, office.poses)
 
 
@@ -41,7 +43,7 @@ def office_grid(office, heard):
 def listen(ring, walls, poses, *, poles=(), **errors):
     """A simulated log at the given poses."""
     room = Room(np.array(walls).reshape(-1, 2, 2), (), np.array(poles).reshape(-1, 2))
-    return simulate(ring, room, poses, **errors).as_log(ring, poses)
+    return simulate(ring, room, poses, beams="hard", **errors).as_log(ring, poses)
 
 
 def silent(poses, ring=RING):
