@@ -103,7 +103,8 @@ def bayes_error(one: Scene, sigma: float) -> float:
     sim = simulate(RING, one.room, one.poses, seed=0)
     own = sim.kind == EchoKind.CIRCLE
     more = {"stamp": sim.stamps, "pose": one.poses, "asked": RING.paths}
-    log = Log.from_echoes(sim.scan[own], *RING.paths[sim.path[own]].T, sim.range[own], **more)
+    tx, rx = RING.paths[sim.path[own]].T
+    log = Log.from_echoes(sim.scan[own], tx, rx, sim.range[own], **more)
     measurements = RangeMeasurements.from_log(RING, log)
     free = np.flatnonzero(np.isfinite(measurements.distance))
     weight, seed = np.ones(len(measurements)), (one.center[None], np.array([one.radius]))

@@ -25,7 +25,7 @@ from jaxsonar.mapping.observations import concatenate, merge_cells
 from jaxsonar.mapping.point_landmarks import PointLandmarks, cluster_points, is_static
 from jaxsonar.mapping.segment_fusion import estimate_systematic_error, fuse_segments, robust_refit
 from jaxsonar.mapping.settings import SETTINGS
-from jaxsonar.mapping.wall_endpoints import blocks_gap, detached_points, snap_endpoints, spurious_walls
+from jaxsonar.mapping.wall_endpoints import blocks_gap, detached_points, end_walls, snap_endpoints, spurious_walls
 from jaxsonar.mapping.wall_growth import grow_walls
 from jaxsonar.mapping.wall_segments import WallSegments
 from jaxsonar.reflectors.find_reflectors import find_reflectors
@@ -143,23 +143,25 @@ def add_reflectors(
     world = world.take_walls(~found.replaced_walls).take_points(~found.replaced_points)
     new = [one for one in found.reflectors if not one.is_wall]
     if not new:
-        return world
+        return end_walls(world)
     cov = np.array([one.cov for one in new])
+    circle_cov = np.where(np.isfinite([one.radius for one in new])[:, None, None], cov, np.nan)
     kinds = (*world.point_kinds, *("undecided" if one.kind < 0 else REFLECTOR_KINDS[one.kind] for one in new))
     points = np.concatenate([world.points, [one.position for one in new]])
     echoes = np.append(world.point_echoes, [len(one.echoes) for one in new])
     order = np.lexsort((points[:, 1], points[:, 0], -echoes))
     scans = (*world.point_scans, *(one.scans for one in new))
-    return world.with_points(
+    world = world.with_points(
         points[order],
         point_kinds=tuple(kinds[k] for k in order),
         point_cov=np.concatenate([world.point_cov, cov[:, :2, :2]])[order],
         point_echoes=echoes[order],
         point_scans=tuple(scans[k] for k in order),
         point_radius=np.append(world.point_radius, [one.radius for one in new])[order],
-        point_circle_cov=np.concatenate([world.point_circle_cov, cov])[order],
+        point_circle_cov=np.concatenate([world.point_circle_cov, circle_cov])[order],
         point_probabilities=np.concatenate([world.point_probabilities, [one.probability for one in new]])[order],
     )
+    return end_walls(world)
 
 
 def assemble_grown_map(

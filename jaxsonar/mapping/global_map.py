@@ -19,10 +19,12 @@ _DERIVED: Any = None
 """Default of columns that the constructor fills."""
 
 if TYPE_CHECKING:
+    _EndCovariances = Float[np.ndarray, "segments 2 2 2"]
     _Radii = Float[np.ndarray, " points"]
     _CircleCovariances = Float[np.ndarray, "points 3 3"]
     _Probabilities = Float[np.ndarray, "points 4"]
 else:  # the constructor replaces None
+    _EndCovariances = Float[np.ndarray, "segments 2 2 2"] | None
     _Radii = Float[np.ndarray, " points"] | None
     _CircleCovariances = Float[np.ndarray, "points 3 3"] | None
     _Probabilities = Float[np.ndarray, "points 4"] | None
@@ -52,6 +54,11 @@ class GlobalMap:
     """Number of echoes that support each wall."""
     scans: tuple[tuple[int, ...], ...]
     """Numbers of the scans that observed each wall, ascending."""
+    end_kinds: tuple[tuple[str, str], ...] = ()
+    """Kinds of the points at which each wall starts and ends, "corner" or "edge"; "" where none answers. Empty if
+    unknown."""
+    end_cov: _EndCovariances = _DERIVED
+    """Covariance of the (x, y) of both ends of each wall, where a point answers, square metres; otherwise NaN."""
     points: Float[np.ndarray, "points 2"] = field(default_factory=lambda: np.zeros((0, 2)))
     """Positions (x, y) of corners, edges and circles (their centers), metres. The position of an undecided reflector
     is its point nearest to the robot."""
@@ -74,6 +81,8 @@ class GlobalMap:
         for name, shape in _OF_SOME_POINTS.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, np.full((len(self.points), *shape), np.nan))
+        if self.end_cov is None:
+            object.__setattr__(self, "end_cov", np.full((len(self.segments), 2, 2, 2), np.nan))
         for name in (
             "segments",
             "rho",
@@ -81,6 +90,7 @@ class GlobalMap:
             "sigma_rho",
             "sigma_theta",
             "echoes",
+            "end_cov",
             "points",
             "point_cov",
             "point_echoes",
@@ -122,6 +132,8 @@ class GlobalMap:
 
     def _taken(self, rows: Bool[np.ndarray, " rows"], names: list[str]) -> "GlobalMap":
         columns: dict[str, Any] = {name: getattr(self, name) for name in names}
+        if not self.end_kinds:
+            columns.pop("end_kinds", None)
         for name, value in columns.items():
             is_array = isinstance(value, np.ndarray)
             columns[name] = value[rows] if is_array else tuple(value[k] for k in np.flatnonzero(rows).tolist())

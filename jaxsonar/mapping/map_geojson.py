@@ -31,6 +31,8 @@ def save_map(world: GlobalMap, filename: str | os.PathLike[str]) -> None:
     for index, ends in enumerate(world.segments.tolist()):
         line = {name: column[index] if np.isfinite(column[index]) else None for name, column in numbers.items()}
         seen = {"echoes": int(world.echoes[index]), "scans": list(world.scans[index])}
+        if world.end_kinds:
+            seen["ends"] = [_end(world, index, side) for side in (0, 1)]
         features.append(feature("LineString", ends, kind="segment", **line, **seen))
     for index, (position, kind) in enumerate(zip(world.points.tolist(), world.point_kinds, strict=True)):
         is_circle = kind == "circle"
@@ -45,6 +47,12 @@ def save_map(world: GlobalMap, filename: str | os.PathLike[str]) -> None:
     write_features(features, filename)
 
 
+def _end(world: GlobalMap, wall: int, side: int) -> dict[str, Any]:
+    """The property of one end of a wall."""
+    cov = world.end_cov[wall, side]
+    return {"kind": world.end_kinds[wall][side] or None, "cov": cov.tolist() if np.isfinite(cov).all() else None}
+
+
 def load_map(filename: str | os.PathLike[str]) -> GlobalMap:
     """Read a global map as ``save_map`` writes it; a map without walls is allowed.
 
@@ -55,11 +63,13 @@ def load_map(filename: str | os.PathLike[str]) -> GlobalMap:
             and property.
     """
     found = read_features(filename, _parse_feature, what="a global map")
-    walls = [row for row in found if not isinstance(row, _MapPoint)]
+    walls = [row for row in found if isinstance(row, _MapWall)]
     points = [row for row in found if isinstance(row, _MapPoint)]
-    segments = np.array([ends for ends, _, _, _ in walls]).reshape(-1, 2, 2)
-    numbers = np.array([line for _, line, _, _ in walls], dtype=np.float64).reshape(-1, len(_NUMBERS))
-    echoes = np.array([count for _, _, count, _ in walls], dtype=np.int64)
+    segments = np.array([one.segment for one in walls]).reshape(-1, 2, 2)
+    numbers = np.array([one.numbers for one in walls], dtype=np.float64).reshape(-1, len(_NUMBERS))
+    echoes = np.array([one.echoes for one in walls], dtype=np.int64)
+    end_cov = np.array([one.end_cov for one in walls], dtype=np.float64).reshape(-1, 2, 2, 2)
+    end_kinds = tuple(one.end_kinds or ("", "") for one in walls) if any(one.end_kinds for one in walls) else ()
     columns = dict(zip(_NUMBERS, numbers.T.copy(), strict=True))
     is_circle = np.array([one.kind == "circle" for one in points], dtype=bool)
     cov = np.array([one.cov for one in points], dtype=np.float64).reshape(-1, 3, 3)
@@ -71,13 +81,15 @@ def load_map(filename: str | os.PathLike[str]) -> GlobalMap:
         "point_circle_cov": np.where(is_circle[:, None, None], cov, np.nan),
         "point_probabilities": np.array([one.probability for one in points], dtype=np.float64).reshape(-1, 4),
     }
-    for column in (segments, echoes, *columns.values(), *of_points.values()):
+    for column in (segments, echoes, end_cov, *columns.values(), *of_points.values()):
         column.setflags(write=False)
     return GlobalMap(
         segments=segments,
         **columns,
         echoes=echoes,
-        scans=tuple(scans for *_, scans in walls),
+        scans=tuple(one.scans for one in walls),
+        end_kinds=end_kinds,
+        end_cov=end_cov,
         **of_points,
         point_kinds=tuple(one.kind for one in points),
         point_scans=tuple(one.scans for one in points),
@@ -140,7 +152,16 @@ def load_points(
     return position, tuple(kind for _, kind, _ in found), np.array([radius for *_, radius in found], dtype=np.float64)
 
 
-_WallRow = tuple[Float[np.ndarray, "2 2"], list[float], int, tuple[int, ...]]
+class _MapWall(NamedTuple):
+    """A wall of the file."""
+
+    segment: Float[np.ndarray, "2 2"]
+    numbers: list[float]
+    end_kinds: tuple[str, str] | None
+    """None where the file has none."""
+    end_cov: list[Float[np.ndarray, "2 2"]]
+    echoes: int
+    scans: tuple[int, ...]
 
 
 class _MapPoint(NamedTuple):
@@ -157,8 +178,8 @@ class _MapPoint(NamedTuple):
     scans: tuple[int, ...]
 
 
-def _parse_feature(properties: dict[str, Any], form: str, coordinates: Any) -> _WallRow | _MapPoint:
-    """Ends, numbers, echoes and scans of a wall; or a point."""
+def _parse_feature(properties: dict[str, Any], form: str, coordinates: Any) -> _MapWall | _MapPoint:
+    """A wall or a point."""
     kind = properties.get("kind")
     if form == "Point" and kind in POINT_KINDS:
         position, defaults = positions([coordinates])[0], {"echoes": 0, "scans": []}
@@ -186,7 +207,19 @@ def _parse_feature(properties: dict[str, Any], form: str, coordinates: Any) -> _
             allowed = "a finite number" + (", or null = not known" if may_be_null else "")
             raise SonarError(f"{name} {value!r:.60}; allowed is {allowed}")
         numbers.append(float(value))
-    return ends, numbers, *_parse_echoes_and_scans(properties)
+    end_kinds, end_cov = _parse_ends(properties.get("ends"))
+    return _MapWall(ends, numbers, end_kinds, end_cov, *_parse_echoes_and_scans(properties))
+
+
+def _parse_ends(value: Any) -> tuple[tuple[str, str] | None, list[Float[np.ndarray, "2 2"]]]:
+    """Kinds and covariances of both ends of a wall; None and NaN if they are unknown."""
+    if value is None:
+        return None, [np.full((2, 2), np.nan)] * 2
+    if isinstance(value, list) and len(value) == 2 and all(isinstance(end, dict) for end in value):
+        first, second = (end.get("kind") for end in value)
+        if {first, second} <= {"corner", "edge", None}:
+            return (first or "", second or ""), [_parse_covariance(end.get("cov"), 2) for end in value]
+    raise SonarError(f'ends {value!r:.60}; allowed are two objects with kind "corner", "edge" or null, and cov')
 
 
 def _parse_covariance(value: Any, size: int) -> Float[np.ndarray, "size size"]:

@@ -61,8 +61,9 @@ class EvidenceSettings:
     max_gap: float = 0.7
     """Upper limit of the gap that fusion closes between two segments, metres; more than two neighboring scans leave
     unobserved of a wall between them."""
-    bridged_gap: float = 1.0
-    """Largest part of a wall that may be occluded, metres. A gap that was seen through stays open, however small."""
+    bridged_gap: float = 1.5
+    """Largest part of a wall that may be occluded or unobserved, metres, as ``max_extension``. A gap that was seen
+    through stays open, however small."""
     inner_share: float = 0.8
     """No wall comes closer to the center of the robot than this share of the distance of its innermost sensor, ..."""
     max_half_width: float = 0.1
@@ -152,6 +153,11 @@ class EndpointSettings:
     """Standard deviation that a corner adds when it constrains a wall's line, metres."""
     max_point_sd: float = 0.1
     """A point with a larger standard deviation ends no wall, metres."""
+    max_unobserved: float = 0.3
+    """Largest distance from the last footpoint of a wall to the edge that ends it, if nothing else shows that the wall
+    goes on until there, metres."""
+    min_end_probability: float = 0.8
+    """Probability of corner or edge from which on an undecided reflector ends a wall."""
     face_margin: float = 0.1
     """Distance from the ends of a wall, and from other walls, at which its face begins, metres."""
     face_depth: float = 0.03

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxsonar.geometry.se2 import unit
 from jaxsonar.geometry.segments import cross
 from jaxsonar.mapping.artifact_removal import angle_between_lines
+from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.observations import concatenate, neighbor_pairs
 from jaxsonar.mapping.point_landmarks import PointLandmarks
 from jaxsonar.mapping.segment_fusion import OpeningTest
@@ -162,3 +164,56 @@ def _relative_position(
     variance = np.einsum("pi,pij,pj->p", normal, points.inflated_cov[point], normal)
     variance += 1 / walls.info_offset[wall] + along**2 / walls.info_theta[wall]
     return along, np.abs(across) / np.sqrt(SETTINGS.points.gate**2 * variance + offset_floor**2)
+
+
+def end_walls(world: GlobalMap) -> GlobalMap:
+    """The map with every wall that ends at a corner or an edge ended there, and the kinds and covariances of its ends.
+
+    The end is the joint estimate of the point and of the line on which it lies (Schmidt). The point moves with it.
+    """
+    count, points, cov = len(world), np.array(world.points), np.array(world.point_cov)
+    kinds, end_cov = [["", ""] for _ in range(count)], np.full((count, 2, 2, 2), np.nan)
+    segments = np.array(world.segments)
+    answers = np.array([_ends_a_wall(world, k) for k in range(len(points))], dtype=bool)
+    if not answers.any() or not count:
+        return replace(world, end_kinds=tuple((a, b) for a, b in kinds), end_cov=end_cov)
+    settings, normal = SETTINGS.endpoints, unit(world.theta)
+    middle = segments.mean(axis=1)
+    along = segments[:, 1] - segments[:, 0]
+    length = np.linalg.norm(along, axis=-1)
+    tangent = along / np.maximum(length, 1e-9)[:, None]
+    # Variance of the line's offset at each point.
+    offset = points - middle[:, None]
+    position, across = (offset * tangent[:, None]).sum(-1), (offset * normal[:, None]).sum(-1)
+    sd_rho, sd_theta = (np.nan_to_num(sd)[:, None] for sd in (world.sigma_rho, world.sigma_theta))
+    at_foot = np.maximum(sd_rho**2 - ((middle * tangent).sum(-1)[:, None] * sd_theta) ** 2, 0.0)
+    of_line = at_foot + (position * sd_theta) ** 2 + settings.constraint_sd**2
+    of_point = np.einsum("wi,pij,wj->wp", normal, np.nan_to_num(cov), normal)
+    gate = SETTINGS.points.gate * np.sqrt(of_line + of_point + settings.alignment_floor**2)
+    aligned = answers & (np.abs(across) <= gate)
+    for wall in range(count):
+        for side, sign in ((0, -1.0), (1, 1.0)):
+            beyond = sign * position[wall] - length[wall] / 2
+            near = aligned[wall] & (beyond <= settings.max_unobserved)
+            near &= beyond >= -min(settings.max_overshoot, length[wall] / 2)
+            if not near.any():
+                continue
+            point = int(np.argmin(np.where(near, np.abs(beyond), np.inf)))
+            prior = np.where(np.isfinite(cov[point]), cov[point], settings.max_point_sd**2 * np.eye(2))
+            gain = prior @ normal[wall] / (normal[wall] @ prior @ normal[wall] + of_line[wall, point])
+            moved = points[point] - gain * ((points[point] - middle[wall]) @ normal[wall])
+            joint = prior - np.outer(gain, normal[wall] @ prior)
+            points[point], cov[point] = moved, (joint + joint.T) / 2
+            end_cov[wall, side] = cov[point]
+            segments[wall, side] = middle[wall] + ((moved - middle[wall]) @ tangent[wall]) * tangent[wall]
+            kinds[wall][side] = "corner" if world.point_kinds[point] == "corner" else "edge"
+    ends = {"segments": segments, "end_kinds": tuple((a, b) for a, b in kinds), "end_cov": end_cov}
+    return replace(world, points=points, point_cov=cov, **ends)
+
+
+def _ends_a_wall(world: GlobalMap, point: int) -> bool:
+    """Whether a point of a map is a corner or an edge, or probably one of both."""
+    if world.point_kinds[point] == "undecided":
+        _, corner, edge, _ = world.point_probabilities[point]
+        return bool(corner + edge > SETTINGS.endpoints.min_end_probability)
+    return world.point_kinds[point] in ("corner", "edge")

@@ -32,13 +32,9 @@ def circle_ranges(
     nx, ny = tx / out_length + rx / back_length, ty / out_length + ry / back_length
     scale = 1 / np.sqrt(nx * nx + ny * ny)
     nx, ny = nx * scale, ny * scale
-    for step in range(_NEWTON_STEPS + 1):
-        px, py = radius * nx, radius * ny
-        ax, ay, bx, by = tx - px, ty - py, rx - px, ry - py
-        a, b = np.sqrt(ax * ax + ay * ay), np.sqrt(bx * bx + by * by)
-        ax, ay, bx, by = ax / a, ay / a, bx / b, by / b
-        if step == _NEWTON_STEPS:
-            break
+    for _ in range(_NEWTON_STEPS):
+        ax, ay, a = _leg(tx, ty, radius, nx, ny)
+        bx, by, b = _leg(rx, ry, radius, nx, ny)
         # First and second derivative of the path length by the direction of the point, divided by the radius.
         a_along, b_along = ay * nx - ax * ny, by * nx - bx * ny
         slope = a_along + b_along
@@ -48,5 +44,20 @@ def circle_ranges(
         nx, ny = nx - turn * ny, ny + turn * nx
         scale = 1 / np.sqrt(nx * nx + ny * ny)
         nx, ny = nx * scale, ny * scale
+    ax, ay, a = _leg(tx, ty, radius, nx, ny)
+    bx, by, b = _leg(rx, ry, radius, nx, ny)
     x, y = -(ax + bx) / 2, -(ay + by) / 2
     return (a + b) / 2, np.stack([x, y], axis=-1), x * nx + y * ny
+
+
+def _leg(
+    x: Float[np.ndarray, "*#batch"],
+    y: Float[np.ndarray, "*#batch"],
+    radius: Float[np.ndarray, "*#batch"],
+    nx: Float[np.ndarray, "*#batch"],
+    ny: Float[np.ndarray, "*#batch"],
+) -> tuple[Float[np.ndarray, "*#batch"], Float[np.ndarray, "*#batch"], Float[np.ndarray, "*#batch"]]:
+    """Unit vector from the point of reflection to a sensor at (x, y) from the center, and their distance, metres."""
+    x, y = x - radius * nx, y - radius * ny
+    length = np.sqrt(x * x + y * y)
+    return x / length, y / length, length

@@ -68,7 +68,7 @@ def explained_by_points(
     for model in (corner_range, edge_range):
         predicted = model(points[point], origin[row, 0], half[row, 0]).range
         explained[row, point] |= np.abs(echoes.distance[row] - predicted) < settings.gate * sigma
-    return explained.any(axis=1)
+    return np.any(explained, axis=1)
 
 
 def meeting_points(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, "points 2"]:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.se2 import perpendicular, tangent_of, unit
-from jaxsonar.geometry.segments import lengths
+from jaxsonar.geometry.segments import lengths, point_to_segments
 from jaxsonar.reflectors.center_votes import center_seeds
 from jaxsonar.reflectors.explained_echoes import (
     explained_by_points,
@@ -17,7 +17,7 @@ from jaxsonar.reflectors.explained_echoes import (
     range_scatter,
     wall_residuals,
 )
-from jaxsonar.reflectors.kind_fit import CIRCLE, PLANE, KindFits, add_silences, fit_kinds, near_echoes
+from jaxsonar.reflectors.kind_fit import CIRCLE, EDGE, PLANE, KindFits, add_silences, fit_kinds, near_echoes
 from jaxsonar.reflectors.range_measurements import RangeMeasurements, independent_weights
 from jaxsonar.reflectors.settings import SETTINGS
 
@@ -60,7 +60,7 @@ class FoundReflectors:
     reflectors: tuple[Reflector, ...]
     """Those with most evidence first found first."""
     replaced_walls: Bool[np.ndarray, " walls"]
-    """Short walls whose echoes a reflector of another kind explains."""
+    """Short walls whose echoes a reflector of another kind explains, and mirror images behind other walls."""
     replaced_points: Bool[np.ndarray, " points"]
     """Points at the position of a reflector."""
     sigma: float
@@ -83,12 +83,14 @@ def find_reflectors(
         sigma: standard deviation of ranges if the walls do not show it, metres.
     """
     settings = SETTINGS.explanation
-    long = lengths(walls) >= settings.released_length
     heard = np.flatnonzero(np.isfinite(measurements.distance))
     if not len(heard):
         return FoundReflectors((), np.zeros(len(walls), dtype=bool), np.zeros(len(points), dtype=bool), sigma)
     echoes = measurements.take(heard)
     residual = wall_residuals(echoes, walls)
+    ghosts = _ghost_walls(echoes, walls, residual, sigma)
+    walls, residual = walls[~ghosts], residual[:, ~ghosts]
+    long = lengths(walls) >= settings.released_length
     for chosen in (residual[:, long], residual):
         scatter = range_scatter(chosen)
         if not np.isnan(scatter):
@@ -107,7 +109,7 @@ def find_reflectors(
         left = left[~explained_by_two_walls(echoes.take(left), fixed, wide)]
         on_walls = np.abs(residual[np.ix_(left, ~long)].T) < SETTINGS.fit.start_gate
         seeds = _wall_seeds(walls[~long], echoes.origin[left], on_walls)
-        found = _search(measurements, heard[left], fixed, sigma, seeds, on_walls)
+        found = _search(measurements, heard[left], fixed, sigma, walls.reshape(-1, 2), seeds, on_walls)
         # Without long walls only the reflectors show the scatter of the ranges.
         squared = np.concatenate([one.residual for one in found] or [np.zeros(0)]) ** 2
         if long.any() or len(squared) < settings.min_scatter_echoes:
@@ -115,13 +117,47 @@ def find_reflectors(
         before, sigma = sigma, max(1.4826 * float(np.sqrt(np.median(squared))), settings.min_sigma)
         if max(before / sigma, sigma / before) < settings.same_sigma:
             break
-    found, replaced = _with_walls(residual, heard, long, found, sigma + settings.model_error / settings.gate)
+    found, replaced = _with_walls(walls, residual, heard, long, found, sigma + settings.model_error / settings.gate)
     points_found = [one for one in found if not one.is_wall]
     position = np.array([one.position for one in points_found]).reshape(-1, 2)
     reach = settings.vertex_distance + np.nan_to_num([one.radius for one in points_found])
     replaced_points = (np.linalg.norm(points[:, None] - position, axis=-1) < reach).any(axis=1)
     replaced_points[at_walls] = False
-    return FoundReflectors(tuple(found), replaced, replaced_points, sigma)
+    removed = ghosts.copy()
+    removed[~ghosts] = replaced
+    return FoundReflectors(tuple(found), removed, replaced_points, sigma)
+
+
+def _ghost_walls(
+    echoes: RangeMeasurements,
+    walls: Float[np.ndarray, "walls 2 2"],
+    residual: Float[np.ndarray, "rows walls"],
+    sigma: float,
+) -> Bool[np.ndarray, " walls"]:
+    """Walls behind other walls whose echoes two other walls in turn explain.
+
+    Args:
+        echoes: all echoes.
+        walls: both ends, metres.
+        residual: as from ``wall_residuals``.
+        sigma: standard deviation of ranges if the walls do not show it, metres.
+    """
+    settings = SETTINGS.explanation
+    scatter = range_scatter(residual)
+    wide = max(sigma if np.isnan(scatter) else scatter, settings.min_sigma) + settings.model_error / settings.gate
+    fits = np.abs(residual) < settings.gate * wide
+    ghosts = np.zeros(len(walls), dtype=bool)
+    for wall in np.argsort(fits.sum(axis=0), kind="stable").tolist():
+        rows, others = np.flatnonzero(fits[:, wall]), ~ghosts
+        others[wall] = False
+        if not len(rows) or not others.any():
+            continue
+        own = echoes.take(rows)
+        tangent = (walls[wall, 1] - walls[wall, 0]) / max(float(lengths(walls[wall : wall + 1])[0]), 1e-9)
+        foot = walls[wall, 0] + ((own.origin - walls[wall, 0]) @ tangent)[:, None] * tangent
+        if hidden_by_walls(own.origin, foot, walls[others]).mean() > settings.ghost_share:
+            ghosts[wall] = explained_by_two_walls(own, walls[others], wide).mean() > settings.ghost_share
+    return ghosts
 
 
 def _search(
@@ -129,6 +165,7 @@ def _search(
     free: Int[np.ndarray, " free"],
     walls: Float[np.ndarray, "walls 2 2"],
     sigma: float,
+    ends: Float[np.ndarray, "ends 2"],
     wall_seeds: tuple[Float[np.ndarray, "short 2"], Float[np.ndarray, " short"]],
     on_walls: Bool[np.ndarray, "short free"],
 ) -> list[Reflector]:
@@ -139,6 +176,7 @@ def _search(
         free: rows of the echoes that nothing explains.
         walls: both ends of the walls that hide what is behind them, metres.
         sigma: standard deviation of ranges, metres.
+        ends: ends of all walls, metres.
         wall_seeds: centers and radii of circles that touch the short walls, metres.
         on_walls: echoes near each of these.
     """
@@ -164,7 +202,7 @@ def _search(
         wave = fit_kinds(measurements, free, weight, centers[chosen], radii[chosen], near[chosen] & is_free, sigma)
         wave = _refitted(measurements, free, is_free, weight, wave, sigma)
         for fits in sorted(wave, key=lambda fits: -np.inf if fits is None else -float(fits.evidence.max())):
-            one = None if fits is None else _decided(measurements, weight, fits, sigma, walls)
+            one = None if fits is None else _decided(measurements, weight, fits, sigma, walls, ends)
             if one is not None and is_free[np.searchsorted(free, one.echoes)].mean() > SETTINGS.decision.min_free_share:
                 # What is hidden by a wall, or heard at one place only, is an artifact; its echoes are used up, too.
                 is_free[np.searchsorted(free, one.echoes)] = False
@@ -232,11 +270,14 @@ def _decided(
     fits: KindFits,
     sigma: float,
     walls: Float[np.ndarray, "walls 2 2"],
+    ends: Float[np.ndarray, "ends 2"],
 ) -> Reflector | None:
     """The reflector of the most likely kind, undecided if it is not much more likely; None without enough evidence."""
     settings = SETTINGS.decision
     evidence, count, gone = add_silences(measurements, weight, fits, sigma, walls)
     odds = evidence + np.log(settings.prior)
+    if len(near_points(fits.nearest[[EDGE]], ends, settings.end_distance)):
+        odds[CIRCLE] -= np.log(settings.end_odds)
     probability = np.exp(odds - odds.max())
     probability /= probability.sum()
     best = int(np.argmax(probability))
@@ -278,6 +319,7 @@ def _decided(
 
 
 def _with_walls(
+    walls: Float[np.ndarray, "walls 2 2"],
     residual: Float[np.ndarray, "rows walls"],
     heard: Int[np.ndarray, " rows"],
     long: Bool[np.ndarray, " walls"],
@@ -287,6 +329,7 @@ def _with_walls(
     """The reflectors, those marked that short walls of the map describe, and the short walls that others replace.
 
     Args:
+        walls: both ends, metres.
         residual: as from ``wall_residuals``, one row per echo.
         heard: rows of the measurements that are echoes.
         long: walls that cannot be replaced.
@@ -300,7 +343,9 @@ def _with_walls(
     for one in found:
         rows = np.searchsorted(heard, one.echoes)
         share = fits[rows].mean(axis=0).max(initial=0.0)
-        is_wall = one.probability[PLANE] >= settings.min_wall_probability and share > settings.replaced_share
+        on_wall = point_to_segments(one.position[None], walls).min(initial=np.inf) < settings.on_wall
+        known = share > settings.replaced_share or (one.kind < 0 and on_wall)
+        is_wall = known and one.probability[PLANE] >= settings.min_wall_probability
         is_wall |= one.kind == PLANE
         by_other[rows] = not is_wall
         marked.append(replace(one, is_wall=bool(is_wall)))

@@ -259,6 +259,9 @@ def add_silences(
             toward = np.broadcast_to(unit(fits.parameters[PLANE, 1]), toward.shape)
         angle = np.abs(wrap_angle(np.arctan2(toward[:, 1], toward[:, 0]) - measurements.axis[near]))
         asked = angle < decision.certain_view * measurements.half_width[near]
+        heard_from = measurements.distance[fits.rows[fits.inlier[kind]]]
+        if len(heard_from):  # what is farther may be too weak
+            asked &= predicted[kind] <= np.quantile(heard_from, decision.certain_quantile)
         asked &= predicted[kind] < decision.certain_range * reach
         asked &= measurements.distance[near] > predicted[kind] - SETTINGS.fit.gate * sigma
         if kind == PLANE:

@@ -65,8 +65,8 @@ class KindFitSettings:
     """Smallest radius of a circle, metres: about a wavelength. A thinner column is a pole, which answers as an edge."""
     max_radius: float = 1.0
     """Largest radius of a circle, metres; thicker columns are rare, and hardly differ from walls."""
-    view_margin: float = float(np.radians(15.0))
-    """Echoes belong to a reflector up to this far outside of the nominal beam, radians."""
+    view_margin: float = float(np.radians(20.0))
+    """Echoes belong to a reflector up to this far outside of the nominal beam, radians; near reflectors are loud."""
     gate: float = 3.5
     """Largest residual of an echo of a reflector, standard deviations."""
     inlier_share: float = 0.9
@@ -104,6 +104,9 @@ class ReflectorDecisionSettings:
     heard at one place only."""
     certain_view: float = 0.6
     """Part of the beam in which a measurement must hear a reflector."""
+    certain_quantile: float = 0.5
+    """A measurement must hear a reflector that is nearer than this quantile of its echoes: edges are heard from nearby
+    only."""
     certain_range: float = 0.9
     """Part of the maximum range in which it must."""
     most_missed: int = 3
@@ -116,6 +119,10 @@ class ReflectorDecisionSettings:
     """A reflector claims the echoes that it would cause as a kind of at least this probability."""
     prior: tuple[float, float, float, float] = (0.5, 0.15, 0.15, 0.2)
     """Prior probabilities of plane, corner, edge and circle: most reflectors of rooms are walls."""
+    end_distance: float = 0.15
+    """A reflector this close to the end of a wall, metres, ..."""
+    end_odds: float = 100.0
+    """... is less likely to be a circle by this factor: where a wall ends there is an edge, hardly ever a column."""
     hidden: float = 0.05
     """A reflector farther behind a wall than this is not visible, metres."""
 
@@ -126,7 +133,7 @@ class ExplainedEchoSettings:
 
     gate: float = 3.5
     """Largest residual of an explained echo, standard deviations."""
-    beyond: float = 0.25
+    beyond: float = 0.1
     """A wall may reflect this far beyond its known ends, metres."""
     corner_reach: float = 1.5
     """Two walls meet if neither has to be extended by more than this, metres."""
@@ -142,11 +149,16 @@ class ExplainedEchoSettings:
     """Echoes within this distance of a wall determine the scatter of the ranges, metres."""
     model_error: float = 0.005
     """Error of the walls that is added to the gate, metres."""
+    ghost_share: float = 0.7
+    """Share of the echoes of a wall that other walls must hide, and explain by two reflections, before it counts as a
+    mirror image."""
     vertex_distance: float = 0.1
     """A point this close to the end of a wall, or to where two walls meet, belongs to them; one this close to a found
     reflector is the same, metres."""
-    min_wall_probability: float = 0.03
+    min_wall_probability: float = 0.003
     """A short wall of the map remains if it may be a plane with this probability: most walls of maps are walls."""
+    on_wall: float = 0.03
+    """An undecided reflector that may be a plane belongs to a wall that is this close, metres."""
     replaced_share: float = 0.5
     """Share of the echoes of a short wall that other reflectors must explain before they replace it."""
     sigma_iterations: int = 3

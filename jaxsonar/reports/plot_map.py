@@ -170,7 +170,8 @@ def map_figure(
     """
     if title is None:
         counts = {kind: world.point_kinds.count(kind) for kind in POINT_KINDS}
-        points = [plural(count, kind) for kind, count in counts.items() if count]
+        names = {"undecided": "undecided reflector"}
+        points = [plural(count, names.get(kind, kind)) for kind, count in counts.items() if count]
         title = ", ".join([plural(len(world), "merged segment"), *points])
     figure, axes = plan_view(title)
     handles = _draw_map(axes, world)
