@@ -48,7 +48,7 @@ def scene(rng):
 
 def oracle(poses, circles, tx, rx):
     """Half the shortest path over each circle, from the definition."""
-    world = [transform_points(poses, sensors[:, None])[:, 0] for sensors in (tx, rx)]
+    world = [transform_points(poses, sensors) for sensors in (tx, rx)]
     center = circles.anchor + circles.parameters
     return shortest_path_over_circle(np.column_stack([center, circles.radius]), *world) / 2
 
