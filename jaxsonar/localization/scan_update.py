@@ -302,7 +302,10 @@ def _nearest(
     along = jnp.clip((offset * t).sum(-1), every.extent[:, 0], every.extent[:, 1])
     on_wall = every.anchor + every.parameters[:, :1] * n + along[:, None] * t
     foot = jnp.where((kind == kernels.PLANE)[:, None], on_wall, every.anchor + every.parameters)
-    distance = jnp.where(kind >= 0, jnp.linalg.norm(foot - pose[None, :2], axis=-1), jnp.inf)
+    distance = jnp.linalg.norm(foot - pose[None, :2], axis=-1)
+    if every.radius is not None:
+        distance -= jnp.asarray(every.radius)
+    distance = jnp.where(kind >= 0, distance, jnp.inf)
     size = min(SETTINGS.max_landmarks, len(distance))
     _, rows = jax.lax.top_k(-distance, size)
     near = jax.tree.map(lambda leaf: jnp.asarray(leaf)[rows], every)

@@ -35,8 +35,9 @@ def adjusted_map(world: GlobalMap, adjustment: AdjustmentResult, cov: Float[np.n
     theta_variance = cov[wall, 1, 1]
     rho_variance = cov[wall, 0, 0] + 2 * arm * cov[wall, 0, 1] + arm**2 * theta_variance
     kinds = {kind: name for name, kind in POINT_KINDS.items()}
+    is_kept = np.isin(np.arange(count), kept)
     return replace(
-        world.take_points(np.isin(np.arange(wall_count, count), point)),
+        world.take_walls(is_kept[:wall_count]).take_points(is_kept[wall_count:]),
         points=landmark_positions(points),
         point_kinds=tuple(kinds[kind] for kind in points.kind.tolist()),
         point_cov=cov[point],
@@ -47,5 +48,6 @@ def adjusted_map(world: GlobalMap, adjustment: AdjustmentResult, cov: Float[np.n
         sigma_rho=np.sqrt(rho_variance),
         sigma_theta=np.sqrt(theta_variance),
         echoes=echoes[wall],
-        scans=tuple(world.scans[row] for row in wall),
+        end_kinds=(),
+        end_cov=np.full((len(wall), 2, 2, 2), np.nan),
     )
