@@ -6,7 +6,7 @@ Modules, in the order of the data:
 - ``hough_voting``, ``hough_accumulator``: arcs -> tangent lines -> votes -> low pass -> threshold (paper, section 4).
 - ``measurement_model``: the only range model of plane, corner, edge and circle. ``detection_cones``: which echoes are
   received. ``landmarks``: reflectors of the world.
-- ``robust_fit``: one reflector fitted to echoes. ``ml_detection`` with ``ml_detection_*``: all reflectors of a scan.
+- ``robust_fit``: one reflector fitted to echoes. ``ml_detection``: all reflectors of a scan.
 - ``data_association``, ``iterated_ekf``, ``bundle_adjustment``: echoes and landmarks, poses and ring parameters.
 - ``focus_measure``, ``beam_pattern``: ring parameters without landmarks, and the detection cones of the sensors.
 - ``occupancy_evidence``: cells that echoes come from, cells that were seen through, and grids after Bayes.
@@ -100,9 +100,10 @@ from .measurement_model import edge_range as edge_range
 from .measurement_model import expected_range as expected_range
 from .measurement_model import plane_range as plane_range
 from .measurement_model import reported_range as reported_range
-from .ml_detection import Detections as Detections
-from .ml_detection import detect_ml as detect_ml
-from .ml_detection_settings import DetectionSettings as DetectionSettings
+from .ml_detection.detector import REFLECTOR_KINDS as REFLECTOR_KINDS
+from .ml_detection.detector import Detections as Detections
+from .ml_detection.detector import detect_ml as detect_ml
+from .ml_detection.settings import DetectionSettings as DetectionSettings
 from .occupancy_evidence import CONE_MARGIN as CONE_MARGIN
 from .occupancy_evidence import DIRECTIONS as DIRECTIONS
 from .occupancy_evidence import ArcCells as ArcCells

@@ -7,7 +7,7 @@ reduced from step to step (graduated non-convexity), so that echoes of other ref
 
 The ranges are those of ``measurement_model``. ``registration.reflector_fit`` fits with the same loss in NumPy, because
 it fits a varying number of reflectors, which would be compiled again for every size.
-``ml_detection_likelihood.refine`` has no such loss: it weights each echo by its probability of being clutter.
+``ml_detection.likelihood.refine`` has no such loss: it weights each echo by its probability of being clutter.
 """
 
 from collections.abc import Callable

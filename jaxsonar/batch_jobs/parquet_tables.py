@@ -31,7 +31,7 @@ SCAN_COLUMNS = {
 }
 PROBABILITY_COLUMNS = {
     f"p_{kind}": ParquetColumn("float64", "", f"probability that it is a {kind}")
-    for kind in ("plane", "corner", "edge")
+    for kind in ("plane", "corner", "edge", "circle")
 }
 SEGMENT_COLUMNS = {
     name: ParquetColumn("float64", "m", "an end of the local segment, robot frame") for name in ("x1", "y1", "x2", "y2")
@@ -65,9 +65,11 @@ TABLES: dict[str, dict[str, ParquetColumn]] = {
         "kind": ParquetColumn("string", "", "corner, edge, or undecided: then it may be a wall, too"),
         "x": ParquetColumn("float64", "m", "robot frame; of a wall the middle of what was seen"),
         "y": ParquetColumn("float64", "m", "robot frame"),
-        "cov_x": ParquetColumn("float64", "m^2", "covariance of (x, y); corners and edges"),
-        "cov_xy": ParquetColumn("float64", "m^2", "covariance of (x, y); corners and edges"),
-        "cov_y": ParquetColumn("float64", "m^2", "covariance of (x, y); corners and edges"),
+        "cov_x": ParquetColumn("float64", "m^2", "covariance of (x, y); corners, edges and circles"),
+        "cov_xy": ParquetColumn("float64", "m^2", "covariance of (x, y); corners, edges and circles"),
+        "cov_y": ParquetColumn("float64", "m^2", "covariance of (x, y); corners, edges and circles"),
+        "radius": ParquetColumn("float64", "m", "radius of a circle, whose x, y are its center"),
+        "cov_radius": ParquetColumn("float64", "m^2", "variance of the radius; circles"),
         "rho": ParquetColumn("float64", "m", "of what is undecided, if it is a wall"),
         "theta": ParquetColumn("float64", "rad", "of what is undecided, if it is a wall"),
         **PROBABILITY_COLUMNS,

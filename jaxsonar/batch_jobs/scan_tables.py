@@ -110,6 +110,9 @@ def _ml_columns(detections: DetectionBatch) -> _BatchColumns:
     row, k = np.nonzero(np.asarray(reflectors.kind) >= 0)
     decided = detections.decided[row, k]
     first, second = np.asarray(reflectors.parameters)[row, k].astype(np.float64).T
+    is_circle = decided == kernels.CIRCLE
+    circle = np.asarray(reflectors.circle)[row, k].astype(np.float64)
+    circle_cov = np.asarray(reflectors.circle_covariance)[row, k].astype(np.float64)
     cov = np.asarray(reflectors.covariance)[row, k].astype(np.float64)
     segment = np.asarray(reflectors.segment)[row, k]
     echoes = np.asarray(reflectors.involved).sum(axis=-1)[row, k]
@@ -133,12 +136,16 @@ def _ml_columns(detections: DetectionBatch) -> _BatchColumns:
         "rho": np.where(is_plane, first, np.hypot(first, second)),
         "theta": wrap_angle(np.where(is_plane, second, np.arctan2(second, first))),
     }
-    point_covariance = {"cov_x": cov[:, 0, 0], "cov_xy": cov[:, 0, 1], "cov_y": cov[:, 1, 1]}
+    point_cov = np.where(is_circle[:, None, None], circle_cov[:, :2, :2], cov)
+    point_covariance = {"cov_x": point_cov[:, 0, 0], "cov_xy": point_cov[:, 0, 1], "cov_y": point_cov[:, 1, 1]}
+    of_circle = {"radius": circle[:, 2], "cov_radius": circle_cov[:, 2, 2]}
+    names = dict(zip(kernels.REFLECTOR_KINDS, KIND_NAMES, strict=True))
     point_columns = {
         "row": scans[row],
-        "kind": np.where(is_decided, np.array(KIND_NAMES, object)[decided], "undecided"),
-        "x": np.where(is_plane, middle[:, 0], first),
-        "y": np.where(is_plane, middle[:, 1], second),
+        "kind": np.array([names.get(one, "undecided") for one in decided.tolist()], object),
+        "x": np.where(is_circle, circle[:, 0], np.where(is_plane, middle[:, 0], first)),
+        "y": np.where(is_circle, circle[:, 1], np.where(is_plane, middle[:, 1], second)),
+        **{name: np.where(is_circle, values, np.nan) for name, values in of_circle.items()},
         **{name: np.where(is_decided, values, np.nan) for name, values in point_covariance.items()},
         **{name: np.where(is_decided, np.nan, values) for name, values in undecided_line.items()},
         **dict(zip(PROBABILITY_COLUMNS, np.asarray(reflectors.probability)[row, k].T, strict=True)),

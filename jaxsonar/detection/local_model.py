@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from jaxsonar.fileio.atomic_files import open_output
 
 KIND_NAMES = ("plane", "corner", "edge", "circle")
-"""Names of the reflector kinds ``kernels.PLANE``, ``kernels.CORNER`` and ``kernels.EDGE``, by their values."""
+"""Names of the reflector kinds, in the order of ``kernels.REFLECTOR_KINDS``."""
 
 
 @dataclass(frozen=True)
@@ -71,22 +71,24 @@ class Line:
 
 @dataclass(frozen=True)
 class Point:
-    """One corner, edge or pole as observed in one scan, robot frame."""
+    """One corner, edge, pole or circle as observed in one scan, robot frame."""
 
     x: float
     """Metres."""
     y: float
     """Metres."""
     kind: str
-    """ "corner" (right-angled, double reflection) or "edge" (diffraction; also thin poles)."""
-    cov: Float[np.ndarray, "2 2"]
-    """Covariance of (x, y), square metres."""
+    """ "corner" (right-angled, two reflections), "edge" (diffraction; also thin poles) or "circle" (a round column)."""
+    cov: Float[np.ndarray, "n n"]
+    """Covariance of (x, y), of a circle of (x, y, radius), square metres."""
     echoes: int
     """Number of echoes that it explains."""
     paths: Int[np.ndarray, "paths 2"]
     """(tx, rx) of those echoes."""
     probability: float
     """Posterior probability of ``kind``."""
+    radius: float = float("nan")
+    """Radius of a circle, metres; NaN for other kinds. The position of a circle is its center."""
 
     def as_json(self) -> dict[str, Any]:
         """The point as an object of the JSON Lines file."""
@@ -97,6 +99,7 @@ class Point:
             "kind": self.kind,
             "echoes": self.echoes,
             "probability": self.probability,
+            **({"radius": self.radius} if self.kind == "circle" else {}),
             "paths": self.paths.tolist(),
         }
 
@@ -114,7 +117,7 @@ class Undecided:
     y: float
     """Metres."""
     probability: dict[str, float]
-    """Posterior probability of "plane", "corner" and "edge"."""
+    """Posterior probability of "plane", "corner", "edge" and "circle"."""
     echoes: int
     """Number of echoes that it explains."""
     paths: Int[np.ndarray, "paths 2"]

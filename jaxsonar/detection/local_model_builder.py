@@ -133,10 +133,11 @@ def _ml_model(ring: Ring, detections: DetectionBatch, row: int, scan: int, stamp
         if decided[k] == kernels.PLANE:
             theta, evidence = float(wrap_angle(b)), float(found.evidence[row, k])
             lines.append(Line(rho=a, theta=theta, segment=segment, votes=evidence, scans=(scan,), cov=cov, **support))
-        elif decided[k] == 3:
+        elif decided[k] == kernels.CIRCLE:
             x, y, radius = found.circle[row, k].tolist()
             cov = np.asarray(found.circle_covariance[row, k], dtype=np.float64)
-            points.append(Point(x=x, y=y, kind="circle", cov=cov, probability=probability["circle"], **support))
+            cov, sure = (cov + cov.T) / 2, probability["circle"]
+            points.append(Point(x=x, y=y, kind="circle", cov=cov, probability=sure, radius=radius, **support))
         elif decided[k] >= 0:
             kind = KIND_NAMES[decided[k]]
             points.append(Point(x=a, y=b, kind=kind, cov=cov, probability=probability[kind], **support))

@@ -68,8 +68,13 @@ def ml_detections(
         rows = slice(0, len(batch.scans))  # without padding
         found = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], found)
         # A kind is decided if its posterior probability suffices and its parameters are those that were fitted.
-        decided = (found.kind >= 0) & (found.probability.max(axis=-1) >= SETTINGS.min_probability)
-        decided &= found.probability.argmax(axis=-1) == found.kind
+        least = np.where(found.kind == kernels.PLANE, SETTINGS.min_wall_probability, SETTINGS.min_probability)
+        decided = (found.kind >= 0) & (found.probability.max(axis=-1) >= least)
+        likely = np.array(kernels.REFLECTOR_KINDS)[found.probability.argmax(axis=-1)]
+        decided &= likely == found.kind
+        # One scan decides on a circle only if it determines the radius.
+        radius, variance = found.circle[..., 2], found.circle_covariance[..., 2, 2]
+        decided &= (found.kind != kernels.CIRCLE) | (np.sqrt(variance) <= SETTINGS.max_radius_error * radius)
         # Direct echoes alone cannot distinguish a corner from an edge; only the prior would decide.
         cross = (found.involved & (ring.paths[batch.path, 0] != ring.paths[batch.path, 1])[rows, None]).any(axis=-1)
         decided &= (found.kind == kernels.PLANE) | cross

@@ -18,7 +18,12 @@ class DecisionSettings:
     """Constants of decisions on the host. Kernels have ``kernels.HoughSettings`` and ``kernels.DetectionSettings``."""
 
     min_probability: float = 0.7
-    """Posterior probability from which on a reflector is reported as a wall, corner or edge. Chosen by hand."""
+    """Posterior probability from which on a reflector is reported as a corner, edge or circle. Chosen by hand."""
+    min_wall_probability: float = 0.5
+    """The same for walls: a wall is more likely than all other kinds together."""
+    max_radius_error: float = 0.5
+    """Largest standard deviation of the radius of a circle that one scan decides on, relative to the radius. Chosen by
+    hand."""
     window_threshold: float = 0.05
     """Occupancy threshold for windows of scans, as a fraction of a fully observed wall. Lower than for single scans,
     because the test of plane against point decides and a wall may be observed by one sensor only. Chosen by hand."""

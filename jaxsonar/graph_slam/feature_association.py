@@ -109,7 +109,7 @@ def feature_measurements(model: LocalModel) -> FeatureMeasurements:
 
 def _radius(point: Point) -> float:
     """Radius of a circle, metres; 0 for other points."""
-    return float(getattr(point, "radius", 0.0)) if point.kind == "circle" else 0.0
+    return point.radius if point.kind == "circle" else 0.0
 
 
 class FeatureAssociation(NamedTuple):

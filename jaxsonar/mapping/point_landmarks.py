@@ -88,16 +88,14 @@ class PointLandmarks(Observations):
 
 
 def aggregate_points(models: Sequence[LocalModel], poses: Float[np.ndarray, "models 3"]) -> PointLandmarks:
-    """The corners and edges of local models in the world frame; circles are found in the echoes of all scans instead.
+    """The corners and edges of local models in the world frame; ``reflectors`` fits circles to the echoes of all scans.
 
     Args:
         models: local models, robot frame.
         poses: world_from_robot of each: x, y (m), theta (rad). Models with a NaN pose are left out.
     """
     has_pose = np.all(np.isfinite(poses), axis=1)
-    found = [
-        (k, p) for k, model in enumerate(models) if has_pose[k] for p in model.points if p.kind in ("corner", "edge")
-    ]
+    found = [(k, p) for k, model in enumerate(models) if has_pose[k] for p in model.points if p.kind != "circle"]
     model = np.array([k for k, _ in found], dtype=np.int64)
     position = np.array([transform_points(poses[k], np.array([[p.x, p.y]]))[0] for k, p in found]).reshape(-1, 2)
     rotation = np.stack([unit(poses[model, 2]), tangent_of(poses[model, 2])], axis=-1)

@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Wedge
+from matplotlib.patches import Circle, Wedge
 from matplotlib.ticker import MultipleLocator
 
 from jaxsonar import kernels
@@ -226,13 +226,20 @@ def _arc_points(sensors: kernels.SensorArray, path: jax.Array, half_path: jax.Ar
 
 
 def _draw_points(axes: Axes, model: LocalModel, pose: Float[np.ndarray, "3"]) -> list[Line2D]:
-    """Draw corners, edges and undecided reflectors. Returns the legend handles."""
+    """Draw corners, edges, circles and undecided reflectors. Returns the legend handles."""
     kinds = {
         POINT_MARKERS["corner"]: ("corner", [(p.x, p.y) for p in model.points if p.kind == "corner"]),
         POINT_MARKERS["edge"]: ("edge or pole", [(p.x, p.y) for p in model.points if p.kind == "edge"]),
-        "o": ("undecided: wall or point", [(u.x, u.y) for u in model.undecided]),
+        POINT_MARKERS["undecided"]: ("undecided: wall or point", [(u.x, u.y) for u in model.undecided]),
     }
     handles = []
+    circles = [p for p in model.points if p.kind == "circle"]
+    for one in circles:
+        center = transform_points(pose, np.array([[one.x, one.y]]))[0]
+        axes.add_patch(Circle((center[0], center[1]), one.radius, fc="white", ec=POINT_COLOR, lw=1.8, zorder=5.5))
+    if circles:
+        style = {"color": POINT_COLOR, "marker": "o", "ls": "", "ms": 9, "mfc": "white", "mew": 1.8}
+        handles.append(Line2D([], [], **style, label="circle (true radius)"))
     for marker, (label, points) in kinds.items():
         style = {"color": POINT_COLOR, "marker": marker, "ls": "", "ms": 7, "mfc": "white", "mew": 1.8, "label": label}
         if points:

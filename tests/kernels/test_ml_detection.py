@@ -18,8 +18,8 @@ from jaxsonar import HoughSettings, Ring, Room, kernels, load_ring, random_pose,
 from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.floor_plans.room import walls_in_robot_frame
 from jaxsonar.kernels.measurement_model import plane_echo
-from jaxsonar.kernels.ml_detection_likelihood import plane_missed_log_likelihood, refine
-from jaxsonar.kernels.ml_detection_state import ScanData, SceneEstimate
+from jaxsonar.kernels.ml_detection.likelihood import plane_missed_log_likelihood, refine
+from jaxsonar.kernels.ml_detection.state import ScanData, SceneEstimate
 from jaxsonar.scans.echo_batches import SLOW_SCANS, pack
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.simulation.acoustics import Acoustics

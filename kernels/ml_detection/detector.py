@@ -21,38 +21,48 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from . import hough_accumulator as hough
-from .detection_cones import SETTINGS as CONES
-from .detection_cones import echo_level, visibility
-from .hough_accumulator import HoughSettings
-from .hough_voting import PackedEchoes, RingArcs, map_scans, tangent_lines
-from .measurement_model import CORNER, PLANE, plane_echo, point_echo
-from .ml_detection_circles import fit_circles
-from .ml_detection_likelihood import (
-    alignment_ratio,
+from .. import hough_accumulator as hough
+from ..hough_accumulator import HoughSettings
+from ..hough_voting import PackedEchoes, RingArcs, map_scans, tangent_lines
+from ..measurement_model import CIRCLE, CORNER, EDGE, PLANE, plane_echo, point_echo
+from ..planar_geometry import fold_line, segment_endpoints, wrap_angle
+from ..robust_fit import (
+    crosstalk_of_echoes,
+    edge_from_midpoint,
+    fit_reflector,
+    paths_and_ranges,
+    plane_from_both_sides,
+    start_of_point,
+)
+from ..sensor_array import EchoPaths, transform_path
+from .circles import fit_circles, nearest_point
+from .likelihood import (
     clutter_log_density,
+    hears_outside_cones,
     plane_log_prior,
     plane_missed_log_likelihood,
     point_log_prior,
     point_missed_log_likelihood,
     refine,
 )
-from .ml_detection_settings import DetectionSettings
-from .ml_detection_state import Hypotheses, ScanData, SceneEstimate, Selection, count, determinant
-from .planar_geometry import fold_line, segment_endpoints, wrap_angle
-from .robust_fit import crosstalk_of_echoes, edge_from_midpoint, fit_reflector, paths_and_ranges, plane_from_both_sides, start_of_point
-from .sensor_array import EchoPaths, transform_path
+from .scene_estimate import update_scene
+from .settings import DetectionSettings
+from .state import Hypotheses, ScanData, SceneEstimate, Selection, count, determinant
 
 _IS_EDGE = (0.0, 1.0)  # corner, edge
+
+REFLECTOR_KINDS = PLANE, CORNER, EDGE, CIRCLE
+"""Kinds of detected reflectors, in the order of ``Detections.probability``."""
 
 
 class Detections(eqx.Module):
     """The reflectors of scans, those with the most evidence first; kind -1 where there are fewer."""
 
     kind: Int[Array, "*scans reflectors"]
-    """PLANE, CORNER or EDGE, the most likely one; -1 for unused rows."""
+    """PLANE, CORNER, EDGE or CIRCLE, the most likely one; -1 for unused rows."""
     parameters: Float[Array, "*scans reflectors 2"]
-    """(rho, theta) of a plane, (x, y) of a corner or an edge; robot frame, metres, radians."""
+    """(rho, theta) of a plane, (x, y) of a corner, an edge or the nearest point of a circle; robot frame, metres,
+    radians."""
     covariance: Float[Array, "*scans reflectors 2 2"]
     """Covariance of the parameters by the noise of the ranges."""
     circle: Float[Array, "*scans reflectors 3"]
@@ -153,24 +163,25 @@ def detect_in_scan(
     # Fit the selected reflectors as circles, and let the four kinds compete.
     clutter = clutter_log_density(scan, scene, settings)
     circles = fit_circles(scan, selected, selection, clutter, scene, settings)
-    selection = with_circles(selection, circles.score, settings)
+    kind, probability = compare_with_circles(selection, circles.evidence, settings)
 
-    # Planes in canonical form, and their endpoints.
-    is_plane = selection.kind == PLANE
+    # Planes in canonical form, and their endpoints; of circles the nearest points.
+    is_plane, is_circle = selection.kind == PLANE, kind == CIRCLE
     line = jnp.stack(fold_line(selected.parameters[:, 0], selected.parameters[:, 1]), axis=-1)
     folded = is_plane & (selected.parameters[:, 0] < 0)
     parameters = jnp.where(is_plane[:, None], line, selected.parameters)
+    parameters = jnp.where(is_circle[:, None], jax.vmap(nearest_point)(circles.circle), parameters)
     covariance = jax.vmap(lambda one: one.covariance)(selected)
     signs = np.array([[[1.0, -1.0], [-1.0, 1.0]]], np.float32)  # rho changes its sign, theta does not
     covariance = jnp.where(folded[:, None, None], covariance * signs, covariance)
     each_segment = jax.vmap(lambda x, involved: segment_endpoints(x[0], x[1], echo_paths.midpoint, involved))
     return Detections(
-        kind=jnp.where(selection.evidence > -jnp.inf, selection.kind, -1),
+        kind=jnp.where(selection.evidence > -jnp.inf, kind, -1),
         circle=circles.circle,
         circle_covariance=circles.covariance,
         parameters=parameters,
         covariance=covariance,
-        probability=selection.probability,
+        probability=probability,
         evidence=selection.evidence,
         involved=selection.involved,
         segment=each_segment(parameters, selection.involved),
@@ -258,19 +269,19 @@ def evaluate_hypotheses(
 
     def plane(x: Float[Array, "2"]) -> Hypotheses:
         one = refine(scan, plane_echo, x, scene, clutter, settings)
-        soft = scene.silence_threshold < settings.deaf_threshold
-        weight = jnp.where(soft, settings.missed_weight_plane_soft, settings.missed_weight_plane)
+        outside = hears_outside_cones(scene, settings)
+        weight = jnp.where(outside, 1, settings.missed_weight_plane)
         missed = weight * plane_missed_log_likelihood(scan, one, scene, settings)
         one = with_base(one, missed, plane_log_prior(scan, one, scene, settings))
         # Points have fewer echoes than a full wall.
         fraction = count(one.log_ratio > 0) / scan.full_wall_paths
-        bonus = jnp.where(soft, settings.full_wall_bonus_soft, settings.full_wall_bonus)
+        bonus = jnp.where(outside, 0, settings.full_wall_bonus)
         return one._replace(base=one.base + bonus * (fraction - settings.typical_fraction))
 
     def point(is_edge: Float[Array, ""], x: Float[Array, "2"]) -> Hypotheses:
         model = partial(point_echo, is_edge)
         one = refine(scan, model, x, scene, clutter, settings)
-        missed = point_missed_log_likelihood(scan, model, is_edge, one, scene, settings)
+        missed = point_missed_log_likelihood(scan, model, is_edge, one, scene, settings, settings.edge_strength)
         prior = point_log_prior(scan, is_edge, one, scene, settings)
         return with_base(one, settings.missed_weight_point * missed, prior)
 
@@ -312,102 +323,19 @@ def select_reflectors(
         evidence=jnp.where(evidence > settings.min_evidence, evidence, -jnp.inf),
         involved=involved,
         log_odds=log_odds,
-        probability=jax.nn.softmax(log_odds, axis=1),
     )
 
 
-def with_circles(selection: Selection, score: Float[Array, " reflectors"], settings: DetectionSettings) -> Selection:
-    """Add circles to the competition of the kinds."""
-    log_odds = jnp.concatenate([selection.log_odds, settings.tempering * score[:, None]], axis=1)
-    probability = jax.nn.softmax(log_odds, axis=1)
-    wins = probability.argmax(axis=1) == 3
-    return selection._replace(kind=jnp.where(wins, 3, selection.kind), log_odds=log_odds, probability=probability)
-
-
-def update_scene(
-    scan: ScanData,
-    selected: Hypotheses,
-    selection: Selection,
-    scene: SceneEstimate,
-    sigma: Float[Array, ""],
-    settings: DetectionSettings,
-) -> SceneEstimate:
-    """Estimate walls, detection probability, sigma and alignment from the selected reflectors, for the next pass.
+def compare_with_circles(
+    selection: Selection, evidence: Float[Array, " reflectors"], settings: DetectionSettings
+) -> tuple[Int[Array, " reflectors"], Float[Array, "reflectors 4"]]:
+    """The most likely kind of each reflector, and the probabilities of plane, corner, edge and circle.
 
     Args:
-        scan: the echoes.
-        selected: the selected hypotheses.
-        selection: their kinds and echoes.
-        scene: the previous estimate.
-        sigma: standard deviation of the ranges, metres; NaN: it is estimated.
-        settings: priors and bounds.
+        selection: the selected reflectors, with the log odds of planes, corners and edges.
+        evidence: of each of them as a circle, nats.
+        settings: tempering of the evidence.
     """
-    involved = selection.involved
-    wall = (selection.kind == PLANE) & (selection.evidence > -jnp.inf)
-    covariance = jax.vmap(lambda one: one.covariance)(selected)
-
-    # Detection probability: of the paths well inside both cones and between the outermost footpoints of a wall.
-    margin = settings.footpoint_margin
-    low = jnp.where(involved, selected.footpoint, jnp.inf).min(axis=1) + margin
-    high = jnp.where(involved, selected.footpoint, -jnp.inf).max(axis=1) - margin
-
-    def is_certain(line: Float[Array, "2"], low: Float[Array, ""], high: Float[Array, ""], path: EchoPaths):
-        echo = plane_echo(line, path)
-        in_range = echo.range < scan.max_range - settings.range_margin - 2 * scene.sigma
-        between = (echo.footpoint > low) & (echo.footpoint < high)
-        return in_range & between & (visibility(echo, path) > settings.certain_visibility)
-
-    each_path = jax.vmap(jax.vmap(is_certain, in_axes=(None, None, None, -1)), in_axes=(0, 0, 0, None))
-    certain = each_path(selected.parameters, low, high, scan.paths) & wall[:, None]
-    certain = certain if scan.measured is None else certain & scan.measured[None]
-    expected, received = count(certain), count(certain[:, scan.path_index] & involved)
-    weight = settings.detection_weight
-    detection = (weight * settings.detection_probability + received) / (weight + expected)
-
-    threshold = estimate_threshold(scan, selected.parameters, low, high, involved & wall[:, None], detection, scene, settings)
-
-    # Sigma: residuals of the walls, minus two degrees of freedom for each wall.
-    enough = wall & (involved.sum(axis=1) >= settings.min_echoes_for_sigma)
-    squares = jnp.where(involved & enough[:, None], selected.residual**2, 0).sum()
-    degrees_of_freedom = count(involved & enough[:, None]) - 2 * count(enough)
-    prior_squares = settings.sigma_weight * scene.sigma**2
-    estimate = jnp.sqrt((prior_squares + squares) / (settings.sigma_weight + degrees_of_freedom))
-
-    # Fraction of the walls that are parallel or perpendicular to another one: posterior of each wall, averaged.
-    corner = (selection.kind == CORNER) & (selection.evidence > -jnp.inf)
-    walls = scene._replace(walls=selected.parameters, covariance=covariance, is_wall=wall, is_corner=corner)
-    ratio = jax.vmap(lambda line, c: alignment_ratio(line, c[1, 1], walls, settings))(selected.parameters, covariance)
-    aligned = scene.aligned_fraction * ratio / (1 - scene.aligned_fraction + scene.aligned_fraction * ratio)
-    aligned_walls = jnp.where(wall, aligned, 0).sum() + settings.aligned_weight * settings.aligned_fraction
-    return walls._replace(
-        detection_probability=jnp.clip(detection, *settings.detection_bounds),
-        aligned_fraction=aligned_walls / (count(wall) + settings.aligned_weight),
-        sigma=jnp.where(jnp.isfinite(sigma), scene.sigma, jnp.maximum(estimate, settings.min_sigma)),
-        threshold=threshold,
-        silence_threshold=threshold,
-    )
-
-
-def estimate_threshold(scan, lines, low, high, involved, detection, scene, settings: DetectionSettings) -> Float[Array, ""]:
-    """Most likely level of the faintest echoes of walls that are heard outside the cones, dB.
-
-    Counted are the paths between the outermost footpoints of the echoes of a wall.
-    """
-
-    def one(line: Float[Array, "2"], low: Float[Array, ""], high: Float[Array, ""], path: EchoPaths):
-        echo = plane_echo(line, path)
-        in_range = echo.exists & (echo.range < scan.max_range - settings.range_margin - 2 * scene.sigma)
-        between = (echo.footpoint > low) & (echo.footpoint < high)
-        outside = in_range & between & (visibility(echo, path) < 0.05)
-        return outside, echo_level(echo, path)
-
-    each_path = jax.vmap(jax.vmap(one, in_axes=(None, None, None, -1)), in_axes=(0, 0, 0, None))
-    outside, level = each_path(lines, low, high, scan.paths)
-    outside = outside if scan.measured is None else outside & scan.measured[None]
-    heard = jnp.zeros_like(outside).at[:, scan.path_index].max(involved)
-    outside = outside & (low < high)[:, None]
-    grid = jnp.asarray((settings.deaf_threshold, *settings.thresholds), level.dtype)
-    probability = 0.01 + (detection - 0.02) * jax.nn.sigmoid((level[..., None] - grid[None, None]) / CONES.level_sd)
-    log_likelihood = jnp.where(heard[..., None], jnp.log(probability), jnp.log(1 - probability))
-    total = jnp.where(outside[..., None], log_likelihood, 0).sum((0, 1))
-    return grid[total.argmax()]
+    log_odds = jnp.concatenate([selection.log_odds, settings.tempering * evidence[:, None]], axis=1)
+    probability = jax.nn.softmax(log_odds, axis=1)
+    return jnp.where(probability.argmax(axis=1) == len(REFLECTOR_KINDS) - 1, CIRCLE, selection.kind), probability

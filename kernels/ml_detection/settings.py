@@ -49,7 +49,7 @@ class DetectionSettings:
 
     # Noise, clutter and missed detections
 
-    initial_sigma: float = 0.006
+    initial_sigma: float = 0.003
     """First guess of the standard deviation of the ranges where it is estimated, metres."""
     sigma_weight: float = 6.0
     """Weight of the previous pass's sigma in the new estimate, in echoes."""
@@ -68,12 +68,16 @@ class DetectionSettings:
     certain_visibility: float = 0.95
     """Visibility above which a path counts for the estimate of the detection probability; chosen by hand."""
     initial_threshold: float = -30.0
-    """First guess of the level of the faintest wall echoes outside the cones, dB (``detection_cones.echo_level``). No echo
-    is expected there until the threshold is estimated."""
+    """First guess of the level of the faintest wall echoes outside the cones, dB (``detection_cones.echo_level``). No
+    echo is expected there until the threshold is estimated. Chosen by hand."""
     deaf_threshold: float = 100.0
-    """Level of the threshold of a ring that hears nothing outside its cones, dB."""
+    """Threshold of a ring that receives nothing outside its cones, dB."""
     thresholds: tuple[float, ...] = (-6.0, -10.0, -14.0, -18.0, -22.0, -26.0, -30.0, -34.0, -38.0)
-    """Other levels of the threshold among which the most likely one is estimated, dB."""
+    """Other thresholds among which the most likely one is chosen for each scan, dB."""
+    outside_cones: float = 0.05
+    """Visibility below which a path counts as outside of the cones; chosen by hand."""
+    stray_probability: float = 0.01
+    """Probability of an echo below the threshold, and of none far above it; chosen by hand."""
     blanking_distance: float = 0.035
     """Metres behind an echo in which a path cannot receive another one."""
     excuse_gate: float = 4.0
@@ -82,16 +86,13 @@ class DetectionSettings:
     """Metres below the maximum range, in addition to two sigma, from which on no echo is expected."""
     max_occlusion_cost: float = 6.0
     """Largest cost of missed detections, nats: another object may occlude the reflector."""
-    max_occlusion_cost_soft: float = 20.0
-    """The same where the ring hears outside of its cones: most of the paths would have to be occluded."""
-    missed_weight_plane_soft: float = 1.0
-    full_wall_bonus_soft: float = 0.0
-    handicap_soft: float = 2.5
-    tempering_soft: float = 0.44
+    max_occlusion_cost_outside: float = 20.0
+    """The same where the ring receives echoes outside of its cones: many more paths would have to be occluded. Tuned,
+    as the other constants of this case, on 32 random rooms with soft beams at 3 and at 5 mm."""
     max_faint_edge_cost: float = 1.0
     """Largest cost of missed detections far off the axes of an edge, nats: its echo may be too faint."""
     missed_weight_plane: float = 0.7
-    """Weight of the missed detections of a wall."""
+    """Weight of the missed detections of a wall; 1 where the ring receives echoes outside of its cones."""
     missed_weight_point: float = 1.15
     """Weight of the missed detections of a corner or an edge."""
     gap_visibility: float = 0.4
@@ -100,8 +101,8 @@ class DetectionSettings:
     """Mean length of walls, metres: a wall ends within a gap g between two footpoints with probability g / length."""
     min_gap: float = 0.02
     """Smallest gap in which a wall can end, metres; chosen by hand."""
-    off_axis_margin: float = 1e-3
-    """Margin of the off-axis ratio beyond the farthest echo of an edge; a numerical tolerance."""
+    loss_margin: float = 1e-3
+    """Margin of the loss beyond the faintest echo of an edge, dB; a numerical tolerance."""
     footpoint_margin: float = 1e-3
     """Metres within which two footpoints coincide; a numerical tolerance."""
 
@@ -141,14 +142,43 @@ class DetectionSettings:
     crossing_penalty: float = 2.0
     """Cost of a wall whose foot is on the line of another wall, nats: it is probably a corner."""
 
+    occluded_penalty: float = 8.0
+    """Cost of a reflector behind a detected wall, nats: sound does not pass through walls. Chosen by hand."""
+    occlusion_margin: float = 0.03
+    """Metres by which a detected wall extends beyond its outermost echoes; chosen by hand."""
+    edge_strength: tuple[float, float] = (-24.0, 8.0)
+    """Mean and standard deviation of the level of an edge or a thin pole relative to that of a wall, dB: poles of 1 cm
+    have -20 dB and edges -34 dB at 1 m (Keller's diffraction coefficient)."""
+    max_strength_deviation: float = 3.5
+    """Largest deviation from that level that counts, standard deviations; chosen by hand."""
+
+    # Circles
+
     expected_circles: float = 0.02
-    circle_starts: tuple[float, float, float] = (0.4, 0.6, 0.8)
+    """Mean number of round columns in a scan."""
     circle_shape: tuple[float, float] = (0.75, 0.2)
+    """Mean and standard deviation of the shape distance / (distance + radius) of a circle, between 0 (a plane) and 1 (a
+    pole): radii from 5 cm to 1 m at 1 m. Chosen by hand."""
     circle_bounds: tuple[float, float] = (0.02, 0.98)
-    circle_steps: int = 6
+    """Bounds of the shape."""
+    circle_starts: tuple[float, float, float] = (0.4, 0.6, 0.8)
+    """First guesses of the shape of what was selected as plane, corner and edge; chosen by hand."""
+    circle_steps: int = 8
+    """Gauss-Newton steps of the fit of a circle; chosen by hand."""
+    circle_initial_scale: float = 0.01
+    """Standard deviation of the ranges in the first of these steps, metres; it is halved from step to step down to that
+    of the ranges. Chosen by hand."""
+    max_shape_step: float = 0.3
+    """Largest change of the shape in a step; chosen by hand."""
     circle_strength_sd: float = 3.0
+    """Standard deviation of the level of a circle about 10 log10(radius / (radius + distance)), dB; chosen by hand."""
+    circle_handicap: float = 12.0
+    """Nats by which a circle must be more likely than other kinds where the ring receives nothing outside of its cones:
+    the levels of the echoes then do not tell it from a wall. Tuned on rooms without circles."""
     min_circle_echoes: int = 4
-    least_circle_distance: float = 0.1
+    """Echoes that a circle needs: three determine it."""
+    min_circle_distance: float = 0.1
+    """Smallest distance for the scale of the curvature, metres; chosen by hand."""
 
     # Selection
 
@@ -156,7 +186,7 @@ class DetectionSettings:
     """Weight of the logarithm of the prior."""
     full_wall_bonus: float = 10.0
     """Evidence of a wall that all its paths receive compared with one that none receives, nats: points have fewer
-    echoes."""
+    echoes. 0 where the ring receives echoes outside of its cones, whose levels tell walls from points."""
     typical_fraction: float = 0.55
     """Fraction of the echoes of a full wall at which this bonus is zero: more than a point usually has."""
     min_evidence: float = 6.0

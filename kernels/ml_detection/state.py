@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .hough_voting import CrosstalkPaths
-from .measurement_model import PredictedEcho
-from .ml_detection_settings import DetectionSettings
-from .sensor_array import EchoPaths
+from ..hough_voting import CrosstalkPaths
+from ..measurement_model import PredictedEcho
+from ..sensor_array import EchoPaths
+from .settings import DetectionSettings
 
 Model = Callable[[Float[Array, "2"], EchoPaths], PredictedEcho]
 """The measurement model of one kind of reflector."""
@@ -49,6 +49,8 @@ class SceneEstimate(NamedTuple):
     """Of rho and theta."""
     is_wall: Bool[Array, " reflectors"]
     """Which of the rows are walls."""
+    extent: Float[Array, "reflectors 2"]
+    """Outermost footpoints of the echoes of each wall: coordinates along it, metres from the foot of the origin."""
     is_corner: Bool[Array, " reflectors"]
     """Which of the rows are corners; ``walls`` holds their x, y."""
     detection_probability: Float[Array, ""]
@@ -70,6 +72,7 @@ class SceneEstimate(NamedTuple):
             walls=jnp.zeros((size, 2)),
             covariance=jnp.zeros((size, 2, 2)),
             is_wall=jnp.zeros(size, bool),
+            extent=jnp.zeros((size, 2)),
             is_corner=jnp.zeros(size, bool),
             detection_probability=jnp.asarray(settings.detection_probability, sigma.dtype),
             aligned_fraction=jnp.asarray(settings.aligned_fraction, sigma.dtype),
@@ -116,10 +119,8 @@ class Selection(NamedTuple):
     """Nats; -inf where no hypothesis has enough."""
     involved: Bool[Array, "reflectors echoes"]
     """Echoes that the reflector explains, of those that were left by the reflectors before it."""
-    log_odds: Float[Array, "reflectors kinds"]
-    """Tempered evidence of the kinds, nats."""
-    probability: Float[Array, "reflectors kinds"]
-    """Posterior probabilities of the kinds, given these echoes."""
+    log_odds: Float[Array, "reflectors 3"]
+    """Tempered evidence for plane, corner and edge, given these echoes, nats."""
 
 
 def log_normal(x: Float[Array, "*any"], sigma: Float[Array, "*#any"]) -> Float[Array, "*any"]:

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .detection_cones import audibility, echo_level
-from .measurement_model import CORNER, PLANE, corner_echo, echo_of_kind, plane_echo, second_order_echo
-from .ml_detection_settings import DetectionSettings
-from .ml_detection_state import Hypotheses, Model, ScanData, SceneEstimate, count, log_normal, regularized_inverse
-from .planar_geometry import normal, tangent, wrap_angle
-from .sensor_array import EchoPaths
+from ..detection_cones import audibility, echo_level
+from ..measurement_model import CORNER, PLANE, corner_echo, echo_of_kind, plane_echo, second_order_echo
+from ..planar_geometry import normal, tangent, wrap_angle
+from ..sensor_array import EchoPaths
+from .settings import DetectionSettings
+from .state import Hypotheses, Model, ScanData, SceneEstimate, count, log_normal, regularized_inverse
 
 
 def clutter_log_density(scan: ScanData, scene: SceneEstimate, settings: DetectionSettings) -> Float[Array, " echoes"]:
@@ -125,14 +125,14 @@ class MissedDetections(NamedTuple):
     """As ``PredictedEcho``."""
     visibility: Float[Array, " paths"]
     """Weight by both cones; 0 beyond the maximum range and for paths that were not measured."""
-    off_axis: Float[Array, " paths"]
-    """As ``off_axis_ratio``."""
+    loss: Float[Array, " paths"]
+    """Minus the level of the echo (``detection_cones.echo_level``), dB."""
     cost: Float[Array, " paths"]
     """Log probability that the path receives no echo, nats."""
     echo_footpoint: Float[Array, " echoes"]
     """As ``footpoint``, for the path of each echo."""
-    echo_off_axis: Float[Array, " echoes"]
-    """As ``off_axis``, for the path of each echo."""
+    echo_loss: Float[Array, " echoes"]
+    """As ``loss``, for the path of each echo."""
     excuse: Float[Array, " echoes"]
     """Cost that each echo cancels, nats: it is the echo of this reflector, or its blanking hides that echo."""
 
@@ -154,14 +154,14 @@ def missed_detections(
         return echo.range, echo.footpoint, visible, -echo_level(echo, path), cost
 
     each_path = jax.vmap(predict, in_axes=-1, out_axes=-1)
-    _, footpoint, visible, off_axis, cost = each_path(scan.paths)
+    _, footpoint, visible, loss, cost = each_path(scan.paths)
     if scan.measured is not None:
         visible, cost = jnp.where(scan.measured, visible, 0), jnp.where(scan.measured, cost, 0)
-    predicted, echo_footpoint, _, echo_off_axis, echo_cost = each_path(scan.echo_paths)
+    predicted, echo_footpoint, _, echo_loss, echo_cost = each_path(scan.echo_paths)
     behind, gate = scan.ranges - predicted, settings.excuse_gate * scene.sigma
     excused = scan.valid & (behind < gate) & (behind > -settings.blanking_distance - gate)
     excuse = jnp.where(excused, echo_cost, 0)
-    return MissedDetections(footpoint, visible, off_axis, cost, echo_footpoint, echo_off_axis, excuse)
+    return MissedDetections(footpoint, visible, loss, cost, echo_footpoint, echo_loss, excuse)
 
 
 def point_missed_log_likelihood(
@@ -171,22 +171,42 @@ def point_missed_log_likelihood(
     point: Hypotheses,
     scene: SceneEstimate,
     settings: DetectionSettings,
-    strength: Float[Array, ""] | float = -24.0,
-    strength_sd: Float[Array, ""] | float = 8.0,
+    strength: tuple[Float[Array, ""] | float, float],
 ) -> Float[Array, ""]:
-    """Log likelihood of the missed detections of ONE corner (0) or edge (1), at most 0 nats."""
+    """Log likelihood of the missed detections of ONE corner (0) or edge (1), at most 0 nats.
+
+    Args:
+        scan: the echoes.
+        model: its measurement model.
+        is_edge: 0 for a corner, which returns as much sound as a wall; 1 for an edge, a pole or a circle.
+        point: the reflector.
+        scene: detection probability, sigma and thresholds.
+        settings: weights.
+        strength: mean and standard deviation of the level of what returns less sound than a wall, dB relative to it.
+    """
     missed = missed_detections(scan, model, point, scene, settings)
-    # A faint edge is received near the axes only: up to the farthest of its echoes.
-    border = jnp.where(point.log_ratio > 0, missed.echo_off_axis, -jnp.inf).max() + settings.off_axis_margin
+    # A faint edge is received near the axes only: up to the highest loss among its echoes.
+    border = jnp.where(point.log_ratio > 0, missed.echo_loss, -jnp.inf).max() + settings.loss_margin
     border = jnp.where(is_edge > 0, border, jnp.inf)
-    inside = missed.total(missed.off_axis < border, missed.echo_off_axis < border)
-    outside = missed.total(missed.off_axis >= border, missed.echo_off_axis >= border)
-    soft = scene.silence_threshold < settings.deaf_threshold
-    most = jnp.where(soft, settings.max_occlusion_cost_soft, settings.max_occlusion_cost)
-    # How much fainter than a wall it is.
-    faintness = jnp.clip((border + scene.silence_threshold - strength) / strength_sd, -3.5, 3.5)
-    unlikely = jnp.where(soft & (is_edge > 0), -0.5 * faintness**2, 0)
-    return jnp.maximum(inside, -most) + jnp.maximum(outside, -settings.max_faint_edge_cost) + unlikely
+    inside = missed.total(missed.loss < border, missed.echo_loss < border)
+    outside = missed.total(missed.loss >= border, missed.echo_loss >= border)
+    # The border also tells how much less sound than a wall it returns.
+    mean, sd = strength
+    most = settings.max_strength_deviation
+    deviation = jnp.clip((border + scene.silence_threshold - mean) / sd, -most, most)
+    faintness = jnp.where(hears_outside_cones(scene, settings) & (is_edge > 0), -0.5 * deviation**2, 0)
+    inside = jnp.maximum(inside, -_max_occlusion_cost(scene, settings))
+    return inside + jnp.maximum(outside, -settings.max_faint_edge_cost) + faintness
+
+
+def hears_outside_cones(scene: SceneEstimate, settings: DetectionSettings) -> Bool[Array, ""]:
+    """Whether the scan has echoes of walls outside of the cones, as far as known."""
+    return scene.silence_threshold < settings.deaf_threshold
+
+
+def _max_occlusion_cost(scene: SceneEstimate, settings: DetectionSettings) -> Float[Array, ""]:
+    outside = hears_outside_cones(scene, settings)
+    return jnp.where(outside, settings.max_occlusion_cost_outside, settings.max_occlusion_cost)
 
 
 def plane_missed_log_likelihood(
@@ -200,8 +220,7 @@ def plane_missed_log_likelihood(
     footpoint, echo_footpoint, own = missed.footpoint, missed.echo_footpoint, plane.log_ratio > 0
     low, high = jnp.where(own, plane.footpoint, jnp.inf).min(), jnp.where(own, plane.footpoint, -jnp.inf).max()
     inside = missed.total((footpoint >= low) & (footpoint <= high), (echo_footpoint >= low) & (echo_footpoint <= high))
-    soft = scene.silence_threshold < settings.deaf_threshold
-    total = jnp.maximum(inside, -jnp.where(soft, settings.max_occlusion_cost_soft, settings.max_occlusion_cost))
+    total = jnp.maximum(inside, -_max_occlusion_cost(scene, settings))
     for gap, echo_gap in ((low - footpoint, low - echo_footpoint), (footpoint - high, echo_footpoint - high)):
         silent = (missed.visibility > settings.gap_visibility) & (gap > settings.footpoint_margin)
         next_silent = jnp.where(silent, gap, jnp.inf).min()
@@ -222,7 +241,25 @@ def plane_log_prior(
     crossing = (scene.is_wall & (jnp.abs(distance) < settings.crossing_distance) & _oblique(turn, settings)).any()
     alignment = alignment_ratio(plane.parameters, plane.covariance[1, 1], scene, settings)
     direction = jnp.log(1 - scene.aligned_fraction + scene.aligned_fraction * alignment)
-    return density + (direction - jnp.where(crossing, settings.crossing_penalty, 0))
+    # Sound does not pass through walls: the outermost points of reflection must not be behind another one.
+    own = plane.log_ratio > 0
+    ends = jnp.stack([jnp.where(own, plane.footpoint, jnp.inf).min(), jnp.where(own, plane.footpoint, -jnp.inf).max()])
+    ends = jnp.where(own.any(), ends, 0)
+    points = (rho * normal(theta))[None] + ends[:, None] * tangent(theta)[None]
+    occluded = (is_behind(points[0], scene, settings) & is_behind(points[1], scene, settings)).any()
+    penalty = jnp.where(crossing, settings.crossing_penalty, 0) + jnp.where(occluded, settings.occluded_penalty, 0)
+    return density + (direction - penalty)
+
+
+def is_behind(point: Float[Array, "2"], scene: SceneEstimate, settings: DetectionSettings) -> Bool[Array, " walls"]:
+    """Known walls that the line from the origin to ONE point crosses between their outermost echoes."""
+    n, t = normal(scene.walls[:, 1]), tangent(scene.walls[:, 1])
+    depth, along = n @ point, t @ point
+    behind = depth > scene.walls[:, 0] + settings.same_wall_rho
+    crossing = along * scene.walls[:, 0] / jnp.where(behind, depth, 1)
+    margin = settings.occlusion_margin
+    between = (crossing > scene.extent[:, 0] - margin) & (crossing < scene.extent[:, 1] + margin)
+    return scene.is_wall & behind & between
 
 
 def alignment_ratio(
@@ -282,7 +319,8 @@ def point_log_prior(
         + settings.corner_fraction_one_wall * on_any_wall
         + settings.corner_fraction_two_walls * on_two_walls
     )
-    return jnp.log(jnp.where(is_edge > 0, edges, settings.expected_corners * corners))
+    penalty = jnp.where(is_behind(place, scene, settings).any(), settings.occluded_penalty, 0)
+    return jnp.log(jnp.where(is_edge > 0, edges, settings.expected_corners * corners)) - penalty
 
 
 def _oblique(turn: Float[Array, "*any"], settings: DetectionSettings) -> Bool[Array, "*any"]:
