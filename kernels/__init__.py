@@ -82,6 +82,7 @@ from .iterated_ekf import expected_ranges as expected_ranges
 from .iterated_ekf import expected_ranges_with_variance as expected_ranges_with_variance
 from .landmarks import Landmarks as Landmarks
 from .landmarks import Reflection as Reflection
+from .landmarks import landmark_echo as landmark_echo
 from .landmarks import landmark_in_robot_frame as landmark_in_robot_frame
 from .landmarks import predict_reflection as predict_reflection
 from .measurement_model import CIRCLE as CIRCLE

@@ -69,9 +69,9 @@ def off_axis_angles(
 
     def one_echo(pose, map_of_scan, reflection, map_of_candidate, first, second, path, motion):
         path = path if motion is None else transform_path(path, motion)
-        distance, visibility, arrival = predict_reflection(pose, reflection, first, second, path)
-        angle = signed_angle(path.axes[0], arrival)
-        exists = (visibility > 0) & (distance < sensors.max_range) & (map_of_scan == map_of_candidate)
+        echo = predict_reflection(pose, reflection, first, second, path)
+        angle = signed_angle(path.axes[0], echo.arrival)
+        exists = (echo.visibility > 0) & (echo.range < sensors.max_range) & (map_of_scan == map_of_candidate)
         return jnp.where(exists, angle, jnp.nan)
 
     first, second = landmarks.take(candidates.reflection.first), landmarks.take(candidates.reflection.second)

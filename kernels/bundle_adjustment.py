@@ -240,7 +240,9 @@ def predicted_report(
     tx, rx = geometry.tx, geometry.rx
     if motion is not None:
         tx, rx = (motion[:2] + rotate(position, motion[2]) for position in (tx, rx))
-    true_range = expected_range(kind, first, second, tx, rx)
+    radius = landmarks[0].radius
+    radius = None if radius is None else jnp.asarray(radius)
+    true_range = expected_range(kind, first, second, tx, rx, radius)
     return reported_range(true_range, range_offset=geometry.offset, range_scale=jnp.exp(geometry.log_scale))
 
 

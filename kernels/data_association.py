@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .detection_cones import SETTINGS
+from .detection_cones import DEAF, SETTINGS
 from .landmarks import AnyArray, Landmarks, Reflection, predict_reflection
 from .measurement_model import reported_range
 from .sensor_array import EchoPaths, SensorArray, echo_paths, transform_path, widen_cones
@@ -32,6 +32,9 @@ class EchoAssociation(eqx.Module):
     competitor_gap: Float[Array, "scans echoes"]
     """Smallest difference between the expected ranges of the nearest candidate and of a candidate of another group,
     metres; infinite without one. It measures the ambiguity of the association independently of the echo's noise."""
+    level: Float[Array, "scans echoes"]
+    """Level of the nearest candidate's echo if it arrives from outside of the cones, dB relative to a wall on the axis
+    at 1 m; infinite inside the cones or without a candidate."""
 
 
 @jax.jit
@@ -45,6 +48,7 @@ def associate(
     reported: Float[Array, "scans echoes"],
     near: Int[Array, "scans near"],
     motion: Float[Array, "scans echoes 3"] | None = None,
+    threshold: float | Float[Array, ""] = DEAF,
 ) -> EchoAssociation:
     """Associate every echo with the candidate of the nearest range that its path can receive.
 
@@ -58,13 +62,15 @@ def associate(
         reported: half path lengths as reported, metres; NaN where there is no echo.
         near: rows of the candidates that each scan may receive; -1 for unused entries.
         motion: scan_from_robot when the path of each echo was measured; None: the robot was at rest.
+        threshold: level of the faintest echoes that are heard outside of the cones (``EchoAssociation.level``).
     """
     paths = widen_cones(echo_paths(sensors), SETTINGS.association_cone_factor)
 
     def report(pose, reflection, first, second, path: EchoPaths):
-        expected, weight, _ = predict_reflection(pose, reflection, first, second, path)
-        report = reported_range(expected, range_offset=path.range_offset, range_scale=sensors.range_scale)
-        return jnp.where(weight > 0, report, jnp.inf)
+        echo = predict_reflection(pose, reflection, first, second, path)
+        report = reported_range(echo.range, range_offset=path.range_offset, range_scale=sensors.range_scale)
+        level = jnp.where(echo.visibility > 0, jnp.inf, echo.level)
+        return jnp.where((echo.visibility > 0) | (echo.level > threshold), report, jnp.inf), level
 
     each_path = jax.vmap(report, in_axes=(None, None, None, None, 0))
     each_candidate = jax.vmap(each_path, in_axes=(None, 0, 0, 0, None))
@@ -79,7 +85,7 @@ def associate(
             lambda leaf: leaf[jnp.maximum(near, 0)], (candidates.reflection, candidates.map_index, candidates.group)
         )
         first, second = landmarks.take(reflection.first), landmarks.take(reflection.second)
-        expected = each_candidate(pose, reflection, first, second, echo_path)
+        expected, level = each_candidate(pose, reflection, first, second, echo_path)
         expected = jnp.where(((map_of_candidate == map_of_scan) & (near >= 0))[:, None], expected, jnp.inf)
         # The nearest one.
         distance = jnp.abs(reported[None] - expected)  # (near, echoes)
@@ -91,6 +97,7 @@ def associate(
         competes = group[:, None] != group[best][None]
         gap = jnp.abs(expected - jnp.where(found, nearest, 0)[None])
         competitor_gap = jnp.where(competes, gap, jnp.inf).min(axis=0)
-        return jnp.where(found, near[best], -1), jnp.where(found, reported - nearest, jnp.inf), competitor_gap
+        level = jnp.where(found, jnp.take_along_axis(level, best[None], axis=0)[0], jnp.inf)
+        return jnp.where(found, near[best], -1), jnp.where(found, reported - nearest, jnp.inf), competitor_gap, level
 
     return EchoAssociation(*jax.lax.map(associate_scan, (poses, map_index, path, reported, near, motion)))

@@ -30,11 +30,16 @@ class VisibilitySettings:
     6 dB."""
     absorption_db_per_m: float = 1.3
     """Loss in air per metre of path at 40 kHz, dB/m (ISO 9613-1, 20 deg C, 50 % relative humidity)."""
+    edge_level_db: float = -20.0
+    """Level of an edge or a thin pole at 1 m relative to a wall, dB: that of a smooth pole of 1 cm radius. Edges of
+    walls return less (Keller)."""
     level_sd: float = 1.5
     """Spread of the threshold of detection, dB: 6 dB beams differ from real ones; chosen by hand."""
 
 
 SETTINGS = VisibilitySettings()
+DEAF = float("inf")
+"""Threshold of sensors that hear nothing outside of their cones, dB."""
 
 
 def echo_level(echo: PredictedEcho, path: EchoPaths) -> Float[Array, ""]:

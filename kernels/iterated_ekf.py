@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .detection_cones import SETTINGS, visibility
-from .landmarks import AnyArray, Landmarks, landmark_in_robot_frame
-from .measurement_model import PLANE, reflector_echo
+from .landmarks import AnyArray, Landmarks, landmark_echo, landmark_in_robot_frame
+from .measurement_model import PLANE
 from .planar_geometry import dot, normal, tangent
 from .sensor_array import EchoPaths, widen_cones
 
@@ -155,7 +155,7 @@ def expected_ranges(pose: Float[Array, "3"], landmarks: Landmarks, paths: EchoPa
     paths = widen_cones(paths, SETTINGS.association_cone_factor)
 
     def expected_range(landmark: Landmarks, path: EchoPaths):
-        echo = reflector_echo(jnp.asarray(landmark.kind), landmark_in_robot_frame(pose, landmark), path)
+        echo = landmark_echo(landmark_in_robot_frame(pose, landmark), landmark, path)
         along = dot(tangent(landmark.parameters[1]), pose[:2] - landmark.anchor) + echo.footpoint
         margin = EKF_SETTINGS.wall_margin
         beside = (along < landmark.extent[0] - margin) | (along > landmark.extent[1] + margin)
@@ -185,7 +185,7 @@ def _range_and_jacobians(
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "2"]]:
     """Range of ONE landmark on ONE path; its derivatives with respect to the pose and to the landmark's parameters."""
     local = landmark_in_robot_frame(pose, landmark)
-    echo = reflector_echo(jnp.asarray(landmark.kind), local, path)
+    echo = landmark_echo(local, landmark, path)
     a, b = echo.d_range_d_landmark
     theta = landmark.parameters[1]
     n, t, forward, left = normal(theta), tangent(theta), normal(pose[2]), tangent(pose[2])

@@ -160,24 +160,29 @@ def expected_range(
     second: Float[Array, "2"],
     tx: Float[Array, "2"],
     rx: Float[Array, "2"],
+    radius: Float[Array, ""] | None = None,
 ) -> Float[Array, ""]:
     """Range of ONE echo of any kind in metres; differentiable in everything but the kind.
 
     Args:
-        kind: PLANE, CORNER, EDGE or SECOND_ORDER.
+        kind: PLANE, CORNER, EDGE, SECOND_ORDER or CIRCLE.
         first: the reflector in the robot frame (``landmark_in_robot_frame``).
         second: the plane that is met second; used by SECOND_ORDER only.
         tx: position of the transmitter in the robot frame, metres.
         rx: position of the receiver, metres.
+        radius: of a circle, metres; None: there is no circle.
     """
     midpoint, half_baseline = (tx + rx) / 2, (rx - tx) / 2
-    ranges = (
+    ranges = [
         plane_range(first, midpoint, half_baseline),
         corner_range(first, midpoint),
         edge_range(first, midpoint, half_baseline),
         second_order_range(first, second, midpoint, half_baseline),
-    )
-    kinds = (PLANE, CORNER, EDGE, SECOND_ORDER)
+    ]
+    kinds = [PLANE, CORNER, EDGE, SECOND_ORDER]
+    if radius is not None:
+        ranges.append(circle_range(first, radius, midpoint, half_baseline))
+        kinds.append(CIRCLE)
     return jnp.select([kind == k for k in kinds], ranges, jnp.zeros_like(ranges[0]))
 
 

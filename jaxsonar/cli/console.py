@@ -189,18 +189,24 @@ def stopped_by_signals() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+def calibrated_certain_angle(ring_file: str) -> float | None:
+    """Angle off the axis up to which a calibrated ring hears walls for sure, radians; None without a calibration."""
+    from jaxsonar.occupancy.direct_readings import certain_angle
+    from jaxsonar.sensors.ring_toml import load_detection
+
+    detection = load_detection(ring_file)
+    return None if detection is None else certain_angle(*detection)
+
+
 def grid_of(options: argparse.Namespace, ring: "Ring", log: "Log", world: "GlobalMap") -> "OccupancyGrid | None":
     """The grid that the options ask for; None without ``--grid``."""
     if options.grid is None:
         return None
-    from jaxsonar.occupancy.direct_readings import certain_angle
     from jaxsonar.occupancy.incremental_grid import occupancy
     from jaxsonar.occupancy.known_reflectors import KnownReflectors
     from jaxsonar.occupancy.nav2_map import check_grid
-    from jaxsonar.sensors.ring_toml import load_detection
 
-    detection = load_detection(options.ring)
-    certain = None if detection is None else certain_angle(*detection)
+    certain = calibrated_certain_angle(options.ring)
     with errors_in(f"--grid {options.grid}"):
         known, method = KnownReflectors.of_map(world), options.grid_method or "counts"
         grid = occupancy(ring, log, walls=known, method=method, certain=certain)

@@ -26,7 +26,7 @@ from jaxsonar.cli.arguments import (
     odometry_error,
     odometry_noise,
 )
-from jaxsonar.cli.console import check_sigma_is_used, print_status, stopped_by_signals
+from jaxsonar.cli.console import calibrated_certain_angle, check_sigma_is_used, print_status, stopped_by_signals
 from jaxsonar.cli.inputs import InputMessages, add_strict, load_checked_ring
 
 TERMINAL_INTERVAL, LOG_INTERVAL = 1.0, 10.0
@@ -147,6 +147,7 @@ def run(options: argparse.Namespace) -> int:
                 grid=options.grid,
                 grid_method=options.grid_method or "counts",
                 grid_mode=grid_mode,
+                grid_certain=calibrated_certain_angle(options.ring) if options.grid else None,
                 odometry_noise=odometry_noise(options.odometry) if options.slam else None,
                 trajectory=options.trajectory,
                 scans=options.scans,

@@ -88,7 +88,7 @@ def heavy_tailed_adjust(
     for _ in range(settings.iterations):
         job = RobustAdjustment(ring, data, basis, poses_free=True, settings=GNC_SETTINGS)
         # 1. The wall of each echo, and the weight of the echo.
-        used, candidate, reflection = job.associate(state, gate=settings.gate, ambiguity=0.0)
+        used, candidate, reflection, _, _ = job.associate(state, gate=settings.gate, ambiguity=0.0)
         residual = job.residual(state, reflection)
         group = stretch[:, None], np.asarray(reflection.first), data.path
         found = _weights(residual, used, group, sigma, least, relief, settings)

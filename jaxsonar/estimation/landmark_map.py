@@ -45,6 +45,8 @@ class LandmarkMapSettings:
 
 
 SETTINGS = LandmarkMapSettings()
+POINT_KINDS = {"corner": kernels.CORNER, "edge": kernels.EDGE, "circle": kernels.CIRCLE}
+"""Kinds of points of a map that are landmarks. Undecided reflectors are not: their range model is unknown."""
 
 
 def map_with_tentative_points(
@@ -81,6 +83,7 @@ def map_with_tentative_points(
         point_cov=np.concatenate([map_.point_cov, more.inflated_cov]),
         point_echoes=np.concatenate([map_.point_echoes, more.echoes]),
         point_scans=(*map_.point_scans, *more.scan_lists()),
+        point_radius=np.append(map_.point_radius, np.full(len(more.kinds), np.nan)),
     )
 
 
@@ -116,6 +119,8 @@ class LandmarkMap(NamedTuple):
         beyond_end = np.maximum(np.maximum(extent[:, 0] - along, along - extent[:, 1]), 0.0)
         across = (offset * unit(theta)).sum(axis=-1) - parameters[:, 0]
         distance = np.where(is_wall, np.hypot(across, beyond_end), np.linalg.norm(offset - parameters, axis=-1))
+        if landmarks.radius is not None:
+            distance -= np.asarray(landmarks.radius)
         first, second = np.asarray(reflection.first), np.asarray(reflection.second)
         in_range = np.minimum(distance[:, first], distance[:, second]) < max_range
         in_range &= (np.asarray(self.candidates.map_index) == map_index[:, None]) & (map_index >= 0)[:, None]
@@ -140,7 +145,7 @@ def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> Landmark
     map_index: list[Int[np.ndarray, " landmarks"]] = [np.zeros(0, int)]
     wall_pairs: list[tuple[int, int, int]] = []  # first wall, second wall, map
     for number, whole in enumerate(maps):
-        map_ = whole.with_kinds("corner", "edge")
+        map_ = whole.with_kinds(*POINT_KINDS)
         pairs, is_intersection = _wall_intersections(map_)
         first = sum(len(part.kind) for part in parts)
         kept = np.append(np.ones(len(map_), bool), ~is_intersection | (not tie_corners))
@@ -152,10 +157,10 @@ def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> Landmark
 
 
 def map_landmarks(map_: GlobalMap) -> kernels.Landmarks:
-    """The walls, then the corners and edges of a map as landmarks, each anchored at its middle."""
-    map_ = map_.with_kinds("corner", "edge")
-    kinds = [kernels.CORNER if kind == "corner" else kernels.EDGE for kind in map_.point_kinds]
-    points = landmarks_from_points(np.array(kinds, np.int32), map_.points)
+    """The walls, then the corners, edges and circles of a map as landmarks, each anchored at its middle."""
+    map_ = map_.with_kinds(*POINT_KINDS)
+    kinds = [POINT_KINDS[kind] for kind in map_.point_kinds]
+    points = landmarks_from_points(np.array(kinds, np.int32), map_.points, map_.point_radius)
     return concatenate_landmarks([landmarks_from_segments(map_.rho, map_.theta, map_.segments), points])
 
 

@@ -40,7 +40,7 @@ def reclassify_points(found: AdjustmentResult, settings: LandmarkSelectionSettin
     state, problem, used = found.state, found.problem, found.used
     landmarks, candidates = state.landmark_map.landmarks, state.landmark_map.candidates
     kind = np.asarray(landmarks.kind)
-    is_point = kind > kernels.PLANE
+    is_point = np.isin(kind, (kernels.CORNER, kernels.EDGE))
     other_kind = np.where(is_point, kernels.CORNER + kernels.EDGE - kind, kind).astype(np.int32)
     # 1. The same echoes with every point of the other kind; ring and poses are held.
     reflection = problem.factors.reflection
@@ -80,7 +80,9 @@ def reclassify_points(found: AdjustmentResult, settings: LandmarkSelectionSettin
 def remove_misfitting_points(
     state: AdjustmentState, found: AdjustmentResult, settings: LandmarkSelectionSettings = SETTINGS
 ) -> AdjustmentState:
-    """Remove the reflections of points whose echoes fit neither a corner nor an edge, such as two walls at an angle.
+    """Remove the reflections of points whose echoes do not fit their kind, such as two walls at an angle.
+
+    Circles are judged, too: their radius may be wrong.
 
     Otherwise their residuals would increase the estimated noise, and the gate would admit more such echoes.
 
@@ -96,7 +98,7 @@ def remove_misfitting_points(
     if not of_wall.any():
         return state
     variance = float(np.mean(found.residual[of_wall] ** 2))
-    of_point = found.used & ((kind == kernels.CORNER) | (kind == kernels.EDGE))
+    of_point = found.used & np.isin(kind, (kernels.CORNER, kernels.EDGE, kernels.CIRCLE))
     count = np.bincount(first[of_point], minlength=len(landmark_map.map_index))
     squares = np.bincount(first[of_point], weights=found.residual[of_point] ** 2, minlength=len(landmark_map.map_index))
     margin = 1 + 4 * np.sqrt(2 / np.maximum(count, 1))  # four standard deviations of the sample variance

@@ -5,7 +5,7 @@ loss. The scale of the loss is halved in each round until it is four sigma; from
 outlier. Reference: Yang et al., "Graduated Non-Convexity for Robust Spatial Perception", 2020.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -20,6 +20,7 @@ from jaxsonar.estimation.landmark_map import LandmarkMap
 from jaxsonar.estimation.landmark_selection import reclassify_points, remove_misfitting_points
 from jaxsonar.estimation.sparse_adjustment import AdjustmentSolution, absorbed_freedom, solve_adjustment
 from jaxsonar.geometry.robust_statistics import MAD_TO_SIGMA
+from jaxsonar.kernels.detection_cones import DEAF
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import PRIOR, ParameterBasis, parameter_basis
 
@@ -45,6 +46,14 @@ class GncSettings:
     """Rounds in which the scale of the loss is halved, at most."""
     final_rounds: int = 3
     """Rounds of association and least squares with a fixed gate, in which the noise is estimated."""
+    levels: tuple[float, ...] = (20.0, -6.0, -10.0, -14.0, -18.0, -22.0, -26.0, -30.0, -34.0, -38.0)
+    """Borders of the levels of echoes from outside of the cones that are judged, dB."""
+    min_level_echoes: int = 20
+    """Echoes of a level from which on it is judged."""
+    background_gates: float = 3.0
+    """Residuals up to this many gates show how many echoes of a level match by chance."""
+    min_purity: float = 0.8
+    """Least share of the echoes of a level within the gate that do not match by chance, if it is heard."""
     max_unknowns: float = 0.2
     """Number of unknowns, as a fraction of the number of echoes, up to which the echoes alone determine all of them.
     With more, odometry and priors determine a part."""
@@ -77,8 +86,9 @@ def gnc_adjust(
         settings: constants of the algorithm.
     """
     job = RobustAdjustment(ring, data, basis, poses_free, settings)
-    # 1. Shrink the scale of the robust loss.
+    # 1. Shrink the scale of the robust loss. Then find out which echoes are heard outside of the cones.
     state, noise = job.anneal(state, initial_scale, sigma)
+    job = replace(job, threshold=job.hearing_threshold(state, noise))
     dof = 0.0
     for _ in range(settings.final_rounds):
         # 2. Associate with a fixed gate and minimize.
@@ -183,6 +193,10 @@ class Association(NamedTuple):
     used: Bool[np.ndarray, "scans echoes"]
     candidate: Int[np.ndarray, "scans echoes"]
     reflection: kernels.Reflection
+    residual: Float[np.ndarray, "scans echoes"]
+    """Reported minus expected range, metres."""
+    level: Float[np.ndarray, "scans echoes"]
+    """Level of the expected echo outside of the cones, dB; infinite inside."""
 
 
 @dataclass(frozen=True)
@@ -194,6 +208,8 @@ class RobustAdjustment:
     basis: ParameterBasis
     poses_free: bool
     settings: GncSettings
+    threshold: float = DEAF
+    """Level of the faintest echoes that are heard outside of the cones, dB (``kernels.EchoAssociation.level``)."""
 
     def anneal(
         self, state: AdjustmentState, initial_scale: float, sigma: float | None
@@ -206,7 +222,8 @@ class RobustAdjustment:
         scale, spread, last = initial_scale, initial_scale / settings.gate_sigmas, False
         for _ in range(settings.max_annealing_rounds):
             gate = settings.loss_gate * scale
-            used, _, reflection = self.associate(state, gate=gate, ambiguity=0.0)
+            found = self.associate(state, gate=gate, ambiguity=0.0)
+            used, reflection = found.used, found.reflection
             residual = self.residual(state, reflection)
             # Geman-McClure weights, normalized so that an echo within the scale counts as one within the gate.
             weight = used / (1 + (residual / scale) ** 2) ** 2 * (settings.gate_sigmas / scale) ** 2
@@ -225,10 +242,38 @@ class RobustAdjustment:
     def reassociate(self, state: AdjustmentState, noise: float) -> AdjustmentResult:
         """One round of association with a hard gate, and least squares."""
         gate, ambiguity = self.settings.gate_sigmas * noise, self.settings.ambiguity_sigmas * noise
-        used, candidate, reflection = self.associate(state, gate=gate, ambiguity=ambiguity)
+        used, candidate, reflection, _, _ = self.associate(state, gate=gate, ambiguity=ambiguity)
         state, problem, solution = self.adjust(state, reflection, used / noise**2)
         residual = np.where(used, self.residual(state, reflection), 0)
         return AdjustmentResult(state, problem, solution, used, candidate, residual, noise)
+
+    def hearing_threshold(self, state: AdjustmentState, noise: float) -> float:
+        """Level of the faintest echoes of walls that are heard outside of the cones, dB; ``DEAF`` if none are.
+
+        Echoes of a level are heard if far more ranges lie within the gate about the expected one than beside it.
+
+        Args:
+            state: poses and landmarks after the annealing.
+            noise: standard deviation of the ranges, metres.
+        """
+        settings = self.settings
+        gate, ambiguity = settings.gate_sigmas * noise, settings.ambiguity_sigmas * noise
+        faintest = settings.levels[-1]
+        wide = replace(self, threshold=faintest)
+        found = wide.associate(state, gate=settings.background_gates * gate, ambiguity=ambiguity)
+        of_wall = found.used & (found.reflection.kind == kernels.PLANE)
+        off, level = np.abs(found.residual[of_wall]), found.level[of_wall]
+        threshold = DEAF
+        for low, high in zip(settings.levels[1:], settings.levels[:-1], strict=True):
+            here = off[(level > low) & (level <= high)]
+            near = np.count_nonzero(here < gate)
+            chance = (len(here) - near) / (settings.background_gates - 1)
+            if len(here) < settings.min_level_echoes and threshold == DEAF:
+                continue
+            if len(here) >= settings.min_level_echoes and near - chance < settings.min_purity * near:
+                break
+            threshold = low
+        return threshold
 
     def associate(self, state: AdjustmentState, *, gate: float, ambiguity: float) -> Association:
         """Assign each echo to the closest reflection; use it if within the gate and no second reflection is near."""
@@ -251,11 +296,13 @@ class RobustAdjustment:
             jnp.asarray(data.reported[rows, columns]),
             jnp.asarray(in_range[scan]),
             None if motion is None else jnp.asarray(motion[rows, columns]),
+            jnp.asarray(self.threshold, dtype=state.poses.dtype),
         )
-        candidate, residual, competitor_gap = np.full(data.path.shape, -1), *np.full((2, *data.path.shape), np.inf)
+        none = np.full((3, *data.path.shape), np.inf)
+        candidate, (residual, competitor_gap, level) = np.full(data.path.shape, -1), none
         for whole, part in zip(
-            (candidate, residual, competitor_gap),
-            (found.candidate, found.residual, found.competitor_gap),
+            (candidate, residual, competitor_gap, level),
+            (found.candidate, found.residual, found.competitor_gap, found.level),
             strict=True,
         ):
             whole[rows, columns] = np.asarray(part)
@@ -267,7 +314,7 @@ class RobustAdjustment:
             np.asarray(leaf)[candidate] for leaf in (of_candidates.kind, of_candidates.first, of_candidates.second)
         )
         if data.wall_explained is not None:
-            used &= ~(data.wall_explained & np.isin(kind, (kernels.CORNER, kernels.EDGE)))
+            used &= ~(data.wall_explained & np.isin(kind, (kernels.CORNER, kernels.EDGE, kernels.CIRCLE)))
         # 3. Landmarks with too few echoes, in a scan or in all.
         count = len(landmark_map.map_index)
         if data.min_echoes_per_landmark > 1:
@@ -276,7 +323,7 @@ class RobustAdjustment:
         echoes = np.bincount(first[used], minlength=count)
         used &= (echoes[first] >= settings.min_landmark_echoes) | (kind == kernels.SECOND_ORDER)
         reflection = kernels.Reflection(*(leaf.astype(np.int32) for leaf in (kind, first, second)))
-        return Association(used, candidate, reflection)
+        return Association(used, candidate, reflection, residual, level)
 
     def adjust(
         self, state: AdjustmentState, reflection: kernels.Reflection, weight: Float[np.ndarray, "scans echoes"]

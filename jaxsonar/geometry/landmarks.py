@@ -1,6 +1,7 @@
-"""NumPy operations on ``kernels.Landmarks``, the container of planes, corners and edges in any frame.
+"""NumPy operations on ``kernels.Landmarks``, the container of planes, corners, edges and circles in any frame.
 
-A landmark has a kind, two parameters, an anchor near it and, for planes, an extent: see ``kernels.Landmarks``.
+A landmark has a kind, two parameters, an anchor near it, and, for planes, an extent, for circles a radius: see
+``kernels.Landmarks``.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxsonar.geometry.se2 import inverse, perpendicular, relative_jacobians, rotate, tangent_of, unit, wrap_angle
 from jaxsonar.kernels.landmarks import Landmarks
-from jaxsonar.kernels.measurement_model import PLANE
+from jaxsonar.kernels.measurement_model import CIRCLE, PLANE
 from jaxsonar.kernels.shape_buckets import pad_rows
 
 UNUSED = -1
@@ -20,18 +21,23 @@ UNUSED = -1
 
 def concatenate_landmarks(parts: Sequence[Landmarks]) -> Landmarks:
     """Landmarks of one frame in one container; an empty one without parts."""
+    radii = [np.zeros(len(part.kind)) if part.radius is None else np.asarray(part.radius) for part in parts]
+    no_circles = all(part.radius is None for part in parts)
     return Landmarks(
         kind=np.concatenate([np.zeros(0, np.int32), *(part.kind for part in parts)]).astype(np.int32),
         parameters=np.concatenate([np.zeros((0, 2)), *(part.parameters for part in parts)]),
         anchor=np.concatenate([np.zeros((0, 2)), *(part.anchor for part in parts)]),
         extent=np.concatenate([np.zeros((0, 2)), *(part.extent for part in parts)]),
+        radius=None if no_circles else np.concatenate(radii),
     )
 
 
 def pad_landmarks(landmarks: Landmarks, rows: int) -> Landmarks:
     """The landmarks with this many rows; new rows are unused."""
     kind, *rest = _arrays(landmarks)
-    return Landmarks(pad_rows(kind, rows, fill=UNUSED), *(pad_rows(leaf, rows) for leaf in rest))
+    parameters, anchor, extent = (pad_rows(leaf, rows) for leaf in rest)
+    radius = None if landmarks.radius is None else pad_rows(np.asarray(landmarks.radius), rows)
+    return Landmarks(pad_rows(kind, rows, fill=UNUSED), parameters, anchor, extent, radius)
 
 
 def landmarks_from_segments(
@@ -55,14 +61,25 @@ def landmarks_from_segments(
     )
 
 
-def landmarks_from_points(kind: Int[np.ndarray, " points"], positions: Float[np.ndarray, "points 2"]) -> Landmarks:
-    """Corners and edges anchored where they are."""
-    zeros = np.zeros_like(positions)
-    return Landmarks(kind=kind.astype(np.int32), parameters=zeros, anchor=positions, extent=zeros)
+def landmarks_from_points(
+    kind: Int[np.ndarray, " points"],
+    positions: Float[np.ndarray, "points 2"],
+    radius: Float[np.ndarray, " points"] | None = None,
+) -> Landmarks:
+    """Corners, edges and circles anchored where they are.
+
+    Args:
+        kind: CORNER, EDGE or CIRCLE.
+        positions: metres; of circles the center.
+        radius: of circles, metres; not used for other kinds. None: there is no circle.
+    """
+    zeros, is_circle = np.zeros_like(positions), kind == CIRCLE
+    radii = None if radius is None or not is_circle.any() else np.where(is_circle, radius, 0.0)
+    return Landmarks(kind=kind.astype(np.int32), parameters=zeros, anchor=positions, extent=zeros, radius=radii)
 
 
 def landmark_positions(landmarks: Landmarks) -> Float[np.ndarray, "landmarks 2"]:
-    """Position of each point; of each plane the footpoint of its anchor."""
+    """Position of each point, center of each circle; of each plane the footpoint of its anchor."""
     kind, parameters, anchor, _ = _arrays(landmarks)
     foot = parameters[:, :1] * unit(parameters[:, 1])
     return anchor + np.where((kind == PLANE)[:, None], foot, parameters)
@@ -85,6 +102,7 @@ def transform_landmarks(new_from_old: Float[np.ndarray, "3"], landmarks: Landmar
         parameters=np.where((kind == PLANE)[:, None], line, point),
         anchor=rotate(anchor, heading) + new_from_old[:2],
         extent=extent,
+        radius=landmarks.radius,
     )
 
 
@@ -145,8 +163,8 @@ def landmarks_in_robot_frame(
         landmarks: in that frame.
 
     Returns:
-        (rho, theta) of planes with rho of either sign, (x, y) of points, robot frame; their derivatives with respect to
-        the pose (3) and to the landmark's own parameters (2).
+        (rho, theta) of planes with rho of either sign, (x, y) of points and circles, robot frame; derivatives with
+        respect to the pose (3) and to the landmark's own parameters (2).
     """
     robot_from_frame = inverse(pose)
     seen = transform_parameters(robot_from_frame, landmarks, np.zeros(2))

@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
-from jaxsonar.detection.local_model import LocalModel
+from jaxsonar.detection.local_model import LocalModel, Point
 from jaxsonar.estimation.joint_compatibility import (
     chi2_bound,
     jointly_compatible_pairs,
     mutual_nearest_neighbors,
 )
+from jaxsonar.estimation.landmark_map import POINT_KINDS
 from jaxsonar.geometry.landmarks import (
     concatenate_landmarks,
     landmarks_from_points,
@@ -49,16 +50,19 @@ class AssociationSettings:
     mistaken for its edge, and a wrong wall rotates the robot."""
     new_point_echoes: int = 6
     """Least number of echoes of a new point."""
+    max_radius_sd: float = 0.01
+    """Circles whose radius one scan determines worse are no landmarks, metres. The radius of a landmark is constant:
+    after a quarter of the way around a circle, the whole error of its radius is an error of ranges."""
 
 
 SETTINGS = AssociationSettings()
 
 
 class FeatureMeasurements(NamedTuple):
-    """Walls, then corners and edges, of one scan as measurements, robot frame."""
+    """Walls, then corners, edges and circles, of one scan as measurements, robot frame."""
 
     kind: Int[np.ndarray, " features"]
-    """``kernels.PLANE``, ``CORNER`` or ``EDGE``."""
+    """``kernels.PLANE``, ``CORNER``, ``EDGE`` or ``CIRCLE``."""
     parameters: Float[np.ndarray, "features 2"]
     """(rho, theta) of walls, (x, y) of points, metres and radians."""
     covariance: Float[np.ndarray, "features 2 2"]
@@ -67,6 +71,8 @@ class FeatureMeasurements(NamedTuple):
     """Endpoints of the observed part of a wall; the position of a point, twice. Metres."""
     echoes: Int[np.ndarray, " features"]
     """Number of echoes that each explains."""
+    radius: Float[np.ndarray, " features"]
+    """Radii of circles, metres; 0 for all other kinds."""
 
     def take(self, rows: np.ndarray) -> "FeatureMeasurements":
         """Select some of the features."""
@@ -77,18 +83,19 @@ class FeatureMeasurements(NamedTuple):
         """The features as landmarks of the robot frame; walls are anchored in their middle."""
         wall = self.kind == kernels.PLANE
         walls = landmarks_from_segments(self.parameters[wall, 0], self.parameters[wall, 1], self.segment[wall])
-        points = landmarks_from_points(self.kind[~wall], self.parameters[~wall])
+        points = landmarks_from_points(self.kind[~wall], self.parameters[~wall], self.radius[~wall])
         return concatenate_landmarks([walls, points])
 
 
 def feature_measurements(model: LocalModel) -> FeatureMeasurements:
     """The lines and points of a local model as measurements."""
-    lines, points = model.lines, model.points
+    lines = model.lines
+    points = [one for one in model.points if one.kind != "circle" or one.cov[2, 2] < SETTINGS.max_radius_sd**2]
     default = np.diag(np.square(SETTINGS.default_line_sd))
     kind = [kernels.PLANE] * len(lines)
-    kind += [kernels.CORNER if point.kind == "corner" else kernels.EDGE for point in points]
+    kind += [POINT_KINDS[point.kind] for point in points]
     parameters = [(line.rho, line.theta) for line in lines] + [(point.x, point.y) for point in points]
-    cov = [default if line.cov is None else line.cov for line in lines] + [point.cov for point in points]
+    cov = [default if line.cov is None else line.cov for line in lines] + [point.cov[:2, :2] for point in points]
     segment = [line.segment for line in lines] + [((point.x, point.y),) * 2 for point in points]
     return FeatureMeasurements(
         kind=np.array(kind, dtype=np.int32),
@@ -96,7 +103,13 @@ def feature_measurements(model: LocalModel) -> FeatureMeasurements:
         covariance=np.array(cov, dtype=np.float64).reshape(-1, 2, 2),
         segment=np.array(segment, dtype=np.float64).reshape(-1, 2, 2),
         echoes=np.array([feature.echoes for feature in (*lines, *points)], dtype=np.int64),
+        radius=np.array([0.0] * len(lines) + [_radius(point) for point in points], dtype=np.float64),
     )
+
+
+def _radius(point: Point) -> float:
+    """Radius of a circle, metres; 0 for other points."""
+    return point.radius if point.kind == "circle" else 0.0
 
 
 class FeatureAssociation(NamedTuple):

@@ -55,6 +55,7 @@ class LiveGrid:
         interval: float,
         method: GridMethod = "counts",
         mode: Nav2Mode = "trinary",
+        certain: float | None = None,
     ):
         """A grid without scans; nothing is written.
 
@@ -64,6 +65,7 @@ class LiveGrid:
             interval: seconds between two updates, at least.
             method: how echoes become obstacles, see ``occupancy``.
             mode: how map_server reads the image.
+            certain: angle off the axis up to which walls are heard for sure, as for ``occupancy``.
 
         Raises:
             SonarError: another suffix than .yaml or .yml; a ring whose range is too long for a grid.
@@ -72,13 +74,17 @@ class LiveGrid:
         """After ``finish``: the reason why no grid was written; empty if one was."""
         self._live, self._interval = live, interval
         self._method: GridMethod = method
-        self._grid = IncrementalGrid(live.ring, method=method)
+        self._certain = certain
+        self._grid = self._new_grid()
         self._files = GridFiles(filename, mode=mode)
         self._pending: list[Scan] = []
         self._entered: list[np.ndarray] = []
         """Poses of the scans in the grid, if poses are estimated."""
         self._update: Future[OccupancyGrid] | None = None
         self._due = time.monotonic() + interval
+
+    def _new_grid(self) -> IncrementalGrid:
+        return IncrementalGrid(self._live.ring, method=self._method, certain=self._certain)
 
     def warm_up(self) -> None:
         """Compile the programs of the first update."""
@@ -93,7 +99,7 @@ class LiveGrid:
             Scan(k, 0.1 * k, np.array([0.3 * k, 0.0, 0.0]), path[:, 0], path[:, 1], ranges, amplitude, asked=ring.paths)
             for k in range(2)
         ]
-        grid = IncrementalGrid(ring, method=self._method)
+        grid = self._new_grid()
         grid.add(Log.from_scans(scans))
         grid.update(walls)
 
@@ -125,7 +131,7 @@ class LiveGrid:
         rebuilt = self._live.slam and self._has_moved()
         scans, self._pending = self._live.scans_at_current_poses() if rebuilt else self._pending, []
         if rebuilt:
-            self._grid, self._entered = IncrementalGrid(self._live.ring, method=self._method), []
+            self._grid, self._entered = self._new_grid(), []
         if self._live.slam:
             self._entered += [scan.pose for scan in scans]
         ring, heard, start = self._live.ring, self._live.in_range > 0, time.monotonic()

@@ -39,6 +39,7 @@ def stream(
     grid: str | os.PathLike[str] | None = None,
     grid_method: GridMethod = "counts",
     grid_mode: Nav2Mode = "trinary",
+    grid_certain: float | None = None,
     odometry_noise: OdometryNoise | None = None,
     trajectory: str | os.PathLike[str] | None = None,
     scans: int | None = None,
@@ -67,6 +68,7 @@ def stream(
             the end, but not without an echo and a pose (``Status.no_grid``).
         grid_method: how echoes become obstacles, see ``occupancy``.
         grid_mode: how map_server reads the image of the grid, see ``save_nav2``.
+        grid_certain: angle off the axis up to which walls are heard for sure, radians, as for ``occupancy``.
         odometry_noise: noise of the device's poses. If given, they are odometry, and the poses of the robot are
             estimated (``slam``). By default the device's poses are exact.
         trajectory: TUM file of the estimated poses, written at the end; needs ``odometry_noise``.
@@ -111,7 +113,9 @@ def stream(
     )
     live_grid = None
     if grid is not None:
-        live_grid = LiveGrid(live, grid, interval=map_interval, method=grid_method, mode=grid_mode)
+        live_grid = LiveGrid(
+            live, grid, interval=map_interval, method=grid_method, mode=grid_mode, certain=grid_certain
+        )
     queue = DropOldestQueue[RawScan](SETTINGS.warm_up_capacity, size_of=lambda scan: len(scan.echoes))
     stop = threading.Event() if stop is None else stop
     reader = _open_reader(

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxsonar import kernels
-from jaxsonar.estimation.landmark_map import map_landmarks
+from jaxsonar.estimation.landmark_map import POINT_KINDS, map_landmarks
 from jaxsonar.geometry.landmarks import concatenate_landmarks, landmarks_from_points, pad_landmarks, wall_segments
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
 from jaxsonar.geometry.segments import perpendicular_intersections, point_to_segments
@@ -31,23 +31,27 @@ class KnownMap:
 
     @classmethod
     def of(cls, world: GlobalMap, map_sd: tuple[float, float] | None = None) -> "KnownMap":
-        """Landmarks of a map; a map without points gets corners where its walls meet, a floor plan also edges.
+        """Landmarks of a map; a map without corners and edges gets corners where its walls meet, a plan also edges.
+
+        The uncertainty of the radius of a circle counts as one of its position.
 
         Args:
             world: the map.
             map_sd: least standard deviations of its walls: across (m), direction (rad); None: those of a floor plan if
                 it is one, else those of the map.
         """
-        world = world.with_kinds("corner", "edge")
+        world = world.with_kinds(*POINT_KINDS)
         if map_sd is None:
             map_sd = SETTINGS.plan_sd if is_floor_plan(world) else SETTINGS.min_map_sd
         wall_covariance = _wall_covariances(world, map_sd)
         default = np.eye(2) * SETTINGS.default_map_sd[0] ** 2
         point_covariance = np.where(np.isfinite(world.point_cov), world.point_cov, default)
+        point_covariance += np.nan_to_num(world.point_circle_cov[:, 2, 2])[:, None, None] * np.eye(2)
         landmarks = map_landmarks(world)
         opening = np.zeros((len(landmarks.kind), 2, 2))
-        if not world.point_kinds:
-            corners, point_covariance, directions = _wall_corners(world, wall_covariance)
+        if not _has_corners_or_edges(world):
+            corners, corner_covariance, directions = _wall_corners(world, wall_covariance)
+            point_covariance = np.concatenate([point_covariance, corner_covariance])
             kind = np.full(len(corners), kernels.CORNER)
             landmarks = concatenate_landmarks([landmarks, landmarks_from_points(kind, corners)])
             opening = np.concatenate([opening, directions])
@@ -129,8 +133,12 @@ def _free_ends(world: GlobalMap) -> Float[np.ndarray, "ends 2"]:
 
 
 def is_floor_plan(world: GlobalMap) -> bool:
-    """Whether a map is a drawing: it has no points, and its walls count as exact (``map_from_room``)."""
-    return not world.point_kinds and bool((world.sigma_rho < SETTINGS.exact_sd).all())
+    """Whether a map is a drawing: without corners and edges, and its walls count as exact (``map_from_room``)."""
+    return not _has_corners_or_edges(world) and bool((world.sigma_rho < SETTINGS.exact_sd).all())
+
+
+def _has_corners_or_edges(world: GlobalMap) -> bool:
+    return "corner" in world.point_kinds or "edge" in world.point_kinds
 
 
 def trust_in(world: GlobalMap) -> MapTrust:

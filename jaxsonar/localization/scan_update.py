@@ -13,8 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsonar import kernels
 from jaxsonar.kernels.detection_cones import visibility
-from jaxsonar.kernels.landmarks import AnyArray, landmark_in_robot_frame
-from jaxsonar.kernels.measurement_model import reflector_echo
+from jaxsonar.kernels.landmarks import AnyArray, landmark_echo, landmark_in_robot_frame
 from jaxsonar.kernels.planar_geometry import normal, tangent, wrap_angle
 from jaxsonar.kernels.sensor_array import widen_cones
 from jaxsonar.localization.settings import UPDATE_SETTINGS as SETTINGS
@@ -195,7 +194,7 @@ def _match(
 
     def range_of(unknowns, landmark, path):
         moved = landmark.with_parameters(unknowns[3:])
-        return reflector_echo(jnp.asarray(landmark.kind), landmark_in_robot_frame(unknowns[:3], moved), path).range
+        return landmark_echo(landmark_in_robot_frame(unknowns[:3], moved), moved, path).range
 
     unknowns = jnp.concatenate([jnp.broadcast_to(pose, (len(best), 3)), mine.parameters], axis=1)
     value, jacobian = jax.vmap(jax.value_and_grad(range_of))(unknowns, mine, scan.paths)
@@ -252,7 +251,7 @@ def _is_well_visible(
     narrow = widen_cones(paths, SETTINGS.inner_cone)
 
     def visible(landmark, path):
-        echo = reflector_echo(jnp.asarray(landmark.kind), landmark_in_robot_frame(jnp.asarray(pose), landmark), path)
+        echo = landmark_echo(landmark_in_robot_frame(jnp.asarray(pose), landmark), landmark, path)
         along = echo.footpoint + jnp.dot(tangent(jnp.asarray(landmark.parameters[1])), pose[:2] - landmark.anchor)
         inside = (along > landmark.extent[0] + SETTINGS.end_margin) & (along < landmark.extent[1] - SETTINGS.end_margin)
         return (visibility(echo, path) > 0.5) & inside
@@ -287,7 +286,7 @@ def _near_landmarks(
     offset = pose[None, :2] - (landmarks.anchor + landmarks.parameters)
     is_outside = (jnp.einsum("kij,kj->ki", opening, offset) < 0).any(axis=1)
     kind = jnp.where((kind == kernels.CORNER) & is_outside, kernels.EDGE, kind)
-    landmarks = kernels.Landmarks(kind, parameters, landmarks.anchor, extent)
+    landmarks = kernels.Landmarks(kind, parameters, landmarks.anchor, extent, landmarks.radius)
     return rows, landmarks, jnp.asarray(known.covariance)[rows], is_near
 
 
@@ -303,7 +302,10 @@ def _nearest(
     along = jnp.clip((offset * t).sum(-1), every.extent[:, 0], every.extent[:, 1])
     on_wall = every.anchor + every.parameters[:, :1] * n + along[:, None] * t
     foot = jnp.where((kind == kernels.PLANE)[:, None], on_wall, every.anchor + every.parameters)
-    distance = jnp.where(kind >= 0, jnp.linalg.norm(foot - pose[None, :2], axis=-1), jnp.inf)
+    distance = jnp.linalg.norm(foot - pose[None, :2], axis=-1)
+    if every.radius is not None:
+        distance -= jnp.asarray(every.radius)
+    distance = jnp.where(kind >= 0, distance, jnp.inf)
     size = min(SETTINGS.max_landmarks, len(distance))
     _, rows = jax.lax.top_k(-distance, size)
     near = jax.tree.map(lambda leaf: jnp.asarray(leaf)[rows], every)

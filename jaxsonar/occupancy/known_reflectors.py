@@ -1,4 +1,4 @@
-"""Known walls and points: their cells with uncertainty, and the echoes that they explain."""
+"""Known walls, points and circles: their cells with uncertainty, and the echoes that they explain."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -38,7 +38,17 @@ class ReflectorMap(Protocol):
 
     @property
     def points(self) -> Float[np.ndarray, "points 2"]:
-        """Corners and edges, metres."""
+        """Corners, edges, centers of circles, and undecided reflectors, metres."""
+        ...
+
+    @property
+    def point_radius(self) -> Float[np.ndarray, " points"]:
+        """Radii of circles, metres; NaN for other points."""
+        ...
+
+    @property
+    def point_circle_cov(self) -> Float[np.ndarray, "points 3 3"]:
+        """Covariances of the (x, y, radius) of circles, square metres; NaN if unknown."""
         ...
 
     @property
@@ -48,22 +58,24 @@ class ReflectorMap(Protocol):
 
 
 class KnownReflectors(NamedTuple):
-    """Walls and points of a map, with standard deviations."""
+    """Walls, points and circles of a map, with standard deviations."""
 
     walls: Float[np.ndarray, "walls 2 2"]
     """Start and end points, world frame, metres."""
     wall_sd: Float[np.ndarray, "walls 2"]
     """Standard deviation across the wall at its start and its end, metres."""
     points: Float[np.ndarray, "points 2"]
-    """Corners and edges, metres."""
+    """Corners, edges, centers of circles, and undecided reflectors, metres."""
     point_sd: Float[np.ndarray, " points"]
-    """Largest standard deviation of each point, metres."""
+    """Largest standard deviation of each point, and of the border of each circle, metres."""
+    point_radius: Float[np.ndarray, " points"]
+    """Radii of circles, metres; 0 for other points."""
 
     @classmethod
     def of_walls(cls, walls: Float[np.ndarray, "walls 2 2"]) -> "KnownReflectors":
         """Exact walls without points. Walls without length are left out."""
         walls = walls[lengths(walls) > 0]
-        return cls(walls, np.zeros((len(walls), 2)), np.zeros((0, 2)), np.zeros(0))
+        return cls(walls, np.zeros((len(walls), 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
     @classmethod
     def of_map(cls, world: ReflectorMap) -> "KnownReflectors":
@@ -78,13 +90,17 @@ class KnownReflectors(NamedTuple):
         sd = np.hypot(middle, lengths(walls) / 2 * sd_theta)
         covariance = np.nan_to_num(world.point_cov)
         point_sd = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0)) if len(covariance) else np.zeros(0)
-        return cls(walls, np.stack([sd, sd], axis=-1), world.points, point_sd)
+        radius_sd = np.sqrt(np.maximum(np.nan_to_num(world.point_circle_cov[:, 2, 2]), 0))
+        point_sd, radius = np.hypot(point_sd, radius_sd), np.nan_to_num(world.point_radius)
+        return cls(walls, np.stack([sd, sd], axis=-1), world.points, point_sd, radius)
 
     def near(self, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]) -> "KnownReflectors":
         """The reflectors that may be in a box, metres."""
         wall = ((self.walls.max(axis=1) >= low) & (self.walls.min(axis=1) <= high)).all(axis=1)
-        point = ((self.points >= low) & (self.points <= high)).all(axis=1)
-        return KnownReflectors(self.walls[wall], self.wall_sd[wall], self.points[point], self.point_sd[point])
+        radius = self.point_radius[:, None]
+        point = ((self.points + radius >= low) & (self.points - radius <= high)).all(axis=1)
+        of_points = (column[point] for column in (self.points, self.point_sd, self.point_radius))
+        return KnownReflectors(self.walls[wall], self.wall_sd[wall], *of_points)
 
     def reflecting_points(self) -> Float[np.ndarray, "points 2"]:
         """Points, wall ends, and crossings of walls that go on a little beyond their ends, metres."""
@@ -96,6 +112,12 @@ class KnownReflectors(NamedTuple):
         corners = self.walls[first, 0] + fraction[meet][:, None] * (self.walls[first, 1] - self.walls[first, 0])
         return np.concatenate([self.points, self.walls.reshape(-1, 2), corners])
 
+    def reflecting_radii(self) -> Float[np.ndarray, " points"]:
+        """Radius of each of ``reflecting_points``, metres; 0 unless it is the center of a circle."""
+        radii = np.zeros(len(self.reflecting_points()))
+        radii[: len(self.points)] = self.point_radius
+        return radii
+
     def cells(self, resolution: float) -> Int[np.ndarray, "cells 2"]:
         """Cells (column, row) of the world that the reflectors cover, with their uncertainty, without repetition."""
         length = lengths(self.walls)
@@ -104,7 +126,9 @@ class KnownReflectors(NamedTuple):
         points, row = sample_segments(self.walls, samples)
         fraction = np.concatenate([np.linspace(0, 1, n) for n in samples]) if len(samples) else np.zeros(0)
         sd = self.wall_sd[row, 0] * (1 - fraction) + self.wall_sd[row, 1] * fraction
-        points, sd = np.concatenate([points, self.points]), np.concatenate([sd, self.point_sd])
+        is_round = self.point_radius > 0
+        points = np.concatenate([points, self.points[~is_round]])
+        sd = np.concatenate([sd, self.point_sd[~is_round]])
         radius = np.minimum(_WALLS.drawn_sd * sd, _WALLS.max_drawn) / resolution
         center = np.floor(points / resolution).astype(int)
         found = [center]
@@ -114,6 +138,14 @@ class KnownReflectors(NamedTuple):
                 cell = center + np.array([column, line])
                 inside = np.linalg.norm(cell + 0.5 - points / resolution, axis=-1) <= radius
                 found.append(cell[inside])
+        for row in np.flatnonzero(is_round):  # discs
+            wide = min(_WALLS.drawn_sd * float(self.point_sd[row]), _WALLS.max_drawn)
+            at, reach = self.points[row] / resolution, (self.point_radius[row] + wide) / resolution
+            steps = np.arange(-int(np.ceil(reach)) - 1, int(np.ceil(reach)) + 2)
+            disc = np.floor(at).astype(int) + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+            # Cells that the disc touches: their point nearest to its center lies within it.
+            off = np.maximum(np.abs(disc + 0.5 - at) - 0.5, 0)
+            found.append(disc[(off**2).sum(axis=1) <= reach**2])
         return np.unique(np.concatenate(found), axis=0)
 
 
@@ -124,7 +156,7 @@ def explained_by_reflectors(
     half_width: Float[np.ndarray, "echoes 2"],
     distance: Float[np.ndarray, " echoes"],
 ) -> Bool[np.ndarray, " echoes"]:
-    """Which echoes have the range of a known wall, wall end, corner or point within both cones.
+    """Which echoes have the range of a known wall, wall end, corner, point or circle within both cones.
 
     Args:
         known: the map around the echoes.
@@ -133,7 +165,7 @@ def explained_by_reflectors(
         half_width: of their cones, radians.
         distance: half path length, metres.
     """
-    walls, points = known.walls, known.reflecting_points()
+    walls, points, radii = known.walls, known.reflecting_points(), known.reflecting_radii()
     middle, half = position.mean(axis=1), (position[:, 1] - position[:, 0]) / 2
     length = lengths(walls)
     tangent = (walls[:, 1] - walls[:, 0]) / np.maximum(length, 1e-9)[:, None]
@@ -143,7 +175,7 @@ def explained_by_reflectors(
     expected = np.hypot(height, half @ tangent.T)
     foot = walls[:, 0] + along[..., None] * tangent
     on_wall = np.abs(along - length / 2) <= length / 2 + _WALLS.beyond_end
-    to_point = np.linalg.norm(points - position[:, :, None], axis=-1).mean(axis=1)
+    to_point = np.linalg.norm(points - position[:, :, None], axis=-1).mean(axis=1) - radii
     match = np.concatenate([np.where(on_wall, expected, np.inf), to_point], axis=1)
     match = np.abs(match - distance[:, None]) <= _WALLS.explained
     target = np.concatenate([foot, np.broadcast_to(points, (len(foot), *points.shape))], axis=1)

@@ -104,7 +104,7 @@ def look_through(
     confirmed, refuted = (np.zeros((len(segments), bins.max()), np.int64) for _ in range(2))
     tangent = (segments[:, 1] - segments[:, 0]) / length[:, None]
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
-    points, max_range = known.reflecting_points(), readings.max_range
+    points, radii, max_range = known.reflecting_points(), known.reflecting_radii(), readings.max_range
     for here, reading, wall, height in _facing_pairs(segments, normal, readings, beyond=beyond):
         along = ((here.position[reading] - segments[wall, 0]) * tangent[wall]).sum(-1)
         cell = np.floor(along / resolution).astype(int) + before
@@ -123,8 +123,9 @@ def look_through(
         close = (points >= start.min(axis=0, initial=np.inf) - max_range) & (
             points <= start.max(axis=0, initial=-np.inf) + max_range
         )
+        close = close.all(axis=1)
         fit = _point_residual(
-            start, here.heading[reading], half_width, here.first_echo[reading], points[close.all(axis=1)]
+            start, here.heading[reading], half_width, here.first_echo[reading], points[close], radii[close]
         )
         passed = (later > _WALLS.explained) | (later > _WALLS.distinct) & (fit < later)
         for counts, some in ((refuted, passed), (confirmed, ~passed)):
@@ -226,7 +227,7 @@ def profile_walls(known: KnownReflectors, readings: FacingReadings, *, resolutio
         for first, last in along[along[:, 1] - along[:, 0] > 1e-6]:
             extensions.append(walls[wall, 0] + np.array([[first], [last]]) * tangent[wall])
     found = KnownReflectors(
-        np.array(parts).reshape(-1, 2, 2), np.array(sd).reshape(-1, 2), known.points, known.point_sd
+        np.array(parts).reshape(-1, 2, 2), np.array(sd).reshape(-1, 2), known.points, known.point_sd, known.point_radius
     )
     return WallProfile(found, np.array(extensions).reshape(-1, 2, 2))
 
@@ -262,7 +263,8 @@ def hidden_walls(
         readings: of all scans.
         resolution: side of a cell, metres.
     """
-    ends = np.concatenate([known.points, known.walls.reshape(-1, 2), obstacles])
+    edges = known.points[known.point_radius == 0]
+    ends = np.concatenate([edges, known.walls.reshape(-1, 2), obstacles])
     if not len(ends):
         return np.zeros((0, 2, 2))
     segments = ends[_near_pairs(ends)]
@@ -311,10 +313,11 @@ def _point_residual(
     half_width: Float[np.ndarray, " readings"],
     first_echo: Float[np.ndarray, " readings"],
     points: Float[np.ndarray, "points 2"],
+    radii: Float[np.ndarray, " points"],
 ) -> Float[np.ndarray, " readings"]:
-    """Smallest difference between the first echo and the range of a point in the cone, metres; inf without one."""
+    """Smallest difference of the first echo and the range of a point or circle in the cone, metres; inf without one."""
     ray = points - position[:, None]
     off_axis = np.abs(wrap_angle(np.arctan2(ray[..., 1], ray[..., 0]) - heading[:, None]))
-    residual = np.abs(np.linalg.norm(ray, axis=-1) - first_echo[:, None])
+    residual = np.abs(np.linalg.norm(ray, axis=-1) - radii - first_echo[:, None])
     inside = off_axis <= half_width[:, None] + _WALLS.beyond_cone
     return np.where(inside, residual, np.inf).min(axis=1, initial=np.inf)

@@ -148,6 +148,8 @@ def _groups_of(model: LocalModel) -> Iterator[_EchoGroup]:
         log_prior = np.log([SETTINGS.decided_probability, rest, rest])
         yield _EchoGroup(np.array([line.rho, line.theta]), line.rho * unit(line.theta), log_prior, line.paths)
     for one in model.points:
+        if one.kind == "circle":
+            continue  # no kind of reflector here fits a circle from all sides
         probability = np.full(3, max((1 - one.probability) / 2, least))
         probability[kernels.CORNER if one.kind == "corner" else kernels.EDGE] = one.probability
         point = np.array([one.x, one.y])

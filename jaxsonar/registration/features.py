@@ -148,7 +148,7 @@ def scan_features(
     half = np.linalg.norm(segment[:, 1] - segment[:, 0], axis=-1) / 2
     # A corner that two walls of the same scan already imply carries no additional information.
     points = [one for one in model.points if not _is_wall_crossing(np.array([one.x, one.y]), model)]
-    noise = np.array([np.trace(one.cov) / 2 for one in points], dtype=np.float64)
+    noise = np.array([np.trace(one.cov[:2, :2]) / 2 for one in points], dtype=np.float64)
     reflectors = [(line.rho, line.theta) for line in model.lines]
     reflectors += [(other.rho, other.theta) for other in model.undecided]
     reflectors += [(float(np.hypot(one.x, one.y)), float(np.arctan2(one.y, one.x))) for one in model.points]

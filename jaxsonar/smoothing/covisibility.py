@@ -109,6 +109,7 @@ def select_landmarks(
         world,
         **columns,
         scans=tuple(scans for _, scans in walls),
+        end_kinds=tuple(world.end_kinds[row] for row in wall) if world.end_kinds else (),
         point_kinds=tuple(world.point_kinds[row] for row in point),
         point_scans=tuple(scans for _, scans in points),
     )

@@ -77,5 +77,13 @@ class SmoothingSettings:
     default_sigma: float = DEFAULT_SIGMA
     """Standard deviation of the ranges of a scan whose local model has no estimate, metres."""
 
+    # Circles
+    max_radius_sd: float = 0.01
+    """Metres; a circle whose radius is known worse is no landmark, because its radius is not adjusted. Chosen by
+    hand: seen from another side, the whole error of the radius is an error of the range."""
+    circle_margin: float = 0.1
+    """Metres from the border of a circle within which corners and edges are detections of the circle. Chosen by
+    hand: about the error of a point that one scan determines."""
+
 
 SETTINGS = SmoothingSettings()

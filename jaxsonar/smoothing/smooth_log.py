@@ -158,7 +158,10 @@ def smooth(
         )
         if has_pose(registered).sum() > has_pose(fit.poses).sum():
             fit = _better_fit(fit, smoother.fit(registered))
-    # 3. Covariances.
+    # 3. Adjust with circles as landmarks.
+    report("circles")
+    fit = _better_fit(fit, smoother.with_circles(fit))
+    # 4. Covariances.
     report("covariances")
     return _result(smoother, fit)
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxsonar import kernels
 from jaxsonar.estimation.adjustment_state import AdjustmentResult
+from jaxsonar.estimation.landmark_map import POINT_KINDS
 from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
 from jaxsonar.geometry.landmarks import landmark_positions, wall_segments
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
@@ -21,6 +21,7 @@ def adjusted_map(world: GlobalMap, adjustment: AdjustmentResult, cov: Float[np.n
         adjustment: its result.
         cov: marginal covariance of the parameters of each landmark, metres and radians.
     """
+    world = world.with_kinds(*POINT_KINDS)
     wall_count, count = len(world), len(world) + len(world.points)
     first = np.asarray(adjustment.problem.factors.reflection.first)[adjustment.used]
     echoes = np.bincount(first, minlength=count)[:count]
@@ -33,20 +34,20 @@ def adjusted_map(world: GlobalMap, adjustment: AdjustmentResult, cov: Float[np.n
     arm = (tangent_of(theta) * walls.anchor).sum(-1)
     theta_variance = cov[wall, 1, 1]
     rho_variance = cov[wall, 0, 0] + 2 * arm * cov[wall, 0, 1] + arm**2 * theta_variance
-    kinds = {kernels.CORNER: "corner", kernels.EDGE: "edge"}
+    kinds = {kind: name for name, kind in POINT_KINDS.items()}
+    is_kept = np.isin(np.arange(count), kept)
     return replace(
-        world.with_points(
-            landmark_positions(points),
-            point_kinds=tuple(kinds[kind] for kind in points.kind.tolist()),
-            point_cov=cov[point],
-            point_echoes=echoes[point],
-            point_scans=tuple(world.point_scans[row - wall_count] for row in point),
-        ),
+        world.take_walls(is_kept[:wall_count]).take_points(is_kept[wall_count:]),
+        points=landmark_positions(points),
+        point_kinds=tuple(kinds[kind] for kind in points.kind.tolist()),
+        point_cov=cov[point],
+        point_echoes=echoes[point],
         segments=wall_segments(walls),
         rho=np.abs(rho),
         theta=wrap_angle(np.where(rho < 0, theta + np.pi, theta)),
         sigma_rho=np.sqrt(rho_variance),
         sigma_theta=np.sqrt(theta_variance),
         echoes=echoes[wall],
-        scans=tuple(world.scans[row] for row in wall),
+        end_kinds=(),
+        end_cov=np.full((len(wall), 2, 2, 2), np.nan),
     )

@@ -23,7 +23,9 @@ from jaxsonar.estimation.landmark_map import LandmarkMap, landmark_map_of, map_w
 from jaxsonar.estimation.odometry_noise import OdometryNoiseModel
 from jaxsonar.estimation.robust_adjustment import anneal, gnc_adjust
 from jaxsonar.hardware.errors import SonarError
+from jaxsonar.mapping.build_map import add_reflectors
 from jaxsonar.mapping.global_map import GlobalMap
+from jaxsonar.reflectors.posed_scans import PosedScans
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.sensors.ring import Ring
 from jaxsonar.sensors.ring_parameters import ParameterBasis
@@ -48,6 +50,8 @@ class SmoothingFit(NamedTuple):
     """world_from_robot; NaN for scans without a pose."""
     echo_counts: Int[np.ndarray, " scans"]
     """Echoes of each scan that landmarks explain."""
+    outliers: OdometryOutliers | None = None
+    """Where points are split; None: not known."""
 
     @property
     def adjustment(self) -> AdjustmentResult:
@@ -102,6 +106,24 @@ class Smoother:
             fit, outliers, split = again, remaining, np.union1d(split, remaining)
         return fit
 
+    def with_circles(self, fit: SmoothingFit) -> SmoothingFit:
+        """The fit adjusted once more with the circles that its poses show as landmarks; the same without a circle.
+
+        Circles need poses: their search uses the echoes of all scans that the walls and corners leave over.
+        """
+        if fit.outliers is None:
+            return fit
+        world, placed = fit.alternation.maps[0], replace(self.log, pose=fit.poses)
+        measurements = PosedScans.of(self.ring_of(fit.adjustment.state), placed).measurements()
+        world = _with_known_circles(world, add_reflectors(world, measurements, sigma=self.sigma))
+        if world is None:
+            return fit
+        landmark_map = self._landmark_map(fit.data, world, fit.outliers)
+        state = fit.adjustment.state._replace(landmark_map=landmark_map)
+        adjustment = self._adjust(fit.data, state, ALTERNATION_SETTINGS.later_scale)
+        again = AlternationResult([world], adjustment)
+        return self._fit_of(fit.data, placed, again, fit.outliers)
+
     def ring_of(self, state: AdjustmentState) -> Ring:
         """The ring with the estimated speed of sound."""
         factor = float(np.exp((self.basis.columns @ state.coordinates)[self.ring.count]))
@@ -117,13 +139,18 @@ class Smoother:
         found = self._alternate(data, log, outliers)
         if found is None:
             raise NothingExplained("smooth: no echo fits the walls; is it the right ring, are poses and units right?")
+        return self._fit_of(data, log, found, outliers)
+
+    def _fit_of(self, data: BatchData, log: Log, found: AlternationResult, outliers: OdometryOutliers) -> SmoothingFit:
+        """The fit of an adjustment; scans with too few explained echoes lose their pose."""
         rows = data.scan_rows[0]
         explained, echoes = np.zeros((2, len(log)), dtype=np.int64)
         explained[rows] = found.adjustment.used.sum(axis=1)[: len(rows)]
         echoes[rows] = np.isfinite(data.reported).sum(axis=1)[: len(rows)]
         lost = self._lost_scans(data, explained, echoes)
         adjusted = data.logs_with_poses([log], found.adjustment.state.poses)[0].pose
-        return SmoothingFit(data, found, np.where(lost[:, None], np.nan, adjusted), np.where(lost, 0, explained))
+        poses = np.where(lost[:, None], np.nan, adjusted)
+        return SmoothingFit(data, found, poses, np.where(lost, 0, explained), outliers)
 
     def _batch_data(self, log: Log) -> BatchData:
         """Echoes, odometry and priors: one pose is fixed, all others and the landmarks are free."""
@@ -235,6 +262,33 @@ class Smoother:
     def _row_of_scan(self) -> dict[int, int]:
         """Row of each scan number in the log."""
         return {int(number): row for row, number in enumerate(self.log.scan)}
+
+
+def _with_known_circles(world: GlobalMap, found: GlobalMap) -> GlobalMap | None:
+    """A map with the circles of another one whose radii are known; None if there is none.
+
+    Args:
+        world: walls and points.
+        found: the same with the reflectors that ``add_reflectors`` finds, and without the short walls that they
+            replace.
+    """
+    is_circle = np.array([kind == "circle" for kind in found.point_kinds], dtype=bool)
+    known = is_circle & (found.point_circle_cov[:, 2, 2] < SETTINGS.max_radius_sd**2)
+    if not known.any():
+        return None
+    circles = found.take_points(known)
+    distance = np.linalg.norm(world.points[:, None] - circles.points, axis=-1) - circles.point_radius
+    points = world.take_points((distance > SETTINGS.circle_margin).all(axis=1))
+    return found.with_points(
+        np.concatenate([points.points, circles.points]),
+        point_kinds=(*points.point_kinds, *circles.point_kinds),
+        point_cov=np.concatenate([points.point_cov, circles.point_cov]),
+        point_echoes=np.append(points.point_echoes, circles.point_echoes),
+        point_scans=(*points.point_scans, *circles.point_scans),
+        point_radius=np.append(points.point_radius, circles.point_radius),
+        point_circle_cov=np.concatenate([points.point_circle_cov, circles.point_circle_cov]),
+        point_probabilities=np.concatenate([points.point_probabilities, circles.point_probabilities]),
+    )
 
 
 def has_pose(poses: Float[np.ndarray, "scans 3"]) -> Bool[np.ndarray, " scans"]:

@@ -54,6 +54,7 @@ def features_with(walls, points=(), *, sd=1e-3):
         covariance=np.tile(np.eye(2) * sd**2, (count, 1, 1)),
         segment=np.array([*segments, *([p, p] for p in points)], dtype=np.float64).reshape(-1, 2, 2),
         echoes=np.full(count, 12),
+        radius=np.zeros(count),
     )
 
 

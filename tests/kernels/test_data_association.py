@@ -74,10 +74,15 @@ def double():
 
 @pytest.fixture(scope="module")
 def heard():
+    """Hard beams: ``simulated``."""
+    return simulated(beams="hard")
+
+
+def simulated(**options):
     """A simulation with its poses, as rectangles, and what each echo came from: a candidate, or -1."""
     rng = np.random.default_rng(11)
     poses = np.column_stack([rng.uniform(-0.6, 0.2, SCANS), rng.uniform(-0.6, 0.5, SCANS), rng.uniform(-3, 3, SCANS)])
-    found = simulate(RING, ROOM, poses, sigma=SIGMA, seed=2)
+    found = simulate(RING, ROOM, poses, sigma=SIGMA, seed=2, **options)
     path, reported = np.zeros((SCANS, SLOTS), np.int32), np.full((SCANS, SLOTS), np.nan)
     truth = np.full((SCANS, SLOTS), -1)
     column = np.arange(len(found.scan)) - np.searchsorted(found.scan, found.scan)
@@ -93,7 +98,7 @@ def heard():
     return poses, path, reported, truth
 
 
-def associated(poses, path, reported, map_index=None, candidates=None, scene=None):
+def associated(poses, path, reported, map_index=None, candidates=None, scene=None, threshold=np.inf):
     map_index = np.zeros(len(poses), np.int32) if map_index is None else map_index
     trees = (the_scene() if scene is None else scene, the_candidates() if candidates is None else candidates)
     scene, candidates = (jax.tree.map(jnp.asarray, tree) for tree in trees)
@@ -103,6 +108,7 @@ def associated(poses, path, reported, map_index=None, candidates=None, scene=Non
         candidates,
         *(jnp.asarray(x) for x in (poses, map_index, path, reported)),
         every(candidates, poses),
+        threshold=jnp.asarray(threshold),
     )
     return [np.asarray(x) for x in (found.candidate, found.residual, found.competitor_gap)]
 
@@ -217,6 +223,20 @@ def test_true_reflectors_are_chosen(heard):
     assert sure.sum() > 0.7 * known.sum()
     np.testing.assert_array_equal(candidate[sure], truth[sure])
     assert np.std(residual[sure]) == pytest.approx(SIGMA, rel=0.2)
+
+
+def test_loud_echoes_from_outside_of_the_cones_are_those_of_their_reflectors():
+    """Soft beams. The threshold is that of the simulator, an amplitude of 0.02."""
+    poses, path, reported, truth = simulated(beams="soft")
+    known = truth >= 0
+    candidate, residual, rival = associated(poses, path, reported)
+    assert np.mean(candidate[known] == truth[known]) < 0.8
+    candidate, residual, rival = associated(poses, path, reported, threshold=20 * np.log10(0.02))
+    right = candidate == truth
+    assert right[known].mean() > 0.95
+    sure = known & (rival > 10 * SIGMA)
+    assert right[sure].mean() > 0.995
+    assert np.std(residual[sure & right]) == pytest.approx(SIGMA, rel=0.2)
 
 
 def test_doubt_does_not_look_at_the_noise(heard):

@@ -107,7 +107,7 @@ def predicted(kind, poses, first, second, tx, rx, heading):
     rows = np.arange(len(poses), dtype=np.int32)
     reflection = Reflection(np.full(len(poses), kind, np.int32), rows, rows)
     path = paths_between(tx, rx, heading=heading, half_beam=1.2)
-    return [np.asarray(x) for x in predict_reflections(*arrays((poses, reflection, first, second)), path)]
+    return [np.asarray(x) for x in predict_reflections(*arrays((poses, reflection, first, second)), path)][:3]
 
 
 # Ranges

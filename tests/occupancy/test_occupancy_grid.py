@@ -29,7 +29,9 @@ RING = Ring.circular()
 @pytest.fixture(scope="module")
 def heard(office):
     """A log of the office."""
-    simulation = simulate(office.ring, office.room, office.poses, sigma=0.003, seed=1, stamps=office.stamps)
+    simulation = simulate(
+        office.ring, office.room, office.poses, sigma=0.003, seed=1, stamps=office.stamps, beams="hard"
+    )
     return simulation.as_log(office.ring, office.poses)
 
 
@@ -41,7 +43,7 @@ def office_grid(office, heard):
 def listen(ring, walls, poses, *, poles=(), **errors):
     """A simulated log at the given poses."""
     room = Room(np.array(walls).reshape(-1, 2, 2), (), np.array(poles).reshape(-1, 2))
-    return simulate(ring, room, poses, **errors).as_log(ring, poses)
+    return simulate(ring, room, poses, beams="hard", **errors).as_log(ring, poses)
 
 
 def silent(poses, ring=RING):
@@ -339,7 +341,8 @@ def test_readings_refute_a_part_of_a_wall_and_echoes_confirm_it():
 
 def test_edges_near_each_other_may_be_the_ends_of_a_wall_that_no_sensor_faced():
     ends = np.array([[0.0, 1.0], [0.5, 1.0], [3.0, 1.0]])
-    known, none = KnownReflectors(np.zeros((0, 2, 2)), np.zeros((0, 2)), ends, np.zeros(3)), np.zeros((0, 2))
+    points = ends, np.zeros(3), np.zeros(3)
+    known, none = KnownReflectors(np.zeros((0, 2, 2)), np.zeros((0, 2)), *points), np.zeros((0, 2))
     found = hidden_walls(known, none, NOTHING, resolution=0.05)
     assert found[..., 0].min() == 0.0
     assert found[..., 0].max() == 0.5  # the third is too far away
