@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
 from benchmarks.calibration import accuracy as calibration
 from benchmarks.calibration import trials
 from benchmarks.calibration.cramer_rao import bound, expected_ranges, first_order_echoes
 from benchmarks.calibration.summary import Outcome, measures
 from benchmarks.calibration.trials import CONDITIONS, noisy_odometry, trajectory_in, trial
-from jaxsonar import random_room, simulate
+from jaxsonar import random_room
 from jaxsonar.geometry.se2 import relative, wrap_angle
 from jaxsonar.geometry.segments import point_to_segments
 

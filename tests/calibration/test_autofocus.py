@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.firings import fire_in_turn
+from support.hard_cones import simulate
 from support.slam_scene import ROOM
 
-from jaxsonar import HoughSettings, Ring, SonarError, kernels, random_pose, random_room, simulate
+from jaxsonar import HoughSettings, Ring, SonarError, kernels, random_pose, random_room
 from jaxsonar.calibration.autofocus import autofocus_ring
 from jaxsonar.kernels.focus_measure import blur, ring_focus_measure
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, SonarError, calibrate, load_ring, save_calibration, simulate
+from jaxsonar import Log, Ring, SonarError, calibrate, load_ring, save_calibration
 from jaxsonar.calibration.calibration_result import Calibration
 from jaxsonar.geometry.se2 import compose, inverse, relative, wrap_angle
 from jaxsonar.reports.plot_calibration import calibration_figure

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.driven_logs import drive
+from support.hard_cones import simulate
 from support.recordings import recorded
 
-from jaxsonar import Log, Ring, SonarError, calibrate, load_log, load_ring, save_calibration, simulate
+from jaxsonar import Log, Ring, SonarError, calibrate, load_log, load_ring, save_calibration
 from jaxsonar.calibration.settings import SPARSE_SETTINGS as SETTINGS
 from jaxsonar.calibration.sparse_ring import is_sparse
 from jaxsonar.floor_plans.room import Room

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import numpy as np
+from support.hard_cones import simulate
 
-from jaxsonar import LocalModel, simulate
+from jaxsonar import LocalModel
 from jaxsonar.cli import app as cli
 from jaxsonar.demo import run_demo as demo
 from jaxsonar.evaluation.line_accuracy import line_accuracy

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from support.bags import firing_log, sonar_ring
 from support.commands import HEADER, OFFICE, PATH, SIMULATE, call, contents
+from support.hard_cones import simulate
 from support.input_files import WALLS
 
-from jaxsonar import Room, load_log, load_ring, save_log, save_ring, simulate
+from jaxsonar import Room, load_log, load_ring, save_log, save_ring
 from jaxsonar.scans.single_firings import group_firings
 
 

@@ -179,7 +179,9 @@ def test_truth_needs_ascending_stamps(here, capsys):
 @pytest.mark.slow
 def test_localize_reports_an_uncertain_pose(here, capsys):
     """A rectangle is symmetric under half a turn: exit code 1, both poses, no file."""
-    from jaxsonar import Room, simulate
+    from support.hard_cones import simulate
+
+    from jaxsonar import Room
 
     corners = np.array([[0, 0], [3, 0], [3, 2], [0, 2]], dtype=float)
     room = Room(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))

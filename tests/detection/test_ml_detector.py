@@ -10,6 +10,7 @@ import math
 import numpy as np
 import pytest
 from support import oracles
+from support.hard_cones import simulate
 
 from jaxsonar import (
     HoughSettings,
@@ -25,7 +26,6 @@ from jaxsonar import (
     random_pose,
     random_room,
     save_log,
-    simulate,
 )
 from jaxsonar.cli import app as cli
 from jaxsonar.detection.local_model import KIND_NAMES

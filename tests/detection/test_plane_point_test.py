@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from support import oracles
+from support.hard_cones import simulate
 
-from jaxsonar import HoughSettings, Log, Room, SonarError, load_ring, local_models, simulate
+from jaxsonar import HoughSettings, Log, Room, SonarError, load_ring, local_models
 from jaxsonar.detection.settings import SETTINGS
 from jaxsonar.floor_plans.room import walls_in_robot_frame
 from jaxsonar.geometry.se2 import transform_points

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support import oracles
+from support.hard_cones import simulate
 
 from jaxsonar import (
     Log,
@@ -16,7 +17,6 @@ from jaxsonar import (
     local_models,
     random_pose,
     random_room,
-    simulate,
 )
 from jaxsonar.floor_plans.room import walls_in_robot_frame
 from jaxsonar.geometry.se2 import compose, transform_points

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 from support.wandering_robot import RING, log_of, ranges, trajectory
 
-from jaxsonar import Ring, Room, simulate
+from jaxsonar import Ring, Room
 from jaxsonar.diagnostics.check_ring import check
 from jaxsonar.scans.readings import without_readings
 

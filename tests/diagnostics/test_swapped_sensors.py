@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 from support.health_logs import RING, renumbered
 
-from jaxsonar import simulate
 from jaxsonar.diagnostics.check_ring import check
 from jaxsonar.simulation.office import load_office
 

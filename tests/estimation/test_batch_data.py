@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 from support.firings import explicit, fire_in_turn, repeat_readings
+from support.hard_cones import simulate
 from support.slam_scene import ROOM
 
-from jaxsonar import Ring, simulate
+from jaxsonar import Ring
 from jaxsonar.estimation.batch_data import BatchData
 from jaxsonar.estimation.estimation_log import estimation_log
 from jaxsonar.estimation.odometry_noise import OdometryNoise

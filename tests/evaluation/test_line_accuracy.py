@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from support import oracles
+from support.hard_cones import simulate
 
-from jaxsonar import Line, LocalModel, Ring, Room, kernels, simulate
+from jaxsonar import Line, LocalModel, Ring, Room, kernels
 from jaxsonar.evaluation.line_accuracy import cramer_rao_bound, line_accuracy, match_lines, pool
 from jaxsonar.evaluation.settings import SETTINGS
 from jaxsonar.simulation.traced_echoes import EchoKind

@@ -5,8 +5,9 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
-from jaxsonar import Ring, Room, kernels, local_model, simulate
+from jaxsonar import Ring, Room, kernels, local_model
 from jaxsonar.geometry.landmarks import wall_segments
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.graph_slam.feature_association import FeatureMeasurements, associate_features

@@ -5,8 +5,9 @@ import math
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, Room, SonarError, load_ring, local_model, simulate
+from jaxsonar import Log, Ring, Room, SonarError, load_ring, local_model
 from jaxsonar.geometry.se2 import transform_points
 from jaxsonar.graph_slam.incremental_mapper import Mapper, MapState
 from jaxsonar.mapping.build_map import build_map

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 from support.slam_scene import ODOMETRY_NOISE, RING, ROOM, SIGMA, truth
 from support.wandering_robot import RING as NARROW
 from support.wandering_robot import log_of, ranges, trajectory
 
-from jaxsonar import simulate
 from jaxsonar.cli.slam_summary import as_json, summary_lines
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle

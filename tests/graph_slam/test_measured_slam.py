@@ -7,9 +7,10 @@ import jax
 import numpy as np
 import pytest
 from support.firings import explicit, fire_in_turn
+from support.hard_cones import simulate
 from support.slam_scene import ODOMETRY_NOISE, ROOM
 
-from jaxsonar import Ring, SonarError, simulate
+from jaxsonar import Ring, SonarError
 from jaxsonar.cli.slam_summary import as_json, summary_lines
 from jaxsonar.detection.extract import local_model
 from jaxsonar.estimation.trajectory import Trajectory

@@ -5,9 +5,10 @@ from functools import cache
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 from support.slam_scene import ODOMETRY_NOISE, RING, ROOM, SCAN_COUNT, SIGMA, log, truth
 
-from jaxsonar import SonarError, local_models, simulate
+from jaxsonar import SonarError, local_models
 from jaxsonar.estimation.trajectory import Trajectory
 from jaxsonar.evaluation.trajectory_errors import trajectory_errors
 from jaxsonar.geometry.se2 import compose, relative

@@ -3,8 +3,9 @@
 import jax
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
-from jaxsonar import Ring, kernels, simulate
+from jaxsonar import Ring, kernels
 from jaxsonar.geometry.se2 import rotation, unit, wrap_angle
 from jaxsonar.simulation.office import load_office
 from jaxsonar.simulation.traced_echoes import EchoKind

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import oracles
+from support.hard_cones import simulate
 from support.rings import bumper_ring
 
-from jaxsonar import HoughSettings, Ring, Room, kernels, load_ring, random_pose, random_room, simulate
+from jaxsonar import HoughSettings, Ring, Room, kernels, load_ring, random_pose, random_room
 from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.floor_plans.room import walls_in_robot_frame
 from jaxsonar.kernels.measurement_model import plane_echo

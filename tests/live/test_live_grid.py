@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import support.rooms as rooms
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, simulate
+from jaxsonar import Log, Ring
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.live.grid_files import GridFiles

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.emulated_devices import office_log
+from support.hard_cones import simulate
 from support.maps import assert_same_map
 
-from jaxsonar import Log, Ring, Room, build_map, kernels, local_model, simulate
+from jaxsonar import Log, Ring, Room, build_map, kernels, local_model
 from jaxsonar.hardware.messages import ECHO, Pose
 from jaxsonar.hardware.recorder import HEADER, csv_rows
 from jaxsonar.hardware.scan_assembler import RawScan, ScanAssembler

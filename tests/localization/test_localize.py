@@ -6,8 +6,9 @@ from functools import cache
 import jax
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, Room, SonarError, simulate
+from jaxsonar import Log, Ring, Room, SonarError
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import (
     compose,

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import shapely
 from support import oracles
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, Room, SonarError, load_log, local_models, random_pose, random_room, save_log, simulate
+from jaxsonar import Log, Ring, Room, SonarError, load_log, local_models, random_pose, random_room, save_log
 from jaxsonar.detection.settings import METHODS
 from jaxsonar.geometry.se2 import rotation
 from jaxsonar.mapping.build_map import MERGING_METHODS, add_reflectors, assemble_map, build_map

@@ -8,9 +8,10 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import oracles
+from support.hard_cones import simulate
 from support.rings import bumper_ring
 
-from jaxsonar import Log, Ring, load_ring, local_models, random_pose, random_room, simulate
+from jaxsonar import Log, Ring, load_ring, local_models, random_pose, random_room
 from jaxsonar.geometry.se2 import compose, transform_points
 from jaxsonar.mapping.free_space import DirectionalFreeSpace, observe_free_space
 from jaxsonar.mapping.map_evidence import gather_evidence

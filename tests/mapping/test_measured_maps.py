@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.firings import explicit, fire_in_turn, repeat_readings
+from support.hard_cones import simulate
 from support.maps import assert_same_map
 from support.rooms import loop, some_poses
 
-from jaxsonar import Log, Ring, local_models, random_room, simulate
+from jaxsonar import Log, Ring, local_models, random_room
 from jaxsonar.detection.local_model import LocalModel
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.segments import point_to_segments

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.hard_cones import simulate
 
 from jaxsonar.detection.extract import local_models
 from jaxsonar.detection.local_model import LocalModel, Point
@@ -23,7 +24,6 @@ from jaxsonar.mapping.wall_endpoints import blocks_gap, detached_points, snap_en
 from jaxsonar.mapping.wall_segments import WallSegments
 from jaxsonar.reports.plot_map import map_figure
 from jaxsonar.simulation.office import load_office
-from jaxsonar.simulation.simulator import simulate
 
 NOWHERE = np.zeros((0, 3))
 PATHS = np.zeros((1, 2), np.int64)

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, Room, load_log, load_ring, simulate
+from jaxsonar import Log, Ring, Room, load_log, load_ring
 from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.mapping.build_map import build_map
 from jaxsonar.mapping.driven_space import DrivenSpace

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, Room, simulate
+from jaxsonar import Log, Ring, Room
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_support import EchoModel, MeasurementIndex, line_evidence

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import shapely
 from support.grid_layers import assert_same_grid, grid_of_parts
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, random_pose, random_room, simulate
+from jaxsonar import Log, Ring, random_pose, random_room
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import rotation
 from jaxsonar.geometry.segments import point_to_segments

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 from support.recordings import recorded
 from support.wandering_robot import RING, log_of, ranges, trajectory
 
-from jaxsonar import Ring, load_log, load_ring, random_pose, random_room, simulate
+from jaxsonar import Ring, load_log, load_ring, random_pose, random_room
 from jaxsonar.plausibility.implausible_input import implausible_input
 from jaxsonar.recordings.input_options import InputOptions
 from jaxsonar.simulation.office import load_office

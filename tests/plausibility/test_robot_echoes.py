@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 from support.health_logs import log_of as random_places
 from support.robot_echoes import drive, same_measurements, with_robot_echoes
 from support.wandering_robot import RING, along_a_wall, log_of, ranges, trajectory
 
-from jaxsonar import Ring, Room, build_map, simulate
+from jaxsonar import Ring, Room, build_map
 from jaxsonar.geometry.se2 import compose
 from jaxsonar.plausibility.prepared_log import PreparedLog
 from jaxsonar.plausibility.robot_echoes import find_robot_echoes, without_robot_echoes

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, Room, random_pose, random_room, simulate
+from jaxsonar import Log, Ring, Room, random_pose, random_room
 from jaxsonar.plausibility.prepared_log import prepared_log
 from jaxsonar.plausibility.unheard_paths import neighbor_offsets, unheard_offsets, unheard_warning
 from jaxsonar.plausibility.unused_echoes import EchoCounts

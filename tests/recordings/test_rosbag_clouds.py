@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from support.bags import KINDS, START, BagMessages, sonar_ring
+from support.hard_cones import simulate
 from support.rooms import loop
 
-from jaxsonar import Room, simulate
+from jaxsonar import Room
 from jaxsonar.geometry.se2 import inverse, transform_points
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.recordings.rosbag_log import read_bag

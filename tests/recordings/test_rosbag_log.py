@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from support.bags import KINDS, START, BagMessages, bag_of_firings, firing_log, sonar_ring, spinning
+from support.hard_cones import simulate
 from support.rooms import loop
 
-from jaxsonar import Log, Room, load_log, simulate
+from jaxsonar import Log, Room, load_log
 from jaxsonar.geometry.se2 import compose, wrap_angle
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.recordings.input_options import InputOptions

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
-from jaxsonar import LocalModel, SonarError, local_models, simulate
+from jaxsonar import LocalModel, SonarError, local_models
 from jaxsonar.detection.local_model import Line, Point
 from jaxsonar.geometry.se2 import compose, inverse, relative, transform_points, wrap_angle
 from jaxsonar.registration.sequential_registration import register_scans

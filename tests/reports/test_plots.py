@@ -10,9 +10,10 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from support.hard_cones import simulate
 from support.rings import bumper_ring
 
-from jaxsonar import LocalModel, Log, Ring, Room, Scan, SonarError, local_model, local_models, simulate
+from jaxsonar import LocalModel, Log, Ring, Room, Scan, SonarError, local_model, local_models
 from jaxsonar.evaluation.laser_polygonal_model import PolygonalModel
 from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.occupancy.occupancy_grid import FREE, OCCUPIED, UNKNOWN

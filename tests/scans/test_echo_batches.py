@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.hard_cones import simulate
 
-from jaxsonar import HoughSettings, Ring, extract_lines, kernels, random_pose, random_room, simulate
+from jaxsonar import HoughSettings, Ring, extract_lines, kernels, random_pose, random_room
 from jaxsonar.detection.arc_tables import arc_tables
 from jaxsonar.scans.echo_batches import FAST_SCANS, SLOW_SCANS, pack, restore_order
 from jaxsonar.scans.flat_echoes import FlatEchoes

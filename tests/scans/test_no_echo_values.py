@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.hard_cones import simulate
 from support.wandering_robot import RING, along_a_wall, held, log_of, ranges, trajectory
 
-from jaxsonar import Log, Ring, random_pose, random_room, simulate
+from jaxsonar import Log, Ring, random_pose, random_room
 from jaxsonar.scans.measured_paths import measured_paths
 from jaxsonar.scans.no_echo_values import NoEchoValue, find_no_echo_values, without_no_echo_values
 from jaxsonar.scans.readings import explicit_log

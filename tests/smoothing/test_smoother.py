@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Room, SonarError, simulate
+from jaxsonar import Log, Room, SonarError
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import compose, relative, wrap_angle
 from jaxsonar.simulation.office import load_office

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, Room, simulate
+from jaxsonar import Log, Ring, Room
 from jaxsonar.geometry.se2 import compose
 
 KINDS = ("ros1", "sqlite", "mcap")

@@ -4,8 +4,9 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from support.hard_cones import simulate
 
-from jaxsonar import Ring, random_pose, random_room, simulate
+from jaxsonar import Ring, random_pose, random_room
 from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.simulation.wheel_odometry import simulate_odometry
 

@@ -4,8 +4,9 @@ import threading
 import time
 
 import numpy as np
+from support.hard_cones import simulate
 
-from jaxsonar import Log, simulate
+from jaxsonar import Log
 from jaxsonar.hardware.device_emulator import emulate
 from jaxsonar.hardware.messages import Pose
 from jaxsonar.hardware.protocol import Decoder

@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+from support.hard_cones import simulate
 
-from jaxsonar import Log, simulate
+from jaxsonar import Log
 
 
 def fire_in_turn(ring, room, trajectory, scans, *, period=0.025, **errors):

@@ -7,8 +7,9 @@ import dataclasses
 import json
 
 import numpy as np
+from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, random_pose, random_room, simulate
+from jaxsonar import Log, Ring, random_pose, random_room
 
 RING = Ring.circular()
 SIGMA = 0.002

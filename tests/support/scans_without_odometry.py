@@ -1,8 +1,9 @@
 """Simulated scans without odometry, and their local models."""
 
 import numpy as np
+from support.hard_cones import simulate
 
-from jaxsonar import local_models, simulate
+from jaxsonar import local_models
 
 SIGMA = 0.005
 """Standard deviation of the range noise, metres. It is that of a sensor with a threshold, which is the hard case."""

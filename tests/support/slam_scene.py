@@ -3,8 +3,9 @@
 from functools import cache
 
 import numpy as np
+from support.hard_cones import simulate
 
-from jaxsonar import Ring, Room, simulate
+from jaxsonar import Ring, Room
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.simulation.wheel_odometry import simulate_odometry
