@@ -39,6 +39,9 @@ CLEARANCE = 0.35
 DOOR_WIDTH, WALL_THICKNESS = (1.0, 1.2), 0.15
 """Widths of doors, and thickness of the walls between corridors and rooms, metres."""
 
+HARD_CONES: dict[str, Any] = {"beams": "hard"}
+"""Argument of long scenes: soft beams have three times as many echoes."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -56,7 +59,7 @@ class Scene:
     dropout: float = 0.0
     """Probability that an echo is lost."""
     beams: str = "soft"
-    """As in ``simulate``. Long scenes have hard cones, because soft beams have three times as many echoes."""
+    """As in ``simulate``."""
     seed: int = 0
     """Seed of the noise."""
     has_odometry: bool = True
@@ -109,7 +112,7 @@ def office(seed: int = 0, **errors: Any) -> Scene:
 def echoes_alone(seed: int = 0, **errors: Any) -> Scene:
     """(b) The office without odometry, at a noise of 5 mm."""
     return replace(
-        office(seed, **({"sigma": 0.005, "beams": "hard"} | errors)),
+        office(seed, **(HARD_CONES | {"sigma": 0.005} | errors)),
         name=f"office, echoes alone {seed}",
         has_odometry=False,
     )
@@ -166,7 +169,7 @@ def long_run(seed: int = 0, *, scans: int = 10_000, length: float = 60.0, **erro
         legs.append(_around(plan, rng, laps=1, visited=int(rng.integers(3)), beyond=0.0))
         route += LineString(legs[-1]).length
     scene = _scene(f"long run {seed}", plan.floor, legs, rng, seed, errors)
-    return Scene(scene.name, scene.room, scene.poses[:scans], seed=seed, **{"beams": "hard"} | errors)
+    return Scene(scene.name, scene.room, scene.poses[:scans], seed=seed, **HARD_CONES | errors)
 
 
 # Floor plans
@@ -320,7 +323,7 @@ def _scene(
         _room_of(_polygon(moved)),
         np.column_stack([position, wrap_angle(poses[:, 2] + turn)]),
         seed=seed,
-        **{"beams": "hard"} | errors,
+        **HARD_CONES | errors,
     )
 
 
