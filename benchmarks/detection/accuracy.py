@@ -1,7 +1,8 @@
 """Accuracy of local models in random rooms, with noise, lost and false echoes, compared with two baselines.
 
 Run ``python -m benchmarks.detection.accuracy [--quick] [-o DIR]``. Each condition is simulated once, and all methods
-get the others echoes: those of walls, corners, edges, poles and second order without the lost ones, and false ones.
+get the same echoes: those of walls, corners, edges, poles, columns and second order without the lost ones, crosstalk,
+and false ones.
 Errors are compared with the Cramer-Rao bound (CRB) of all received first-order echoes of a wall, even if a method does
 not use them. A wall counts if it has 8 such echoes, another reflector if it has 4. A line matches a wall within 100 mm
 and 15 deg, one to one. Standard errors assume independent rooms, not independent scans. Most of the time of a quick run
@@ -19,6 +20,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.detection import plots
+from benchmarks.detection.bayes_error import bayes_error
 from benchmarks.detection.conditions import BASE, CONDITIONS, ISOLATED, THREE_WALLS, Condition
 from benchmarks.detection.methods import CLASSIFYING_METHODS, METHODS, Method
 from benchmarks.detection.plots import KINDS
@@ -72,9 +74,7 @@ def run(
     for condition in isolated:
         progress(condition.name)
         chosen_methods = {name: method for name, method in methods.items() if name in CLASSIFYING_METHODS}
-        parts = [
-            scored(single_reflectors(condition, kind, single, seed), chosen_methods, condition.sigma) for kind in KINDS
-        ]
+        parts = [scored(scans, chosen_methods, condition.sigma) for scans in single_scans(condition, single, seed)]
         found["isolated"][condition] = {
             name: replace(parts[0][name], confusion=np.sum([part[name].confusion for part in parts], axis=0))
             for name in chosen_methods
@@ -84,20 +84,28 @@ def run(
     return found
 
 
-def summary(found: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+def single_scans(condition: Condition, count: int, seed: int) -> list[Scans]:
+    """Scans with one reflector, the same number of each kind."""
+    return [single_reflectors(condition, kind, count, seed) for kind in KINDS]
+
+
+def summary(found: dict[str, Any], settings: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """All measures by condition and method, as in the JSON file."""
     measures_of: dict[str, Callable[[Score], dict[str, Any]]] = {
         "conditions": lambda one: one.measures() | {"confusion": one.confusion.tolist()},
         "isolated": lambda one: answers(one.confusion) | {"confusion": one.confusion.tolist()},
         "three": worst_of_three,
     }
-    return {
+    content = {
         part: [
             asdict(condition) | {"methods": {name: measures_of[part](one) for name, one in scores.items()}}
             for condition, scores in found[part].items()
         ]
         for part in measures_of
     }
+    for row, condition in zip(content["isolated"], found["isolated"], strict=True):
+        row["bayes_error"] = bayes_error(single_scans(condition, settings["single"], settings["seed"]), condition.sigma)
+    return content
 
 
 def figures_of(found: dict[str, dict[Condition, dict[str, Score]]]) -> dict[str, Any]:
@@ -128,7 +136,7 @@ def write(found: dict[str, Any], output: Path, settings: dict[str, Any]) -> dict
     """Write accuracy.json and the figures into a folder; returns the content of the file."""
     make_folder(output)
     counts = {"clear_echoes": EVALUATION.lines.min_echoes, "clear_reflector": CLEAR_REFLECTOR, "ranges_m": RANGES}
-    content = {"versions": environment(), "settings": settings | counts, "paper": PAPER, **summary(found)}
+    content = {"versions": environment(), "settings": settings | counts, "paper": PAPER, **summary(found, settings)}
     with atomic_write(output / "accuracy.json") as file:
         json.dump(without_nan(content), file, indent=1, allow_nan=False)
     for name, figure in figures_of(found).items():

@@ -22,6 +22,10 @@ class Condition:
     """Full width of the detection cones, degrees."""
     sensors: int = 24
     """Number of sensors of the ring."""
+    beams: str = "soft"
+    """"soft": paths detect what is loud enough, and there is crosstalk. "hard": only echoes within both cones."""
+    columns: float = 0.0
+    """Expected number of round columns in each random room."""
     quick: bool = False
     """Whether the condition is part of the quick run."""
 
@@ -56,12 +60,15 @@ CONDITIONS = (
     HARD,
     Condition("5 mm, 10 % lost, 50 % false", sigma=0.005, false=0.5),
     Condition("5 mm, cones of 120 deg", sigma=0.005, cone_deg=120.0),
+    Condition("a column in each room", columns=1.0, quick=True),
+    Condition("hard cones", beams="hard", quick=True),
+    Condition("hard cones; 5 mm, 30 % lost, 20 % false", sigma=0.005, lost=0.3, false=0.2, beams="hard"),
 )
 
 ISOLATED = (
-    Condition("one reflector, 1 mm, cones of 60 deg", sigma=0.001, lost=0.0, false=0.0, quick=True),
-    Condition("one reflector, 5 mm, cones of 120 deg", sigma=0.005, lost=0.0, false=0.0, cone_deg=120.0),
+    Condition("one reflector, 1 mm, cones of 60 deg", sigma=0.001, lost=0.0, false=0.0, beams="hard", quick=True),
+    Condition("one reflector, 5 mm, cones of 120 deg", 0.005, lost=0.0, false=0.0, cone_deg=120.0, beams="hard"),
 )
-"""Conditions of scans with one reflector each."""
+"""Conditions of scans with one reflector each. The cones are hard, so that edges and walls have equally many echoes."""
 
 THREE_WALLS = Condition("three walls, 1 mm", sigma=0.001, lost=0.0, false=0.0)

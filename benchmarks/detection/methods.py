@@ -21,7 +21,7 @@ class DetectionResult:
     cov: Float[np.ndarray, "lines 2 2"]
     """Covariances of the lines; NaN if the method gives none."""
     others: Float[np.ndarray, "others 2"]
-    """Distance (metres) and direction (radians) of points and undecided reflectors."""
+    """Distance (metres) and direction (radians) of points and undecided reflectors; of a circle, its nearest point."""
     answers: Int[np.ndarray, " others"]
     """Class of each of them, an index into ANSWERS."""
 
@@ -33,7 +33,10 @@ class DetectionResult:
     @classmethod
     def of_model(cls, model: LocalModel) -> "DetectionResult":
         """The lines, points and undecided reflectors of a local model."""
-        others = [(np.hypot(point.x, point.y), np.arctan2(point.y, point.x)) for point in model.points]
+        others = [
+            (np.hypot(point.x, point.y) - np.nan_to_num(point.radius), np.arctan2(point.y, point.x))
+            for point in model.points
+        ]
         others += [(one.rho, one.theta) for one in model.undecided]
         answers = [ANSWERS.index(point.kind) for point in model.points]
         answers += [ANSWERS.index("undecided")] * len(model.undecided)

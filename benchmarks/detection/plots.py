@@ -12,8 +12,10 @@ from rich.table import Table
 
 from jaxsonar.reports import plot_style
 
-KINDS = ("plane", "corner", "edge")
+KINDS = ("plane", "corner", "edge", "circle")
 """Kinds of reflectors. Poles count as edges."""
+KIND_TITLES = {"edge": "edge, pole"}
+"""Kinds that are named otherwise in tables and figures."""
 ANSWERS = (*KINDS, "undecided", "nothing")
 """Classes that a method can report for a reflector."""
 Series = dict[float, dict[str, dict[str, float]]]
@@ -61,29 +63,27 @@ def robustness_figure(columns: dict[str, Series]) -> Figure:
         return _with_legend(figure, grid[0, 0])
 
 
-def confusion_figure(tables: dict[str, Int[np.ndarray, "4 5"]]) -> Figure:
+def confusion_figure(tables: dict[str, Int[np.ndarray, "rows answers"]]) -> Figure:
     """Confusion matrices of the methods, with the number of reports without a reflector."""
-    across = 3
+    across, kinds = 3, len(KINDS)
     down = -(-len(tables) // across)
     with plot_style.figure_style():
-        figure = Figure(figsize=(9.4, 2.7 * down + 0.4), layout="constrained")
+        figure = Figure(figsize=(9.4, 3.0 * down + 0.4), layout="constrained")
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
         for axes in grid.ravel()[len(tables) :]:
             axes.set_axis_off()
         for (name, table), axes in zip(tables.items(), grid.ravel(), strict=False):
             share = np.full(table.shape, np.nan)
-            share[:3] = table[:3] / np.maximum(table[:3].sum(axis=1, keepdims=True), 1)
+            share[:kinds] = table[:kinds] / np.maximum(table[:kinds].sum(axis=1, keepdims=True), 1)
             axes.imshow(share, cmap="Blues", vmin=0, vmax=1, aspect="auto")
             for (row, column), count in np.ndenumerate(table):
-                if row < 3 or column < 4:
-                    percent = f"\n{100 * share[row, column]:.0f} %" if row < 3 else ""
-                    if not count:
-                        continue
+                if count and (row < kinds or column < len(ANSWERS) - 1):
+                    percent = f"\n{100 * share[row, column]:.0f} %" if row < kinds else ""
                     color = "white" if share[row, column] > 0.5 else plot_style.ROBOT_COLOR
                     axes.text(column, row, f"{count}{percent}", ha="center", va="center", fontsize=7, color=color)
             axes.set_title(name)
             axes.set_xticks(range(len(ANSWERS)), ANSWERS, rotation=30, ha="right", rotation_mode="anchor")
-            axes.set_yticks(range(4), [*KINDS[:2], "edge, pole", "nothing"])
+            axes.set_yticks(range(kinds + 1), [*(KIND_TITLES.get(kind, kind) for kind in KINDS), "nothing"])
             axes.tick_params(length=0)
             axes.spines[:].set_visible(False)
         figure.supxlabel("reported", fontsize=9)
@@ -155,20 +155,25 @@ def tables(content: dict[str, Any]) -> Iterator[Table]:
     for name, got in base["methods"].items():
         table.add_section()
         for row, (kind, cells) in enumerate(zip((*KINDS, "nothing there"), got["confusion"], strict=True)):
-            total = sum(cells) if row < 3 else got["scans"]
-            shares = [f"{100 * k / max(total, 1):.1f}" if row < 3 else f"{k / total:.2f}" for k in cells]
-            what = "edge or pole" if kind == "edge" else kind
-            table.add_row("" if row else name, what, str(total) if row < 3 else "", *shares[: 5 if row < 3 else 4])
+            true = row < len(KINDS)
+            total = sum(cells) if true else got["scans"]
+            shares = [f"{100 * k / max(total, 1):.1f}" if true else f"{k / total:.2f}" for k in cells]
+            what = KIND_TITLES.get(kind, kind)
+            if total:
+                table.add_row("" if row else name, what, *([str(total), *shares] if true else ["", *shares[:-1]]))
     yield table
     table = Table(
-        title=f"One reflector at {s['ranges_m'][0]} to {s['ranges_m'][1]} m: a plane, a right-angled corner or an edge",
-        caption="correct: share of the decided ones",
+        title=f"One reflector at {s['ranges_m'][0]} to {s['ranges_m'][1]} m: a plane, a right-angled corner, an edge "
+        "or a circle of 0.05 to 1 m radius; hard cones",
+        caption="correct: share of the decided ones; Bayes error: of the same scans, if the echoes are known to be of "
+        "one reflector and each kind is equally likely",
     )
     for column in ("", "reflectors", "correct (%)", "undecided (%)", "missed (%)"):
         table.add_column(column, justify="left" if not column else "right")
     for condition in content["isolated"]:
         table.add_section()
-        table.add_row(f"[bold]{condition['name']}[/]")
+        error = f"Bayes error {100 * condition['bayes_error']:.1f} %"
+        table.add_row(f"[bold]{condition['name']}[/]; {error}")
         for name, got in condition["methods"].items():
             shares = f"{100 * got['undecided']:.2f}", f"{100 * got['nothing']:.2f}"
             right = f"{100 * got['right']:.2f} ± {100 * got['right_se']:.2f}"
@@ -214,5 +219,5 @@ def _condition_text(c: dict[str, Any]) -> str:
     """Text of a condition."""
     return (
         f"{c['sigma'] * 1e3:g} mm, {100 * c['lost']:g} % lost, {100 * c['false']:g} % false, "
-        f"cones of {c['cone_deg']:g} deg, {c['sensors']} sensors"
+        f"{c['beams']} cones of {c['cone_deg']:g} deg, {c['sensors']} sensors"
     )

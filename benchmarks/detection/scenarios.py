@@ -20,6 +20,8 @@ POSES = 4
 
 RANGES = 0.5, 1.8
 """Minimum and maximum distance of single reflectors and of the three walls, metres."""
+RADII = 0.05, 0.1, 0.2, 0.5, 1.0
+"""Radii of single circles, metres: from the leg of a table to a round wall, as in the observability of a ring."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Truth:
     room: int
     """Index of the room. Scans of one room are not independent."""
     polar: Float[np.ndarray, "reflectors 2"]
-    """Distance (metres) and direction (radians); rho and theta of a plane."""
+    """Distance (metres) and direction (radians); rho and theta of a plane; the nearest point of a circle."""
     kind: Int[np.ndarray, " reflectors"]
     """Index into KINDS."""
     echoes: Int[np.ndarray, " reflectors"]
@@ -64,7 +66,7 @@ def random_scans(condition: Condition, rooms: int, poses: int, seed: int) -> Sca
     ring, truth, parts = condition.ring, [], []
     for k in range(rooms):
         rng = np.random.default_rng([seed, k])
-        room = random_room(rng)
+        room = random_room(rng, columns=condition.columns)
         pose = np.stack([random_pose(rng, room) for _ in range(poses)])
         echoes = simulate(
             ring,
@@ -73,6 +75,7 @@ def random_scans(condition: Condition, rooms: int, poses: int, seed: int) -> Sca
             sigma=condition.sigma,
             dropout=condition.lost,
             clutter=condition.false,
+            beams=condition.beams,
             seed=int(rng.integers(2**31)),
         )
         parts.append((echoes.scan + k * poses, echoes.path, echoes.range))
@@ -89,45 +92,58 @@ def reflectors_in(
 ) -> tuple[Float[np.ndarray, "reflectors 2"], Int[np.ndarray, " reflectors"], Int[np.ndarray, " echoes"]]:
     """Polar position and kind of all reflectors in the robot frame, and the reflector of each echo.
 
-    Collinear walls, such as the two parts beside a door, are one plane.
+    Echoes of second order, false ones and crosstalk have none (-1). Collinear walls, such as the two parts beside a
+    door, are one plane.
     """
     walls = np.stack(walls_in_robot_frame(room, pose), axis=-1)
     apart = np.abs(walls[:, None] - walls)
     line = ((apart[..., 0] < 1e-6) & (np.minimum(apart[..., 1], 2 * np.pi - apart[..., 1]) < 1e-6)).argmax(axis=1)
     vertices = room.junctions.vertices
-    points = np.concatenate([vertices, vertices, room.poles]) - pose[:2]
-    point_polar = np.stack([np.hypot(*points.T), wrap_angle(np.arctan2(points[:, 1], points[:, 0]) - pose[2])], axis=-1)
+    points = np.concatenate([vertices, vertices, room.poles, room.circles[:, :2]]) - pose[:2]
+    radius = np.append(np.zeros(len(points) - len(room.circles)), room.circles[:, 2])
+    bearing = wrap_angle(np.arctan2(points[:, 1], points[:, 0]) - pose[2])
+    point_polar = np.stack([np.hypot(*points.T) - radius, bearing], axis=-1)
     first = {
         EchoKind.CORNER: len(walls),
         EchoKind.EDGE: len(walls) + len(vertices),
         EchoKind.POLE: len(walls) + 2 * len(vertices),
+        EchoKind.CIRCLE: len(walls) + 2 * len(vertices) + len(room.poles),
     }
     owner = np.full(len(kind), -1)
     plane = kind == EchoKind.PLANE
     owner[plane] = line[reflector[plane]]
     for of, begin in first.items():
         owner[kind == of] = begin + reflector[kind == of]
-    kinds = np.repeat([0, 1, 2, 2], [len(walls), len(vertices), len(vertices), len(room.poles)])
+    counts = len(walls), len(vertices), len(vertices), len(room.poles), len(room.circles)
+    kinds = np.repeat([KINDS.index(kind) for kind in ("plane", "corner", "edge", "edge", "circle")], counts)
     return np.concatenate([walls, point_polar]), kinds, owner
 
 
 def single_reflectors(condition: Condition, kind: str, count: int, seed: int) -> Scans:
-    """Scans of one plane, one right-angled corner or one edge (the end of a thin wall) each."""
+    """Scans of one plane, one right-angled corner, one edge (the end of a thin wall) or one circle each."""
     ring = condition.ring
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     distance, heading = rng.uniform(*RANGES, count), rng.uniform(-np.pi, np.pi, count)
     far = 50.0
+    center, circles = np.zeros((count, 2)), np.zeros((0, 3))
     if kind == "plane":  # the robot is at -x from a wall along y
         walls, bearing = [[[0, -far], [0, far]]], np.full(count, np.pi)
     elif kind == "corner":  # the ring keeps clear of both walls
         clear = float(np.linalg.norm(np.asarray(ring.position), axis=-1).max()) + 0.02
         walls = [[[0, 0], [far, 0]], [[0, 0], [0, far]]]
         bearing = np.pi / 4 + rng.uniform(-1, 1, count) * (np.pi / 4 - np.arcsin(clear / distance))
-    else:
+    elif kind == "edge":
         walls, bearing = [[[0, 0], [-far, 0]]], rng.uniform(-np.pi / 6, np.pi / 6, count)
-    pose = np.stack([distance * np.cos(bearing), distance * np.sin(bearing), heading], axis=-1)
+    else:  # one room with all circles, far from each other
+        walls, bearing = np.zeros((0, 2, 2)), rng.uniform(-np.pi, np.pi, count)
+        circles = np.array([(far * k, 0.0, radius) for k, radius in enumerate(RADII)])
+        center = circles[rng.integers(len(circles), size=count)]
+    away = distance + (center[:, 2] if kind == "circle" else 0.0)
+    place = center[:, :2] + (away * np.array([np.cos(bearing), np.sin(bearing)])).T
+    pose = np.column_stack([place, heading])
     polar = np.stack([distance, wrap_angle(bearing + np.pi - heading)], axis=-1)
-    return echoes_of_one(condition, Room(np.array(walls, dtype=float)), pose, polar, kind, 1, seed)
+    room = Room(np.array(walls, dtype=float), circles=circles)
+    return echoes_of_one(condition, room, pose, polar, kind, 1, seed)
 
 
 def three_walls(condition: Condition, count: int, seed: int) -> Scans:
@@ -142,15 +158,14 @@ def three_walls(condition: Condition, count: int, seed: int) -> Scans:
 
 
 def echoes_of_one(condition: Condition, room: Room, pose, polar, kind: str, poses_per_scan: int, seed: int) -> Scans:
-    """Scans with the echoes of one kind of reflector only, without an amplitude threshold.
+    """Scans with the echoes of one kind of reflector only; with hard cones without an amplitude threshold.
 
     The echoes of each group of ``poses_per_scan`` consecutive poses form one scan.
     """
-    ring = condition.ring
-    no_threshold = Acoustics(threshold=0.0)
-    echoes = simulate(
-        ring, room, pose, sigma=condition.sigma, seed=seed, max_echoes=9, blanking=0.0, acoustics=no_threshold
-    )
+    ring, beams = condition.ring, condition.beams
+    acoustics = Acoustics(threshold=0.0) if beams == "hard" else Acoustics()
+    alone = {"seed": seed, "max_echoes": 9, "blanking": 0.0, "crosstalk": False}
+    echoes = simulate(ring, room, pose, sigma=condition.sigma, beams=beams, acoustics=acoustics, **alone)
     own = echoes.kind == EchoKind[kind.upper()]
     scan, row = np.divmod(echoes.scan[own], poses_per_scan)
     path, kinds = echoes.path[own], np.full(poses_per_scan, KINDS.index(kind))

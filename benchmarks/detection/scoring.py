@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from benchmarks.detection.methods import DetectionResult
-from benchmarks.detection.plots import ANSWERS
+from benchmarks.detection.plots import ANSWERS, KINDS
 from benchmarks.detection.scenarios import Truth
 from jaxsonar.evaluation.line_accuracy import match_lines
 from jaxsonar.evaluation.settings import SETTINGS as EVALUATION
@@ -32,7 +32,7 @@ class Score:
     """Cramer-Rao bound of rho and theta."""
     cov: Float[np.ndarray, "matches 2 2"]
     """Reported covariance; NaN if none."""
-    confusion: Int[np.ndarray, "4 5"]
+    confusion: Int[np.ndarray, "kinds+1 answers"]
     """Confusion matrix: KINDS and "nothing predicted" by ANSWERS."""
 
     @property
@@ -65,7 +65,7 @@ class Score:
 def score(truth: list[Truth], reported: list[DetectionResult]) -> Score:
     """Compare the results with the truth, scan by scan."""
     counts, rows, covs = [], [np.zeros((0, 5))], [np.zeros((0, 2, 2))]
-    confusion = np.zeros((4, 5), dtype=int)
+    confusion = np.zeros((len(KINDS) + 1, len(ANSWERS)), dtype=int)
     for k, (true, result) in enumerate(zip(truth, reported, strict=True)):
         plane = true.kind == 0
         walls, clear = true.polar[plane], true.echoes[plane] >= EVALUATION.lines.min_echoes
@@ -92,17 +92,17 @@ def score(truth: list[Truth], reported: list[DetectionResult]) -> Score:
     )
 
 
-def confusion_of(true: Truth, result: DetectionResult) -> Int[np.ndarray, "4 5"]:
+def confusion_of(true: Truth, result: DetectionResult) -> Int[np.ndarray, "kinds+1 answers"]:
     """Confusion matrix of one scan; the last row counts reports without a reflector."""
     polar = np.concatenate([result.lines, result.others])
     answer = np.append(np.zeros(len(result.lines), dtype=int), result.answers)
-    table = np.zeros((4, 5), dtype=int)
+    table = np.zeros((len(KINDS) + 1, len(ANSWERS)), dtype=int)
     report, reflector = match_lines(polar, true.polar)
     predicted = np.full(len(true.kind), ANSWERS.index("nothing"))
     predicted[reflector] = answer[report]
     clear = true.echoes >= CLEAR_REFLECTOR
     np.add.at(table, (true.kind[clear], predicted[clear]), 1)
-    np.add.at(table[3], np.delete(answer, report), 1)
+    np.add.at(table[len(KINDS)], np.delete(answer, report), 1)
     return table
 
 
@@ -136,18 +136,18 @@ def _quantile(values: np.ndarray, share: float) -> float:
     return float(np.quantile(values, share)) if len(values) else float("nan")
 
 
-def answers(confusion: Int[np.ndarray, "4 5"]) -> dict[str, float]:
+def answers(confusion: Int[np.ndarray, "kinds+1 answers"]) -> dict[str, float]:
     """Rates of a confusion matrix: correct among decided; undecided and missed among all reflectors."""
-    table = confusion[:3]
-    decided, total = int(table[:, :3].sum()), int(table.sum())
-    right = int(np.trace(table[:, :3]))
+    table, kinds = confusion[: len(KINDS)], len(KINDS)
+    decided, total = int(table[:, :kinds].sum()), int(table.sum())
+    right = int(np.trace(table[:, :kinds]))
     share = right / decided if decided else float("nan")
     return {
         "reflectors": total,
         "right": share,
         "right_se": float(np.sqrt(share * (1 - share) / decided)) if decided else float("nan"),
-        "undecided": int(table[:, 3].sum()) / total,
-        "nothing": int(table[:, 4].sum()) / total,
+        "undecided": int(table[:, ANSWERS.index("undecided")].sum()) / total,
+        "nothing": int(table[:, ANSWERS.index("nothing")].sum()) / total,
     }
 
 

@@ -39,6 +39,9 @@ CLEARANCE = 0.35
 DOOR_WIDTH, WALL_THICKNESS = (1.0, 1.2), 0.15
 """Widths of doors, and thickness of the walls between corridors and rooms, metres."""
 
+HARD_CONES: dict[str, Any] = {"beams": "hard"}
+"""Argument of long scenes: soft beams have three times as many echoes."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -55,6 +58,8 @@ class Scene:
     """False echoes per true echo."""
     dropout: float = 0.0
     """Probability that an echo is lost."""
+    beams: str = "soft"
+    """As in ``simulate``."""
     seed: int = 0
     """Seed of the noise."""
     has_odometry: bool = True
@@ -64,7 +69,7 @@ class Scene:
     def simulation(self) -> Simulation:
         """The echoes and the reflector of each."""
         errors = {"sigma": self.sigma, "clutter": self.clutter, "dropout": self.dropout, "seed": self.seed}
-        return simulate(self.ring, self.room, self.poses, **errors)
+        return simulate(self.ring, self.room, self.poses, beams=self.beams, **errors)
 
     @property
     def distance_traveled(self) -> float:
@@ -106,7 +111,11 @@ def office(seed: int = 0, **errors: Any) -> Scene:
 
 def echoes_alone(seed: int = 0, **errors: Any) -> Scene:
     """(b) The office without odometry, at a noise of 5 mm."""
-    return replace(office(seed, **({"sigma": 0.005} | errors)), name=f"office, echoes alone {seed}", has_odometry=False)
+    return replace(
+        office(seed, **(HARD_CONES | {"sigma": 0.005} | errors)),
+        name=f"office, echoes alone {seed}",
+        has_odometry=False,
+    )
 
 
 def loop(seed: int = 0, **errors: Any) -> Scene:
@@ -160,7 +169,7 @@ def long_run(seed: int = 0, *, scans: int = 10_000, length: float = 60.0, **erro
         legs.append(_around(plan, rng, laps=1, visited=int(rng.integers(3)), beyond=0.0))
         route += LineString(legs[-1]).length
     scene = _scene(f"long run {seed}", plan.floor, legs, rng, seed, errors)
-    return Scene(scene.name, scene.room, scene.poses[:scans], seed=seed, **errors)
+    return Scene(scene.name, scene.room, scene.poses[:scans], seed=seed, **HARD_CONES | errors)
 
 
 # Floor plans
@@ -314,7 +323,7 @@ def _scene(
         _room_of(_polygon(moved)),
         np.column_stack([position, wrap_angle(poses[:, 2] + turn)]),
         seed=seed,
-        **errors,
+        **HARD_CONES | errors,
     )
 
 

@@ -7,15 +7,18 @@ import pytest
 
 from benchmarks.detection import accuracy, plots, scenarios, scoring
 from benchmarks.detection.baselines import PairConsensus, PointHough, arcs_of_scans, distinct
+from benchmarks.detection.bayes_error import bayes_error
 from benchmarks.detection.conditions import BASE, CONDITIONS, HARD, ISOLATED, Condition
 from benchmarks.detection.methods import METHODS, DetectionResult
 from benchmarks.detection.plots import ANSWERS, KINDS
 from benchmarks.detection.scenarios import Truth
 from benchmarks.detection.scoring import Score, score
-from jaxsonar import Ring
+from jaxsonar import LocalModel, Ring, random_pose, random_room, simulate
+from jaxsonar.detection.local_model import Point
 from jaxsonar.geometry.se2 import wrap_angle
+from jaxsonar.simulation.traced_echoes import EchoKind
 
-EXACT = Condition("", sigma=0.0, lost=0.0, false=0.0)
+EXACT = Condition("", sigma=0.0, lost=0.0, false=0.0, beams="hard")
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +81,7 @@ def gaussian(rng, *, count, scale=1.0):
     bound = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     walls = np.ones(count, dtype=int)
     counts = np.stack([walls, walls, 0 * walls, 0 * walls], axis=-1)
-    confusion = np.zeros((4, 5), dtype=int)
+    confusion = np.zeros((len(KINDS) + 1, len(ANSWERS)), dtype=int)
     return Score(np.arange(count) // 5, counts, np.arange(count), error, bound, cov, confusion)
 
 
@@ -158,13 +161,31 @@ def test_a_perfect_result_has_a_perfect_score():
     found = score(scans.truth, perfect)
     assert found.measures()["recall"] == 1
     assert found.measures()["false_per_scan"] == found.measures()["rmse_rho_mm"] == 0
-    assert np.trace(found.confusion[:, :3]) == found.confusion.sum() > 0
+    assert np.trace(found.confusion[:, : len(KINDS)]) == found.confusion.sum() > 0
 
 
 def test_rooms_and_poses_are_the_same_in_every_condition():
     some = [scenarios.random_scans(c, 2, 2, seed=3) for c in (BASE, Condition("", sensors=32), HARD)]
     places = [{tuple(np.round(polar, 9)) for true in scans.truth for polar in true.polar} for scans in some]
     assert all(len(places[0] & other) > 0.6 * min(len(places[0]), len(other)) for other in places[1:])
+
+
+def shortest_over_circle(a, b, at, n, length):
+    """Shortest path lengths over a circle whose nearest point is ``at``, of the radius that fits them best."""
+    turn = np.linspace(-0.6, 0.6, 20_001)
+    best = None
+    for radius in scenarios.RADII:
+        surface = (
+            at
+            + radius * n
+            - radius
+            * np.stack([n[0] * np.cos(turn) - n[1] * np.sin(turn), n[1] * np.cos(turn) + n[0] * np.sin(turn)], axis=-1)
+        )
+        ways = [np.linalg.norm(end[:, None] - surface, axis=-1) for end in (a, b)]
+        shortest = (ways[0] + ways[1]).min(axis=1)
+        if best is None or np.abs(shortest - length).max() < np.abs(best - length).max():
+            best = shortest
+    return best
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -182,8 +203,9 @@ def test_single_reflectors_produce_echoes_from_their_position(kind):
             "plane": np.linalg.norm(a + 2 * (at - a) @ np.outer(n, n) - b, axis=-1),
             "corner": 2 * np.linalg.norm(middle - at, axis=-1),
             "edge": np.linalg.norm(a - at, axis=-1) + np.linalg.norm(b - at, axis=-1),
+            "circle": shortest_over_circle(a, b, at, n, 2 * log.range[own]),
         }[kind]
-        np.testing.assert_allclose(2 * log.range[own], method, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(2 * log.range[own], method, rtol=0, atol=1e-7 if kind == "circle" else 1e-9)
         assert true.echoes.tolist() == [len(method)]
         assert len(method) >= 4
 
@@ -199,6 +221,43 @@ def test_three_walls_are_at_least_60_degrees_apart():
     assert found["all_found"] == 1
     assert found["rho_mm_p50"] == pytest.approx(1.0)
     assert found["theta_deg_p90"] == pytest.approx(np.degrees(0.01))
+
+
+def test_columns_own_their_echoes_and_crosstalk_none():
+    condition = Condition("", sigma=0.0, lost=0.0, false=0.0, columns=1.0)
+    rng = np.random.default_rng(6)
+    room = random_room(rng, columns=1.0)
+    pose = np.stack([random_pose(rng, room) for _ in range(12)])
+    echoes = simulate(condition.ring, room, pose)
+    seen = 0
+    for k in range(len(pose)):
+        mine = echoes.scan == k
+        polar, kind, owner = scenarios.reflectors_in(room, pose[k], echoes.kind[mine], echoes.reflector[mine])
+        assert (owner[echoes.kind[mine] == EchoKind.CROSSTALK] == -1).all()
+        circle = np.flatnonzero(echoes.kind[mine] == EchoKind.CIRCLE)
+        assert (kind[owner[circle]] == KINDS.index("circle")).all()
+        center, radius = room.circles[0, :2] - pose[k, :2], room.circles[0, 2]
+        assert polar[-1, 0] == pytest.approx(np.hypot(*center) - radius)
+        seen += len(circle)
+    assert seen > 10
+    assert (echoes.kind == EchoKind.CROSSTALK).any()
+
+
+def test_the_nearest_point_of_a_reported_circle():
+    circle = Point(3.0, 4.0, "circle", np.eye(3), 9, np.zeros((9, 2), int), 0.9, radius=0.5)
+    corner = Point(0.0, 2.0, "corner", np.eye(2), 9, np.zeros((9, 2), int), 0.9)
+    result = DetectionResult.of_model(LocalModel(0, 0.0, (), points=(circle, corner)))
+    np.testing.assert_allclose(result.others, [[4.5, np.arctan2(4, 3)], [2.0, np.pi / 2]])
+    assert [ANSWERS[k] for k in result.answers] == ["circle", "corner"]
+
+
+def test_the_bayes_error_falls_with_the_noise():
+    errors = []
+    for sigma in (1e-5, 0.02):
+        scans = accuracy.single_scans(Condition("", sigma, lost=0.0, false=0.0, beams="hard"), 12, seed=7)
+        errors.append(bayes_error(scans, sigma))
+    assert errors[0] < 0.1
+    assert 0.2 < errors[1] <= 0.75
 
 
 def test_rings_of_conditions():
@@ -219,7 +278,7 @@ def test_a_tiny_run_writes_every_file(tmp_path):
         for result in METHODS["consensus of pairs"](ring, log, sigma):
             cov = np.zeros((len(result.lines), 2, 2)) + np.diag([1e-6, 1e-4])
             other = noise.uniform(0.5, 1.5, (2, 2))
-            yield DetectionResult(result.lines, cov, other, np.array([1, 3]))
+            yield DetectionResult(result.lines, cov, other, np.array([1, ANSWERS.index("undecided")]))
 
     settings = {"rooms": 1, "poses": 2, "single": 3, "seed": 0}
     result = []

@@ -107,11 +107,11 @@ def run_in_group(command, folder, environment):
 
 
 def check_first_example(output, folder):
-    assert re.fullmatch(r"(wall 1\.\d+ m away.*\n){3}8 walls, 10\.4 m\n", output)
+    assert re.fullmatch(r"(wall 1\.\d+ m away.*\n){3}8 walls, 11\.4 m\n", output)
 
 
 def check_errors_of_slam(output, folder):
-    assert re.search(r"8\.\d mm, 0\.4\d deg \(RMS of 17 poses\)", output)
+    assert re.search(r"8\.\d mm, 0\.3\d deg \(RMS of 17 poses\)", output)
 
 
 def check_corridor_table(output, folder):
