@@ -1,4 +1,4 @@
-"""Scans for the measurements: simulated in random rooms with hard cones, with the echoes that these give or with about 64."""
+"""Scans for the measurements: simulated with hard cones in random rooms, with their echoes or with about 64."""
 
 from typing import NamedTuple
 

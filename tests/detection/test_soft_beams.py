@@ -62,6 +62,7 @@ def test_crosstalk_does_not_become_walls(random_scans):
 
 def test_simultaneous_transmitters_share_a_firing_group():
     found = simultaneous_transmitters(RING)
+    assert found is not None
     tx, rx = RING.paths.T
     group = RING.firing_group_of_sensor
     assert found.shape == (len(tx), 2)
