@@ -13,7 +13,11 @@ from jaxsonar.hardware.errors import SonarError
 
 _PROPERTIES = ("kind", "name", "id", "radius")
 """Properties of the features of a room."""
-_KINDS_OF_MAPS = ("segment", "corner", "edge")
+_CIRCLE_PROPERTIES_OF_MAPS = ("cov", "echoes", "scans", "probability")
+"""Further properties of circles in maps."""
+_SKIPPED_POINTS = ("corner", "edge", "undecided")
+"""Kinds of points of maps that are no reflectors of a room."""
+_KINDS_OF_MAPS = ("segment", *_SKIPPED_POINTS)
 """Kinds of features of maps, which have properties of their own."""
 _KINDS_OF_WALLS = (None, "wall", "segment")
 """Kinds of lines and polygons; without a kind, they are walls."""
@@ -25,7 +29,8 @@ def load_room(filename: str | os.PathLike[str]) -> Room:
     The pieces of LineString and MultiLineString and the rings of Polygon and MultiPolygon are walls, named by the
     property ``name`` of their feature; their ``kind`` is "wall", "segment" (in maps) or absent. A Point with the
     property ``kind`` "pole" is a pole; one of kind "circle" with the property ``radius`` (metres) is a round column.
-    Points of kind "corner" and "edge", which maps contain, are skipped, because walls imply them.
+    Points of kind "corner" and "edge", which maps contain, are skipped, because walls imply them, and those of kind
+    "undecided", too.
 
     Raises:
         SonarError: the file cannot be read, or a feature is of another type; the message names file, feature and cause.
@@ -67,16 +72,17 @@ def _feature(properties: dict[str, Any], form: str, coordinates: Any) -> tuple[s
     name, kind = properties.get("name"), properties.get("kind")
     if not isinstance(name, str | None):
         raise SonarError(f"name {name!r:.60}; allowed is text")
-    if kind not in _KINDS_OF_MAPS and (unknown := [key for key in properties if key not in _PROPERTIES]):
+    known = _PROPERTIES + (_CIRCLE_PROPERTIES_OF_MAPS if kind == "circle" else ())
+    if kind not in _KINDS_OF_MAPS and (unknown := [key for key in properties if key not in known]):
         raise SonarError(f"unknown property {shown(unknown[0], 60)!r}; allowed are {', '.join(_PROPERTIES)}")
     if form == "Point":
-        if kind not in ("pole", "circle", "corner", "edge"):
-            allowed = 'allowed is "pole" or "circle" ("corner" and "edge" are skipped)'
+        if kind not in ("pole", "circle", *_SKIPPED_POINTS):
+            allowed = 'allowed is "pole" or "circle" ("corner", "edge" and "undecided" are skipped)'
             raise SonarError(f"Point of kind {kind!r:.60}; {allowed}")
         return name or "", [], [] if kind in _KINDS_OF_MAPS else [_round(properties, positions([coordinates])[0])]
     if "radius" in properties:
         raise SonarError(f"radius of a {form:.60}; allowed is it with a Point of kind circle")
-    if kind in ("pole", "circle", "corner", "edge"):
+    if kind in ("pole", "circle", *_SKIPPED_POINTS):
         raise SonarError(f"{form:.60} of kind {kind!r}; allowed with this kind is a Point")
     if kind not in _KINDS_OF_WALLS:
         raise SonarError(f'{form:.60} of kind {kind!r:.60}; allowed is "wall" ("segment" in maps), or no kind')
