@@ -10,8 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsonar import Room, load_room, random_pose, random_room, save_room
-from jaxsonar.fileio.geojson import feature as a_feature
-from jaxsonar.fileio.geojson import write_features
 from jaxsonar.floor_plans.room import laser_ranges, walls_in_robot_frame
 from jaxsonar.geometry.segments import point_to_segments
 from jaxsonar.hardware.errors import SonarError
@@ -387,14 +385,9 @@ def test_without_columns_a_seed_gives_the_rooms_that_it_always_gave():
 
 def test_a_map_with_circles_is_a_room(tmp_path):
     circle = {"radius": 0.2, "cov": np.eye(3).tolist(), "echoes": 9, "scans": [0], "probability": {"circle": 1.0}}
-    wall = a_feature(
-        "LineString", [[0, 0], [2, 0]], kind="segment", rho=0.0, theta=1.5708, echoes=9, scans=[0], ends=[]
-    )
-    points = [
-        a_feature("Point", [1, 1], kind="circle", **circle),
-        a_feature("Point", [2, 2], kind="undecided", cov=None),
-    ]
-    write_features([wall, *points], tmp_path / "map.geojson")
-    room = load_room(tmp_path / "map.geojson")
+    wall = feature("LineString", [[0, 0], [2, 0]], kind="segment", rho=0.0, echoes=9, scans=[0], ends=[])
+    column = feature("Point", [1, 1], kind="circle", **circle)
+    undecided = feature("Point", [2, 2], kind="undecided", cov=None)
+    room = load_room(write(tmp_path / "map.geojson", wall, column, undecided))
     assert room.circles.tolist() == [[1, 1, 0.2]]
     assert (len(room.walls), len(room.poles)) == (1, 0)
