@@ -47,7 +47,7 @@ def make_logs(folder: Path, scans: int, *, each: int = SCANS_PER_LOG, seed: int 
     for k in range(-(-min(DISTINCT, each) // 100)):
         room = random_room(rng)
         poses = np.stack([random_pose(rng, room) for _ in range(100)])
-        exact += list(simulate(ring, room, poses, sigma=0.0, seed=seed + k).as_log(ring, poses))
+        exact += list(simulate(ring, room, poses, sigma=0.0, seed=seed + k, beams="hard").as_log(ring, poses))
     files = []
     for first in track(range(0, scans, each), description="logs", console=Console(stderr=True)):
         rows = np.arange(first, min(first + each, scans))

@@ -1,4 +1,4 @@
-"""Scans for the measurements: simulated in random rooms, with the echoes that the rooms give or with about 64."""
+"""Scans for the measurements: simulated with hard cones in random rooms, with their echoes or with about 64."""
 
 from typing import NamedTuple
 
@@ -34,7 +34,9 @@ def scans_of_random_rooms(ring: Ring, count: int, *, seed: int = 0) -> Float[np.
     for k in range(ROOMS):
         room = random_room(rng)
         poses = np.stack([random_pose(rng, room) for _ in range(-(-count // ROOMS))])
-        parts.append(simulate(ring, room, poses, sigma=SIGMA, seed=seed + k).dense(len(ring.paths), SLOTS))
+        parts.append(
+            simulate(ring, room, poses, sigma=SIGMA, seed=seed + k, beams="hard").dense(len(ring.paths), SLOTS)
+        )
     order = rng.permutation(sum(len(part) for part in parts))[:count]
     return np.concatenate(parts)[order].astype(np.float32)
 

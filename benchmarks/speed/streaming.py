@@ -43,7 +43,7 @@ def endless(scans: float) -> Iterator[Message]:
     """Messages of the office, repeated with continuing sequence numbers and times."""
     office = load_office()
     stamps = SCAN * np.arange(len(office.poses))
-    simulation = simulate(office.ring, office.room, office.poses, sigma=0.002, seed=0, stamps=stamps)
+    simulation = simulate(office.ring, office.room, office.poses, sigma=0.002, seed=0, stamps=stamps, beams="hard")
     messages = list(log_messages(simulation.as_log(office.ring, office.poses), office.ring))
     lap_us = round(1e6 * SCAN * len(stamps))
     for k in itertools.count():

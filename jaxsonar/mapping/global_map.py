@@ -132,8 +132,7 @@ class GlobalMap:
 
     def _taken(self, rows: Bool[np.ndarray, " rows"], names: list[str]) -> "GlobalMap":
         columns: dict[str, Any] = {name: getattr(self, name) for name in names}
-        if not self.end_kinds:
-            columns.pop("end_kinds", None)
+        columns = {name: value for name, value in columns.items() if len(value) == len(rows)}  # others are omitted
         for name, value in columns.items():
             is_array = isinstance(value, np.ndarray)
             columns[name] = value[rows] if is_array else tuple(value[k] for k in np.flatnonzero(rows).tolist())

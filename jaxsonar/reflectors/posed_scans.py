@@ -55,7 +55,7 @@ def _place(scan: Scan) -> Place:
 
 
 def _order(scan: Scan) -> tuple[float, int]:
-    return (scan.scan if np.isnan(scan.stamp) else scan.stamp, scan.scan)
+    return (float(scan.scan if np.isnan(scan.stamp) else scan.stamp), int(scan.scan))
 
 
 def _latest(scans: tuple[Scan, ...]) -> tuple[Scan, ...]:

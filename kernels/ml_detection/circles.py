@@ -184,7 +184,7 @@ def _evidence(
     volume = 1.5 * jnp.log(2 * jnp.pi) + 0.5 * jnp.log(jnp.maximum(jnp.linalg.det(covariance), 1e-30))
     gain = jnp.where(supported, echoes.log_ratio, 0).sum()
     evidence = gain + settings.missed_weight_point * missed + settings.prior_weight * prior + volume
-    evidence -= jnp.where(hears_outside_cones(scene, settings), 0, settings.circle_handicap)
+    evidence -= jnp.where(hears_outside_cones(scene), 0, settings.circle_handicap)
     return jnp.where(supported.sum() >= settings.min_circle_echoes, evidence, -jnp.inf)
 
 

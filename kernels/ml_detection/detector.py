@@ -269,7 +269,7 @@ def evaluate_hypotheses(
 
     def plane(x: Float[Array, "2"]) -> Hypotheses:
         one = refine(scan, plane_echo, x, scene, clutter, settings)
-        outside = hears_outside_cones(scene, settings)
+        outside = hears_outside_cones(scene)
         weight = jnp.where(outside, 1, settings.missed_weight_plane)
         missed = weight * plane_missed_log_likelihood(scan, one, scene, settings)
         one = with_base(one, missed, plane_log_prior(scan, one, scene, settings))

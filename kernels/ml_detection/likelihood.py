@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..detection_cones import audibility, echo_level
+from ..detection_cones import DEAF, audibility, echo_level
 from ..measurement_model import CORNER, PLANE, corner_echo, echo_of_kind, plane_echo, second_order_echo
 from ..planar_geometry import normal, tangent, wrap_angle
 from ..sensor_array import EchoPaths
@@ -194,18 +194,18 @@ def point_missed_log_likelihood(
     mean, sd = strength
     most = settings.max_strength_deviation
     deviation = jnp.clip((border + scene.silence_threshold - mean) / sd, -most, most)
-    faintness = jnp.where(hears_outside_cones(scene, settings) & (is_edge > 0), -0.5 * deviation**2, 0)
+    faintness = jnp.where(hears_outside_cones(scene) & (is_edge > 0), -0.5 * deviation**2, 0)
     inside = jnp.maximum(inside, -_max_occlusion_cost(scene, settings))
     return inside + jnp.maximum(outside, -settings.max_faint_edge_cost) + faintness
 
 
-def hears_outside_cones(scene: SceneEstimate, settings: DetectionSettings) -> Bool[Array, ""]:
+def hears_outside_cones(scene: SceneEstimate) -> Bool[Array, ""]:
     """Whether the scan has echoes of walls outside of the cones, as far as known."""
-    return scene.silence_threshold < settings.deaf_threshold
+    return scene.silence_threshold < DEAF
 
 
 def _max_occlusion_cost(scene: SceneEstimate, settings: DetectionSettings) -> Float[Array, ""]:
-    outside = hears_outside_cones(scene, settings)
+    outside = hears_outside_cones(scene)
     return jnp.where(outside, settings.max_occlusion_cost_outside, settings.max_occlusion_cost)
 
 

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..detection_cones import DEAF, echo_level, visibility
 from ..detection_cones import SETTINGS as CONES
-from ..detection_cones import echo_level, visibility
 from ..measurement_model import CORNER, PLANE, plane_echo
 from ..sensor_array import EchoPaths
 from .likelihood import alignment_ratio
@@ -117,7 +117,7 @@ def estimate_threshold(
     outside, level = each_path(lines, extent, scan.paths)
     outside = outside if scan.measured is None else outside & scan.measured[None]
     heard = jnp.zeros_like(outside).at[:, scan.path_index].max(involved)
-    grid = jnp.asarray((settings.deaf_threshold, *settings.thresholds), level.dtype)
+    grid = jnp.asarray((DEAF, *settings.thresholds), level.dtype)
     audible = jax.nn.sigmoid((level[..., None] - grid[None, None]) / CONES.level_sd)
     stray = settings.stray_probability
     probability = stray + (scene.detection_probability - 2 * stray) * audible

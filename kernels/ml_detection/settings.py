@@ -70,10 +70,8 @@ class DetectionSettings:
     initial_threshold: float = -30.0
     """First guess of the level of the faintest wall echoes outside the cones, dB (``detection_cones.echo_level``). No
     echo is expected there until the threshold is estimated. Chosen by hand."""
-    deaf_threshold: float = 100.0
-    """Threshold of a ring that receives nothing outside its cones, dB."""
     thresholds: tuple[float, ...] = (-6.0, -10.0, -14.0, -18.0, -22.0, -26.0, -30.0, -34.0, -38.0)
-    """Other thresholds among which the most likely one is chosen for each scan, dB."""
+    """Thresholds, beside infinity, among which the most likely one is chosen for each scan, dB."""
     outside_cones: float = 0.05
     """Visibility below which a path counts as outside of the cones; chosen by hand."""
     stray_probability: float = 0.01
@@ -142,7 +140,7 @@ class DetectionSettings:
     crossing_penalty: float = 2.0
     """Cost of a wall whose foot is on the line of another wall, nats: it is probably a corner."""
 
-    occluded_penalty: float = 8.0
+    occluded_penalty: float = 40.0
     """Cost of a reflector behind a detected wall, nats: sound does not pass through walls. Chosen by hand."""
     occlusion_margin: float = 0.03
     """Metres by which a detected wall extends beyond its outermost echoes; chosen by hand."""

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..detection_cones import DEAF
 from ..hough_voting import CrosstalkPaths
 from ..measurement_model import PredictedEcho
 from ..sensor_array import EchoPaths
@@ -78,7 +79,7 @@ class SceneEstimate(NamedTuple):
             aligned_fraction=jnp.asarray(settings.aligned_fraction, sigma.dtype),
             sigma=sigma,
             threshold=jnp.asarray(settings.initial_threshold, sigma.dtype),
-            silence_threshold=jnp.asarray(settings.deaf_threshold, sigma.dtype),
+            silence_threshold=jnp.asarray(DEAF, sigma.dtype),
         )
 
 
