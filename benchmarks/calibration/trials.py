@@ -48,12 +48,14 @@ class Condition:
     """False echoes per true echo."""
     lost: float = 0.0
     """Probability that an echo is lost."""
+    beams: str = "soft"
+    """As in ``simulate``."""
 
 
 CONDITIONS = (
     Condition("poses known"),
-    Condition("poses estimated, no odometry", poses="estimate"),
-    Condition("poses estimated, 2 % odometry", poses="estimate", odometry=0.02),
+    Condition("poses estimated, no odometry", poses="estimate", beams="hard"),
+    Condition("poses estimated, 2 % odometry", poses="estimate", odometry=0.02, beams="hard"),
     Condition("hard start: 2 %, 20 mm, poses known", offset=0.003, extra=0.02, speed=0.02),
     Condition("20 % false, 10 % lost, poses known", false=0.2, lost=0.1),
 )
@@ -86,7 +88,16 @@ def trial(condition: Condition, seed: int, place: str) -> Trial:
     offset[for_ring.choice(count, 2, replace=False)] += condition.extra * np.array([1.0, -1.0])
     speed = float(office.ring.speed_of_sound) * (1 + condition.speed * for_ring.choice([-1.0, 1.0]))
     true = replace(office.ring, range_offset=offset, speed_of_sound=speed)
-    simulation = simulate(true, room, poses, sigma=SIGMA, clutter=condition.false, dropout=condition.lost, seed=seed)
+    simulation = simulate(
+        true,
+        room,
+        poses,
+        sigma=SIGMA,
+        clutter=condition.false,
+        dropout=condition.lost,
+        seed=seed,
+        beams=condition.beams,
+    )
     given = poses
     if condition.poses == "estimate":
         odometry = condition.odometry
