@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .detection_cones import SETTINGS, visibility
+from .detection_cones import DEAF, SETTINGS, echo_level, visibility
 from .landmarks import AnyArray, Landmarks, landmark_echo, landmark_in_robot_frame
-from .measurement_model import PLANE
+from .measurement_model import EDGE, PLANE
 from .planar_geometry import dot, normal, tangent
 from .sensor_array import EchoPaths, widen_cones
 
@@ -144,25 +144,32 @@ def expected_ranges_with_variance(belief: Belief, paths: EchoPaths) -> ExpectedR
 
 
 @jax.jit
-def expected_ranges(pose: Float[Array, "3"], landmarks: Landmarks, paths: EchoPaths) -> Float[Array, "landmarks paths"]:
+def expected_ranges(
+    pose: Float[Array, "3"], landmarks: Landmarks, paths: EchoPaths, threshold: float | Float[Array, ""] = DEAF
+) -> Float[Array, "landmarks paths"]:
     """Ranges that paths measure of landmarks, metres; infinite where a path cannot receive the echo.
 
     Args:
         pose: frame_from_robot.
         landmarks: (landmarks,) in that frame.
         paths: (paths,) in the robot frame; their cones are widened here (``association_cone_factor``).
+        threshold: level of the faintest echoes that are heard outside of the cones, dB (``echo_level``); inf: none.
     """
+    nominal = paths.cone
     paths = widen_cones(paths, SETTINGS.association_cone_factor)
 
-    def expected_range(landmark: Landmarks, path: EchoPaths):
+    def expected_range(landmark: Landmarks, path: EchoPaths, cone: Float[Array, "2"]):
         echo = landmark_echo(landmark_in_robot_frame(pose, landmark), landmark, path)
         along = dot(tangent(landmark.parameters[1]), pose[:2] - landmark.anchor) + echo.footpoint
         margin = EKF_SETTINGS.wall_margin
         beside = (along < landmark.extent[0] - margin) | (along > landmark.extent[1] + margin)
-        visible = (visibility(echo, path) > 0) & ((landmark.kind != PLANE) | ~beside)
-        return jnp.where(visible, echo.range, jnp.inf)
+        level = echo_level(echo, eqx.tree_at(lambda p: p.cone, path, cone))
+        level += jnp.where(landmark.kind == EDGE, SETTINGS.edge_level_db, 0)
+        heard = (visibility(echo, path) > 0) | (echo.exists & (level > threshold))
+        return jnp.where(heard & ((landmark.kind != PLANE) | ~beside), echo.range, jnp.inf)
 
-    return jax.vmap(jax.vmap(expected_range, in_axes=(None, 0)), in_axes=(0, None))(landmarks, paths)
+    each_path = jax.vmap(expected_range, in_axes=(None, 0, 0))
+    return jax.vmap(each_path, in_axes=(0, None, None))(landmarks, paths, nominal)
 
 
 def _range_variances(belief: Belief, paths: EchoPaths) -> Float[Array, "landmarks paths"]:

@@ -43,7 +43,7 @@ TABLES: dict[str, dict[str, ParquetColumn]] = {
         "left_out": ParquetColumn("int64", "", "of them of pairs of sensors that the ring does not listen to"),
         "in_range": ParquetColumn("int64", "", "of them within the maximum range, without those left out"),
         "lines": ParquetColumn("int64", "", "rows in the table of lines"),
-        "points": ParquetColumn("int64", "", "corners and edges in the table of points"),
+        "points": ParquetColumn("int64", "", "corners, edges and circles in the table of points"),
         "undecided": ParquetColumn("int64", "", "reflectors of undecided kind in the table of points"),
         "sigma": ParquetColumn("float64", "m", "noise of the ranges, given or estimated; method ml"),
         "empty": ParquetColumn("string", "", "why there is no line"),

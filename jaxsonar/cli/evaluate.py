@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> None:
     points = load_points(options.map, kinds=(*POINT_KINDS, "pole"))
     there, kinds, radii = load_points(options.reference, kinds=tuple(KIND_OF_REFERENCE))
     of_points = evaluate_points(*points, walls, there, kinds, np.nan_to_num(radii), reference, gate=options.gate)
-    has_points = bool(len(there) or len(of_points.false))
+    has_points = bool(len(there))
     if options.json:
         more = {"points": of_points.as_json()} if has_points else {}
         write_json(evaluation.as_json() | more, options.json)

@@ -113,7 +113,7 @@ class Undecided:
     theta: float
     """Direction of the normal of that line, radians, in [-pi, pi)."""
     x: float
-    """Position as a corner or edge, metres; the middle of the observed segment if a plane is the most likely kind."""
+    """Position as a point (of a circle: its nearest one), metres; the middle of the observed segment if a plane is the most likely kind."""
     y: float
     """Metres."""
     probability: dict[str, float]
@@ -143,7 +143,7 @@ class LocalModel:
     empty: str = ""
     """Reason why there is no line; empty if there is one."""
     points: tuple[Point, ...] = ()
-    """Corners and edges, strongest first; none with method hough."""
+    """Corners, edges and circles, strongest first; none with method hough."""
     undecided: tuple[Undecided, ...] = ()
     """Reflectors of uncertain kind; none with method hough, which takes every reflector for a wall."""
     sigma: float = float("nan")

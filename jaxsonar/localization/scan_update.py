@@ -185,7 +185,7 @@ def _match(
 
     ``annealing`` is the fraction of the variance of the predicted pose that is added to that of the residuals.
     """
-    expected = kernels.expected_ranges(pose, landmarks, scan.paths)
+    expected = kernels.expected_ranges(pose, landmarks, scan.paths, SETTINGS.hearing_threshold)
     expected = jnp.where(is_near[:, None], expected, jnp.inf)
     distance = jnp.abs(expected - scan.ranges[None])
     best = (distance / jnp.sqrt(covariance[:, :1, 0] + scan.sigma**2)).argmin(axis=0)

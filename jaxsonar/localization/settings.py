@@ -35,6 +35,9 @@ class UpdateSettings:
     sight_margin: float = 0.12
     """Distance from the ends of a wall, and in front of a landmark, within which the wall does not hide it, metres;
     more than the thickness of a light wall would hide the jambs of a door."""
+    hearing_threshold: float = -36.0
+    """Level of the faintest echoes that are matched outside of the cones, dB (``kernels.detection_cones.echo_level``):
+    a wall at 1 m up to 52 deg off the axes of 60 deg cones. Chosen by hand."""
     inner_cone: float = 0.7
     """Fraction of the detection cone in which an echo is surely received."""
     end_margin: float = 0.1

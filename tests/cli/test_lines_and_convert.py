@@ -348,4 +348,4 @@ def test_a_saved_log_is_what_the_command_reads(here):
         assert [line["paths"] for line in mine["lines"]] == [line["paths"] for line in its["lines"]]
         for key in ("rho", "theta", "segment"):
             ours, theirs = ([line[key] for line in model["lines"]] for model in (mine, its))
-            np.testing.assert_allclose(ours, theirs, rtol=0, atol=2e-4)
+            np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-3)
