@@ -113,7 +113,8 @@ class Undecided:
     theta: float
     """Direction of the normal of that line, radians, in [-pi, pi)."""
     x: float
-    """Position as a point (of a circle: its nearest one), metres; the middle of the observed segment if a plane is the most likely kind."""
+    """Position as a point (of a circle: the nearest one), metres; the middle of the observed segment if a plane is the
+    most likely kind."""
     y: float
     """Metres."""
     probability: dict[str, float]
