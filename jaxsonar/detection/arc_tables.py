@@ -58,8 +58,11 @@ def simultaneous_transmitters(ring: Ring, *, most: int = 2) -> Int[np.ndarray, "
         most: number of them; -1 where a group has fewer.
 
     Returns:
-        None if every sensor fires alone.
+        None if every sensor fires alone, or if the ring has direct paths only: their neighbors would fire at the same
+        time, and crosstalk would resemble the echoes themselves.
     """
+    if not ring.neighbors:
+        return None
     group, (tx, rx) = ring.firing_group_of_sensor, ring.paths.T
     together = group[tx][:, None] == group
     together[np.arange(len(tx)), tx] = False

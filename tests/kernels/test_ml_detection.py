@@ -475,7 +475,7 @@ def test_direct_echoes_alone_do_not_distinguish_corner_and_edge():
     many = np.array([len(scan) for scan in scans]) >= 3
     there = found.kind[:, 0] >= 0
     assert (there & many).sum() > 0.8 * many.sum() > 8
-    assert (found.probability[there, 0, 1:] > 0.1).all()
+    assert (found.probability[there, 0, 1:3] > 0.1).all()
     assert not (decided(found)[there] > kernels.PLANE).any()
     points = there & (found.kind[:, 0] != kernels.PLANE)
     np.testing.assert_allclose(found.parameters[points, 0], place[points], atol=2e-3)
