@@ -97,15 +97,7 @@ def _or_circle(
     """The echo, or that of a circle if the kind is CIRCLE; its derivatives are by the center."""
     if landmark.radius is None:
         return echo
-    found = circle_echo(center, jnp.asarray(landmark.radius), path)
-    circle = PredictedEcho(
-        found.range,
-        found.d_range_d_landmark[:2],
-        found.departure,
-        found.arrival,
-        jnp.zeros_like(found.range),
-        found.exists,
-    )
+    circle = circle_echo(center, jnp.asarray(landmark.radius), path).as_predicted()
     return jax.tree.map(lambda round_one, other: jnp.where(kind == CIRCLE, round_one, other), circle, echo)
 
 

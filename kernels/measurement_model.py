@@ -69,6 +69,12 @@ class CurvedEcho(eqx.Module):
     exists: Bool[Array, "*paths"]
     """Whether the path is possible, cones aside: the circle is not between the sensors, and both are outside of it."""
 
+    def as_predicted(self) -> PredictedEcho:
+        """The echo of ONE path with the derivatives by the first two parameters only."""
+        footpoint = jnp.zeros_like(self.range)
+        slopes = self.d_range_d_landmark[:2]
+        return PredictedEcho(self.range, slopes, self.departure, self.arrival, footpoint, self.exists)
+
 
 # Ranges
 

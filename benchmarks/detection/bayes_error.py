@@ -5,7 +5,7 @@ import numpy as np
 from benchmarks.detection.plots import KINDS
 from benchmarks.detection.scenarios import Scans
 from jaxsonar.observability.kind_errors import error_probability
-from jaxsonar.observability.reflectors import KIND_NAMES, ArrayPaths
+from jaxsonar.observability.reflectors import NAME_OF_KIND, ArrayPaths
 
 CHUNK = 192
 """Scans that are fitted at once; limits the memory."""
@@ -18,8 +18,8 @@ def bayes_error(scans: list[Scans], sigma: float) -> float:
         scans: scans with one reflector each, without lost and false echoes, the same number of each kind; one ring.
         sigma: range noise, metres.
     """
-    kinds = tuple(KIND_NAMES)
-    number = {KINDS.index(name): kind for kind, name in KIND_NAMES.items()}
+    kinds = tuple(NAME_OF_KIND)
+    number = {KINDS.index(name): kind for kind, name in NAME_OF_KIND.items()}
     errors, weight = [], []
     for part in scans:
         ring, log = part.ring, part.log

@@ -3,6 +3,7 @@
 import io
 from typing import Any, NamedTuple
 
+from jaxsonar.detection.local_model import KIND_NAMES
 from jaxsonar.hardware.errors import SonarError
 
 Columns = dict[str, Any]
@@ -30,8 +31,7 @@ SCAN_COLUMNS = {
     "pose_theta": ParquetColumn("float64", "rad", "world_from_robot, counter-clockwise"),
 }
 PROBABILITY_COLUMNS = {
-    f"p_{kind}": ParquetColumn("float64", "", f"probability that it is a {kind}")
-    for kind in ("plane", "corner", "edge", "circle")
+    f"p_{kind}": ParquetColumn("float64", "", f"probability that it is a {kind}") for kind in KIND_NAMES
 }
 SEGMENT_COLUMNS = {
     name: ParquetColumn("float64", "m", "an end of the local segment, robot frame") for name in ("x1", "y1", "x2", "y2")

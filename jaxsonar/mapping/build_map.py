@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxsonar import kernels
 from jaxsonar.detection.extract import local_models
-from jaxsonar.detection.local_model import LocalModel
+from jaxsonar.detection.local_model import KIND_NAMES, LocalModel
 from jaxsonar.detection.settings import DEFAULT_SIGMA, hough_settings, widened
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.hardware.errors import SonarError
@@ -18,7 +18,7 @@ from jaxsonar.mapping.artifact_removal import (
     remove_driven_through,
     remove_seen_through,
 )
-from jaxsonar.mapping.global_map import REFLECTOR_KINDS, GlobalMap
+from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.mapping.hough_merging import merge_by_hough
 from jaxsonar.mapping.map_evidence import MapEvidence, gather_evidence_of_each
 from jaxsonar.mapping.observations import concatenate, merge_cells
@@ -146,7 +146,7 @@ def add_reflectors(
         return end_walls(world)
     cov = np.array([one.cov for one in new])
     circle_cov = np.where(np.isfinite([one.radius for one in new])[:, None, None], cov, np.nan)
-    kinds = (*world.point_kinds, *("undecided" if one.kind < 0 else REFLECTOR_KINDS[one.kind] for one in new))
+    kinds = (*world.point_kinds, *("undecided" if one.kind < 0 else KIND_NAMES[one.kind] for one in new))
     points = np.concatenate([world.points, [one.position for one in new]])
     echoes = np.append(world.point_echoes, [len(one.echoes) for one in new])
     order = np.lexsort((points[:, 1], points[:, 0], -echoes))

@@ -11,8 +11,6 @@ from jaxsonar.geometry.segments import lengths
 POINT_KINDS = ("corner", "edge", "circle", "undecided")
 """Kinds of points: right-angled corners (two reflections), edges (diffraction; also thin poles), round columns, and
 reflectors of uncertain kind."""
-REFLECTOR_KINDS = ("plane", "corner", "edge", "circle")
-"""Kinds of reflectors, in the order of ``GlobalMap.point_probabilities``."""
 _OF_SOME_POINTS = {"point_radius": (), "point_circle_cov": (3, 3), "point_probabilities": (4,)}
 """Fields that may be omitted, and the shape of each row."""
 _DERIVED: Any = None
@@ -75,7 +73,7 @@ class GlobalMap:
     point_circle_cov: _CircleCovariances = _DERIVED
     """Covariance of the (x, y, radius) of each circle, square metres; NaN where unknown, and if omitted."""
     point_probabilities: _Probabilities = _DERIVED
-    """Probability of each of ``REFLECTOR_KINDS``; NaN where unknown, and if omitted."""
+    """Probability of each of ``detection.local_model.KIND_NAMES``; NaN where unknown, and if omitted."""
 
     def __post_init__(self):
         for name, shape in _OF_SOME_POINTS.items():

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 from jaxtyping import Float
 
+from jaxsonar.detection.local_model import KIND_NAMES
 from jaxsonar.fileio.geojson import feature, lines_of, positions, read_features, write_features
 from jaxsonar.hardware.errors import SonarError
-from jaxsonar.mapping.global_map import POINT_KINDS, REFLECTOR_KINDS, GlobalMap
+from jaxsonar.mapping.global_map import POINT_KINDS, GlobalMap
 
 NON_WALL_KINDS = ("pseudo", "intersection")
 """Kinds of features in a reference that are not walls: limits of visibility, and corners."""
@@ -40,7 +41,7 @@ def save_map(world: GlobalMap, filename: str | os.PathLike[str]) -> None:
         more: dict[str, Any] = {"radius": float(world.point_radius[index])} if is_circle else {}
         if np.isfinite(world.point_probabilities[index]).all():
             probability = world.point_probabilities[index].tolist()
-            more["probability"] = dict(zip(REFLECTOR_KINDS, probability, strict=True))
+            more["probability"] = dict(zip(KIND_NAMES, probability, strict=True))
         seen = {"echoes": int(world.point_echoes[index]), "scans": list(world.point_scans[index])}
         known = cov.tolist() if np.isfinite(cov).all() else None
         features.append(feature("Point", position, kind=kind, **more, cov=known, **seen))
@@ -237,14 +238,14 @@ def _parse_covariance(value: Any, size: int) -> Float[np.ndarray, "size size"]:
 
 
 def _parse_probability(value: Any) -> list[float]:
-    """Probability of each of ``REFLECTOR_KINDS``; NaN if unknown."""
+    """Probability of each of ``KIND_NAMES``; NaN if unknown."""
     if value is None:
-        return [float("nan")] * len(REFLECTOR_KINDS)
-    if isinstance(value, dict) and sorted(value) == sorted(REFLECTOR_KINDS):
-        found = [value[kind] for kind in REFLECTOR_KINDS]
+        return [float("nan")] * len(KIND_NAMES)
+    if isinstance(value, dict) and sorted(value) == sorted(KIND_NAMES):
+        found = [value[kind] for kind in KIND_NAMES]
         if all(_is_number(one) and 0 <= one <= 1 for one in found):
             return [float(one) for one in found]
-    allowed = f"an object with a number from 0 to 1 for each of {', '.join(REFLECTOR_KINDS)}"
+    allowed = f"an object with a number from 0 to 1 for each of {', '.join(KIND_NAMES)}"
     raise SonarError(f"probability {value!r:.60}; allowed is {allowed}")
 
 

@@ -6,11 +6,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
+from jaxsonar.detection.local_model import KIND_NAMES
 from jaxsonar.geometry.se2 import unit
 from jaxsonar.sensors.range_models import RANGE_OF_KIND, PredictedRange, curved_range
 from jaxsonar.sensors.ring import Ring
 
-KIND_NAMES = {kernels.PLANE: "plane", kernels.CORNER: "corner", kernels.EDGE: "edge", kernels.CIRCLE: "circle"}
+NAME_OF_KIND = dict(zip(kernels.REFLECTOR_KINDS, KIND_NAMES, strict=True))
+"""Names of ``kernels.REFLECTOR_KINDS``."""
 THREE_KINDS = (kernels.PLANE, kernels.CORNER, kernels.EDGE)
 
 

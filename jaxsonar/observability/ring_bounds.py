@@ -12,7 +12,7 @@ from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
 from jaxsonar.observability.cramer_rao import reflector_bound
 from jaxsonar.observability.kind_errors import error_probability
 from jaxsonar.observability.reflectors import (
-    KIND_NAMES,
+    NAME_OF_KIND,
     THREE_KINDS,
     ArrayPaths,
     is_heard,
@@ -131,7 +131,7 @@ def _distance_bounds(
     paths = ArrayPaths.of(ring, pairs)
     bearing = direction + np.linspace(-settings.bearing, settings.bearing, settings.bearings)
     far = np.full(len(bearing), distance)
-    points = {KIND_NAMES[kind]: reflector_bound(kind, paths, far, bearing) for kind in THREE_KINDS}
+    points = {NAME_OF_KIND[kind]: reflector_bound(kind, paths, far, bearing) for kind in THREE_KINDS}
     circles = {radius: reflector_bound(kernels.CIRCLE, paths, far, bearing, radius=radius) for radius in settings.radii}
     errors = [_error(paths, distance, direction, kinds, sigma, settings) for kinds in (THREE_KINDS, FOUR_KINDS)]
     names = {**points, **{f"{radius:g}": circle for radius, circle in circles.items()}}

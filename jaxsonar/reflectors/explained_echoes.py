@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxsonar.geometry.robust_statistics import robust_deviation
 from jaxsonar.geometry.se2 import perpendicular, wrap_angle
 from jaxsonar.geometry.segments import crossings, lengths, point_to_segments
 from jaxsonar.reflectors.range_measurements import RangeMeasurements
@@ -47,7 +48,7 @@ def range_scatter(residual: Float[np.ndarray, "rows walls"]) -> float:
         near = nearest[nearest < settings.gate * sigma]
         if not len(near):
             return float("nan")
-        sigma = max(1.4826 * float(np.median(near)), settings.min_sigma)
+        sigma = max(robust_deviation(near, center=0.0), settings.min_sigma)
     return sigma
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxsonar.geometry.robust_statistics import MAD_TO_SIGMA
 from jaxsonar.geometry.se2 import perpendicular, tangent_of, unit
 from jaxsonar.geometry.segments import lengths, point_to_segments
 from jaxsonar.reflectors.center_votes import center_seeds
@@ -27,7 +28,7 @@ class Reflector:
     """A reflector that answered from several places, world frame."""
 
     kind: int
-    """Number of its kind in ``kind_fit.KIND_NAMES``; -1 if the kind is undecided."""
+    """Number of its kind in ``detection.local_model.KIND_NAMES``; -1 if the kind is undecided."""
     position: Float[np.ndarray, "2"]
     """Center of a circle, position of a corner or an edge; of an undecided reflector or a plane its nearest point,
     metres."""
@@ -114,7 +115,7 @@ def find_reflectors(
         squared = np.concatenate([one.residual for one in found] or [np.zeros(0)]) ** 2
         if long.any() or len(squared) < settings.min_scatter_echoes:
             break
-        before, sigma = sigma, max(1.4826 * float(np.sqrt(np.median(squared))), settings.min_sigma)
+        before, sigma = sigma, max(MAD_TO_SIGMA * float(np.sqrt(np.median(squared))), settings.min_sigma)
         if max(before / sigma, sigma / before) < settings.same_sigma:
             break
     found, replaced = _with_walls(walls, residual, heard, long, found, sigma + settings.model_error / settings.gate)

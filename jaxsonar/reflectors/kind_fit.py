@@ -18,9 +18,8 @@ from jaxsonar.reflectors.explained_echoes import hidden_by_walls
 from jaxsonar.reflectors.range_measurements import RangeMeasurements
 from jaxsonar.reflectors.settings import SETTINGS
 
-KIND_NAMES = ("plane", "corner", "edge", "circle")
-"""Kinds of reflectors, in the order of all columns."""
 PLANE, CORNER, EDGE, CIRCLE = range(4)
+"""Kinds of reflectors by their columns, in the order of ``detection.local_model.KIND_NAMES``."""
 _STARTS = np.array([PLANE, CORNER, EDGE] + [CIRCLE] * len(SETTINGS.fit.radii))
 """Kind of each start of a fit."""
 _RADII = np.array([SETTINGS.fit.plane_radius, 0.0, 0.0, *SETTINGS.fit.radii])

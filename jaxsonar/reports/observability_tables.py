@@ -6,12 +6,12 @@ import numpy as np
 from rich.table import Table
 
 from jaxsonar import kernels
-from jaxsonar.observability.reflectors import KIND_NAMES, THREE_KINDS
+from jaxsonar.observability.reflectors import NAME_OF_KIND, THREE_KINDS
 from jaxsonar.observability.ring_bounds import DistanceBounds, RingBounds
 from jaxsonar.reports.text import NO_VALUE, fixed, plural
 from jaxsonar.sensors.ring import Ring
 
-POINTS = tuple(KIND_NAMES[kind] for kind in (kernels.CORNER, kernels.EDGE))
+POINTS = tuple(NAME_OF_KIND[kind] for kind in (kernels.CORNER, kernels.EDGE))
 
 
 def scan_time(ring: Ring) -> float:
@@ -63,7 +63,7 @@ def bounds_table(bounds: RingBounds, what: str) -> Table:
     ]  # fmt: skip
     for heading in headings:
         table.add_column(heading, justify="right")
-    plane = KIND_NAMES[THREE_KINDS[0]]
+    plane = NAME_OF_KIND[THREE_KINDS[0]]
     for row in rows:
         cells = [f"{row.distance:g}", fixed(row.echoes[plane], 0)]
         cells += [_cell(1e3 * row.range_sd[plane]), _cell(math.degrees(row.bearing_sd[plane]))]

@@ -10,12 +10,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from jaxsonar.observability.reflectors import KIND_NAMES, THREE_KINDS
+from jaxsonar.observability.reflectors import NAME_OF_KIND, THREE_KINDS
 from jaxsonar.observability.ring_bounds import DistanceBounds, RingBounds
 from jaxsonar.reports.plot_style import DIRECT_COLOR, FAINT_COLOR, LINE_COLOR, PALETTE, ROBOT_COLOR, figure_style
 from jaxsonar.sensors.ring import Ring
 
-_KIND_COLORS = dict(zip((KIND_NAMES[kind] for kind in THREE_KINDS), PALETTE, strict=False))
+_KIND_COLORS = dict(zip((NAME_OF_KIND[kind] for kind in THREE_KINDS), PALETTE, strict=False))
 _MAX_RADIUS_SD = 10.0
 """Bounds of a radius above this are not drawn, metres: nothing is known then."""
 

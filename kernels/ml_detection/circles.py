@@ -123,7 +123,7 @@ def _fit_circle(
             echo = at.echo(path)
             d_curvature_d_shape = 1 / (at.scale * (1 - at.shape) ** 2)
             factor = jnp.stack([jnp.ones_like(at.shape), jnp.ones_like(at.shape), d_curvature_d_shape])
-            visible = audibility(_without_derivatives(echo), path, scene.threshold)
+            visible = audibility(echo.as_predicted(), path, scene.threshold)
             return echo.range, echo.d_range_d_landmark * factor, visible
 
         distance, jacobian, visible = jax.vmap(one, in_axes=-1, out_axes=-1)(scan.echo_paths)
@@ -172,7 +172,7 @@ def _evidence(
     )
 
     def model(_: Float[Array, "2"], path: EchoPaths) -> PredictedEcho:
-        return _without_derivatives(fitted.echo(path))
+        return fitted.echo(path).as_predicted()
 
     # A convex mirror widens the wave: it is fainter than a wall.
     strength = 10 * jnp.log10(fitted.radius / (fitted.radius + fitted.scale)), settings.circle_strength_sd
@@ -186,11 +186,6 @@ def _evidence(
     evidence = gain + settings.missed_weight_point * missed + settings.prior_weight * prior + volume
     evidence -= jnp.where(hears_outside_cones(scene), 0, settings.circle_handicap)
     return jnp.where(supported.sum() >= settings.min_circle_echoes, evidence, -jnp.inf)
-
-
-def _without_derivatives(echo: CurvedEcho) -> PredictedEcho:
-    zero = jnp.zeros_like(echo.range)
-    return PredictedEcho(echo.range, jnp.stack([zero, zero]), echo.departure, echo.arrival, zero, echo.exists)
 
 
 def _covariance(information: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

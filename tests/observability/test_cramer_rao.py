@@ -6,7 +6,7 @@ from support.reflector_paths import hears, information
 
 from jaxsonar import Ring, kernels, load_ring
 from jaxsonar.observability.cramer_rao import covariance_bound, reflector_bound
-from jaxsonar.observability.reflectors import KIND_NAMES, ArrayPaths, is_heard, predicted_ranges, reflectors_at
+from jaxsonar.observability.reflectors import NAME_OF_KIND, ArrayPaths, is_heard, predicted_ranges, reflectors_at
 
 RINGS = {"ring": Ring.circular(), "bumper": load_ring("bumper4")}
 DISTANCE, BEARING = 1.1, 0.07
@@ -25,13 +25,13 @@ def scene(kind, paths, *, radius=0.2):
 def test_the_nominal_cones_decide_what_is_heard(name, kind):
     ring = RINGS[name]
     parameters, _, heard = scene(kind, ArrayPaths.of(ring, ring.paths))
-    expected = [hears(KIND_NAMES[kind], parameters[0], ring, tx, rx) for tx, rx in ring.paths]
+    expected = [hears(NAME_OF_KIND[kind], parameters[0], ring, tx, rx) for tx, rx in ring.paths]
     np.testing.assert_array_equal(heard[0], expected)
     assert heard.any()
 
 
 @rings
-@pytest.mark.parametrize("kind", KIND_NAMES)
+@pytest.mark.parametrize("kind", NAME_OF_KIND)
 def test_the_bounds_equal_those_of_finite_differences_of_plain_geometry(name, kind):
     ring, radius = RINGS[name], 0.2
     paths = ArrayPaths.of(ring, ring.paths)
@@ -39,7 +39,7 @@ def test_the_bounds_equal_those_of_finite_differences_of_plain_geometry(name, ki
     plain = parameters[0].copy()
     if kind == kernels.CIRCLE:
         plain[2] = radius
-    covariance = np.linalg.inv(information(KIND_NAMES[kind], plain, ring, ring.paths, heard[0]))
+    covariance = np.linalg.inv(information(NAME_OF_KIND[kind], plain, ring, ring.paths, heard[0]))
     bound = reflector_bound(kind, paths, np.array([DISTANCE]), np.array([BEARING]), radius=radius)
     assert bound.echoes[0] == heard.sum()
     if kind in (kernels.PLANE, kernels.CIRCLE):
@@ -100,7 +100,7 @@ def test_a_reflector_that_no_path_hears_has_no_bound():
         assert np.isnan([bound.distance[0], bound.bearing[0]]).all()
 
 
-@pytest.mark.parametrize("kind", KIND_NAMES)
+@pytest.mark.parametrize("kind", NAME_OF_KIND)
 def test_more_paths_never_weaken_a_bound(kind):
     ring = RINGS["bumper"]
     distance, bearing = np.full(20, 1.2), np.linspace(-0.2, 0.2, 20)

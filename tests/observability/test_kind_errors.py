@@ -11,7 +11,7 @@ from jaxsonar import Ring, kernels, load_ring
 from jaxsonar.observability.kind_errors import error_probability, kind_separations
 from jaxsonar.observability.reflector_fits import residual_squares
 from jaxsonar.observability.reflectors import (
-    KIND_NAMES,
+    NAME_OF_KIND,
     THREE_KINDS,
     ArrayPaths,
     is_heard,
@@ -32,7 +32,7 @@ def least_residual(kind, ring, pairs, ranges, distance, bearing):
     """Norm of the residuals of the best reflector by SciPy, from several starts."""
     center = ring.position.mean(axis=0)
     ends = [(ring.position[tx] - center, ring.position[rx] - center) for tx, rx in pairs]
-    name = KIND_NAMES[kind]
+    name = NAME_OF_KIND[kind]
 
     def residuals(x):
         return [half_path(name, x, *pair) - value for pair, value in zip(ends, ranges, strict=True)]

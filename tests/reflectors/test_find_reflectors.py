@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from jaxsonar import Ring, Room, simulate
+from jaxsonar.detection.local_model import KIND_NAMES
 from jaxsonar.reflectors.find_reflectors import find_reflectors
-from jaxsonar.reflectors.kind_fit import CIRCLE, EDGE, KIND_NAMES
+from jaxsonar.reflectors.kind_fit import CIRCLE, EDGE
 from jaxsonar.reflectors.posed_scans import PosedScans
 from jaxsonar.reflectors.range_measurements import RangeMeasurements
 from jaxsonar.scans.scan_log import Log
