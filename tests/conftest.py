@@ -2,7 +2,9 @@
 
 import contextlib
 import dataclasses
+import gc
 import inspect
+import pathlib
 import types
 from typing import get_args
 
@@ -50,6 +52,16 @@ jaxtyping.jaxtyped = _jaxtyped_where_needed
 from jaxsonar.fileio.compilation_cache import use_compilation_cache  # noqa: E402  imports from here on are type-checked
 
 use_compilation_cache()  # shared with the commands and between test processes
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_executables():
+    """Drops compiled programs before the process has more memory maps than Linux allows (65530), which ends it."""
+    yield
+    maps = pathlib.Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > 25_000:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture

@@ -143,6 +143,21 @@ class HypothesisTracker:
         return np.array([int(scan.is_echo.sum()) for scan in self.scans])
 
     @cached_property
+    def chance_nats(self) -> float:
+        """Evidence per echo that a scan gains by chance: at poses all over the map, fitted like the hypotheses, nats.
+
+        It depends on the map and on how widely the sensors hear, which no constant covers.
+        """
+        low, high = self.known_map.bounds
+        drawn = np.random.default_rng(0).uniform([*low, -np.pi], [*high, np.pi], (SETTINGS.chance_poses, 3))
+        start, gained = self._at(list(drawn)), []
+        for number in np.unique(np.linspace(0, len(self.rows) - 1, SETTINGS.chance_scans).round().astype(int)):
+            found = self._update_all(start.pose, start.covariance, int(number), UPDATE_SETTINGS.iterations[False])
+            evidence = found.evidence.sum(axis=1) + found.log_odometry
+            gained.append(np.quantile(evidence, SETTINGS.chance_quantile) / max(self.echo_counts[number], 1))
+        return max(float(np.mean(gained)), 0.0)
+
+    @cached_property
     def _moved(self) -> Float[np.ndarray, " steps"]:
         """Motion between consecutive scans in ``rows``, metres; a turn by one radian counts as ``turn_length``."""
         step = relative(self.odometry[self.rows[:-1]], self.odometry[self.rows[1:]])
@@ -263,7 +278,7 @@ class HypothesisTracker:
 
         See ``place_probabilities.relative_log_likelihood``.
         """
-        none = SETTINGS.chance_nats * self.echo_counts[numbers]
+        none = self.chance_nats * self.echo_counts[numbers]
         both = np.concatenate([hypotheses.scan_evidence[:, : len(numbers)], none[None]])
         found = relative_log_likelihood(both, self.scan_weights[numbers], self.trust)
         return found[:-1], float(found[-1])

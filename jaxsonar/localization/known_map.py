@@ -85,6 +85,13 @@ class KnownMap:
         return wall_segments(self.landmarks.take(np.flatnonzero(self.is_wall)))
 
     @cached_property
+    def bounds(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+        """Lowest and highest coordinates of the map, metres."""
+        points = (self.landmarks.anchor + self.landmarks.parameters)[~self.is_wall]
+        ends = np.concatenate([self.segments.reshape(-1, 2), points])
+        return ends.min(axis=0), ends.max(axis=0)
+
+    @cached_property
     def features(self) -> Features:
         """Walls, each from both of its sides, and points."""
         scans = np.full(len(self.covariance), SETTINGS.wall_scans)

@@ -207,8 +207,11 @@ def _judge(hypotheses: Sequence[PoseHypothesis], scans: int, *, is_local: bool) 
         )
     alike = [one for one in hypotheses if one.probability > SETTINGS.shown_probability][: SETTINGS.shown_places]
     none = 1 - sum(one.probability for one in hypotheses)
-    if none > best.probability or not alike:
-        return False, f"{of}: no place in the map fits: at the best pose {fit}, hardly more than by chance"
+    if none > 1 - none or not alike:
+        return False, (
+            f"{of}: no place in the map fits: at the best pose {fit}, which is chance with a probability of "
+            f"{_percent(none)}"
+        )
     if len(alike) == 1:
         heading = f"{of}: uncertain, {_percent(none)} for no place of the map"
     else:

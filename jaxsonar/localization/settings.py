@@ -98,8 +98,12 @@ class LocalizationSettings:
     """A hypothesis is dropped if it is behind the best by this many nats."""
     max_tracked: int = 48
     """Number of hypotheses that are tracked together."""
-    chance_nats: float = 0.15
-    """Evidence of an echo where the map explains as much as it would by chance, nats."""
+    chance_poses: int = 48
+    """Number of poses all over the map whose evidence is that of chance..."""
+    chance_quantile: float = 23 / 24
+    """... at this quantile of it: what the best of ``max_hypotheses`` wrong poses gains by chance..."""
+    chance_scans: int = 8
+    """... at this many scans; in the others it is taken in proportion to the number of echoes."""
     none_share: float = 0.05
     """Prior probability that the robot is at none of the places of the map that are found."""
     plan_trust: MapTrust = MapTrust(1.0, 0.1, 4.0)
