@@ -80,7 +80,7 @@ def batch(
     on_planned: Callable[[int], None] | None = None,
     on_done: Callable[[int], None] | None = None,
 ) -> BatchReport:
-    """Detect lines, corners and edges in every scan of any number of logs, and write them as Parquet.
+    """Detect lines, corners, edges and circles in every scan of any number of logs, and write them as Parquet.
 
     The output folder holds the data sets ``scans/``, ``lines/`` and ``points/``, one file per shard, and
     ``manifest.jsonl``. The same call resumes an interrupted batch. Results do not depend on executor, workers or

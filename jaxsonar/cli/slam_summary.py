@@ -14,7 +14,7 @@ from jaxsonar.graph_slam.slam import Slam
 from jaxsonar.hardware.errors import SonarError
 from jaxsonar.loop_closure.closure_candidate import ACCEPTED, WITHDRAWN
 from jaxsonar.plausibility.odometry_jumps import OdometryJump
-from jaxsonar.reports.text import plural
+from jaxsonar.reports.text import plural, point_counts
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.smoothing.sparse_smoother import SPARSE_SETTINGS
 
@@ -152,7 +152,7 @@ def summary_lines(result: Slam, errors: Errors | None) -> list[str]:
     states = {state: sum(closure.state == state for closure in result.closures) for state in (ACCEPTED, WITHDRAWN)}
     lines = [
         f"{plural(len(result.poses), 'scan')}, {len(result.trajectory)} of them with a pose, "
-        f"{plural(len(result.world), 'wall')}, {plural(len(result.world.points), 'corner')} or edges; "
+        f"{', '.join([plural(len(result.world), 'wall'), *point_counts(result.world.point_kinds)])}; "
         f"{plural(states[ACCEPTED], 'loop closure')}, {states[WITHDRAWN]} withdrawn"
     ]
     smoothed = result.smoothed

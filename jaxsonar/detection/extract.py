@@ -104,7 +104,7 @@ def local_models(
     Args:
         ring: the sensors.
         log: the scans; poses are used for windows only.
-        method: "ml": the walls, corners and edges that explain the echoes best, by maximum likelihood over the ranges;
+        method: "ml": the walls, corners, edges and circles that explain the echoes best, by maximum likelihood;
             "hough": the method of the paper, lines only.
         settings: accumulator and low pass, for "hough" also threshold and smallest number of echoes; if omitted, the
             paper's values with an accumulator that is large enough for the ring.

@@ -45,7 +45,7 @@ class LandmarkMapSettings:
 
 
 SETTINGS = LandmarkMapSettings()
-POINT_KINDS = {"corner": kernels.CORNER, "edge": kernels.EDGE, "circle": kernels.CIRCLE}
+LANDMARK_KINDS = {"corner": kernels.CORNER, "edge": kernels.EDGE, "circle": kernels.CIRCLE}
 """Kinds of points of a map that are landmarks. Undecided reflectors are not: their range model is unknown."""
 
 
@@ -145,7 +145,7 @@ def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> Landmark
     map_index: list[Int[np.ndarray, " landmarks"]] = [np.zeros(0, int)]
     wall_pairs: list[tuple[int, int, int]] = []  # first wall, second wall, map
     for number, whole in enumerate(maps):
-        map_ = whole.with_kinds(*POINT_KINDS)
+        map_ = whole.with_kinds(*LANDMARK_KINDS)
         pairs, is_intersection = _wall_intersections(map_)
         first = sum(len(part.kind) for part in parts)
         kept = np.append(np.ones(len(map_), bool), ~is_intersection | (not tie_corners))
@@ -158,8 +158,8 @@ def landmark_map_of(maps: Sequence[GlobalMap], *, tie_corners: bool) -> Landmark
 
 def map_landmarks(map_: GlobalMap) -> kernels.Landmarks:
     """The walls, then the corners, edges and circles of a map as landmarks, each anchored at its middle."""
-    map_ = map_.with_kinds(*POINT_KINDS)
-    kinds = [POINT_KINDS[kind] for kind in map_.point_kinds]
+    map_ = map_.with_kinds(*LANDMARK_KINDS)
+    kinds = [LANDMARK_KINDS[kind] for kind in map_.point_kinds]
     points = landmarks_from_points(np.array(kinds, np.int32), map_.points, map_.point_radius)
     return concatenate_landmarks([landmarks_from_segments(map_.rho, map_.theta, map_.segments), points])
 

@@ -42,7 +42,9 @@ def load_room(filename: str | os.PathLike[str]) -> Room:
         names += [name] * len(pieces)
         points += found
     if not walls and not points:
-        raise SonarError(f"{place}: neither wall nor pole came; allowed is at least one LineString, Polygon or pole")
+        raise SonarError(
+            f"{place}: no wall, pole or circle came; allowed is at least one LineString, Polygon, pole or circle"
+        )
     table = np.array(points).reshape(-1, 3)
     is_pole = table[:, 2] == 0
     try:
@@ -74,7 +76,7 @@ def _feature(properties: dict[str, Any], form: str, coordinates: Any) -> tuple[s
         raise SonarError(f"name {name!r:.60}; allowed is text")
     known = _PROPERTIES + (_CIRCLE_PROPERTIES_OF_MAPS if kind == "circle" else ())
     if kind not in _KINDS_OF_MAPS and (unknown := [key for key in properties if key not in known]):
-        raise SonarError(f"unknown property {shown(unknown[0], 60)!r}; allowed are {', '.join(_PROPERTIES)}")
+        raise SonarError(f"unknown property {shown(unknown[0], 60)!r}; allowed are {', '.join(known)}")
     if form == "Point":
         if kind not in ("pole", "circle", *_SKIPPED_POINTS):
             allowed = 'allowed is "pole" or "circle" ("corner", "edge" and "undecided" are skipped)'

@@ -8,9 +8,9 @@ Design decisions:
 
 - A pose is (x, y, theta); ``a_from_b`` transforms points of frame b to frame a. Covariances are those of additive
   errors of the three coordinates. Every covariance propagation of the project is in ``se2``.
-- There is one container of planes, corners and edges, ``kernels.Landmarks``. Its leaves may be NumPy or JAX arrays, so
-  that maps, submaps, beliefs and least-squares problems share it without conversion. Each landmark is relative to an
-  anchor near it, so that single precision suffices far from the origin.
+- There is one container of planes, corners, edges and circles, ``kernels.Landmarks``. Its leaves may be NumPy or
+  JAX arrays, so that maps, submaps, beliefs and least-squares problems share it without conversion. Each landmark is
+  relative to an anchor near it, so that single precision suffices far from the origin.
 - ``mapping`` keeps its own containers, because they hold sums of second moments that add up in any order;
   ``registration.features`` does so, too, because it compares walls and points separately for many poses at once.
 """

@@ -17,7 +17,7 @@ from jaxsonar.estimation.joint_compatibility import (
     jointly_compatible_pairs,
     mutual_nearest_neighbors,
 )
-from jaxsonar.estimation.landmark_map import POINT_KINDS
+from jaxsonar.estimation.landmark_map import LANDMARK_KINDS
 from jaxsonar.geometry.landmarks import (
     concatenate_landmarks,
     landmarks_from_points,
@@ -93,7 +93,7 @@ def feature_measurements(model: LocalModel) -> FeatureMeasurements:
     points = [one for one in model.points if one.kind != "circle" or one.cov[2, 2] < SETTINGS.max_radius_sd**2]
     default = np.diag(np.square(SETTINGS.default_line_sd))
     kind = [kernels.PLANE] * len(lines)
-    kind += [POINT_KINDS[point.kind] for point in points]
+    kind += [LANDMARK_KINDS[point.kind] for point in points]
     parameters = [(line.rho, line.theta) for line in lines] + [(point.x, point.y) for point in points]
     cov = [default if line.cov is None else line.cov for line in lines] + [point.cov[:2, :2] for point in points]
     segment = [line.segment for line in lines] + [((point.x, point.y),) * 2 for point in points]

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxsonar import kernels
-from jaxsonar.estimation.landmark_map import POINT_KINDS, map_landmarks
+from jaxsonar.estimation.landmark_map import LANDMARK_KINDS, map_landmarks
 from jaxsonar.geometry.landmarks import concatenate_landmarks, landmarks_from_points, pad_landmarks, wall_segments
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
 from jaxsonar.geometry.segments import perpendicular_intersections, point_to_segments
@@ -40,7 +40,7 @@ class KnownMap:
             map_sd: least standard deviations of its walls: across (m), direction (rad); None: those of a floor plan if
                 it is one, else those of the map.
         """
-        world = world.with_kinds(*POINT_KINDS)
+        world = world.with_kinds(*LANDMARK_KINDS)
         if map_sd is None:
             map_sd = SETTINGS.plan_sd if is_floor_plan(world) else SETTINGS.min_map_sd
         wall_covariance = _wall_covariances(world, map_sd)
@@ -49,7 +49,7 @@ class KnownMap:
         point_covariance += np.nan_to_num(world.point_circle_cov[:, 2, 2])[:, None, None] * np.eye(2)
         landmarks = map_landmarks(world)
         opening = np.zeros((len(landmarks.kind), 2, 2))
-        if not _has_corners_or_edges(world):
+        if is_floor_plan(world) or not {"corner", "edge"} & set(world.point_kinds):
             corners, corner_covariance, directions = _wall_corners(world, wall_covariance)
             point_covariance = np.concatenate([point_covariance, corner_covariance])
             kind = np.full(len(corners), kernels.CORNER)
@@ -140,12 +140,9 @@ def _free_ends(world: GlobalMap) -> Float[np.ndarray, "ends 2"]:
 
 
 def is_floor_plan(world: GlobalMap) -> bool:
-    """Whether a map is a drawing: without corners and edges, and its walls count as exact (``map_from_room``)."""
-    return not _has_corners_or_edges(world) and bool((world.sigma_rho < SETTINGS.exact_sd).all())
-
-
-def _has_corners_or_edges(world: GlobalMap) -> bool:
-    return "corner" in world.point_kinds or "edge" in world.point_kinds
+    """Whether a map is a drawing: its walls and points count as exact (``map_from_room``)."""
+    sd = np.concatenate([world.sigma_rho, np.sqrt(world.point_cov[:, 0, 0])])
+    return bool((sd < SETTINGS.exact_sd).all())
 
 
 def trust_in(world: GlobalMap) -> MapTrust:

@@ -169,7 +169,7 @@ class LocalizationSettings:
     """Standard deviations of the walls of a floor plan: across (m), direction (rad). Plans and buildings agree within
     1 to 3 cm, and plaster is not plane."""
     exact_sd: float = 1e-5
-    """A map without points whose walls have smaller standard deviations is a floor plan, metres."""
+    """A map whose walls and points have smaller standard deviations is a floor plan, metres."""
     min_landmarks: int = 64
     """Smallest padded number of landmarks; powers of two from there on are compiled."""
     wall_scans: float = 4.0

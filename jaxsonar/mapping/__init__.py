@@ -1,4 +1,4 @@
-"""Global maps: walls, corners and edges in the world frame, from the local models of many scans (paper, section 5).
+"""Global maps: walls, corners, edges and circles in the world frame, from local models (paper, section 5).
 
 Entry points: ``build_map.build_map`` (a log), ``map_evidence.gather_evidence`` and ``build_map.assemble_map`` (its two
 steps, also used scan by scan), ``GlobalMap``, ``map_geojson.load_map`` and ``save_map``, ``map_dxf.save_dxf``.

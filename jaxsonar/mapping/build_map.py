@@ -54,7 +54,7 @@ def build_map(
     on_observed: Callable[[Sequence[LocalModel], MapEvidence], None] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> GlobalMap:
-    """The walls, corners and edges of the world, from a log of scans with poses (paper, section 5).
+    """The walls, corners, edges and circles of the world, from a log of scans with poses (paper, section 5).
 
     Firings that stand in scans of their own are grouped (``group_firings``). The map names the first scan of a group.
     With windows, walls are found in windows of several lengths, and grow over single echoes (``grow_walls``).
@@ -132,7 +132,7 @@ def add_reflectors(
     are replaced by it.
 
     Args:
-        world: walls, corners and edges.
+        world: walls, corners, edges and circles.
         measurements: echoes and silences of all scans with poses; None: no scan.
         sigma: standard deviation of the ranges, metres, if the walls do not show it.
     """

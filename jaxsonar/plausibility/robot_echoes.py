@@ -177,8 +177,9 @@ def find_robot_echoes(ring: Ring, log: Log) -> RobotEchoes:
     must not have a constant range, or most sensors around the robot have the same one.
 
     A path that cannot prove this has the echo, too, if its reverse path has it at the same range, or half of the paths
-    with the same distance between transmitter and receiver. A robot that rests or only turns gives no statement, and
-    neither does one that only drives along walls.
+    with the same distance between transmitter and receiver. A cross echo that the measured reverse path lacks is left
+    out: it is crosstalk. A robot that rests or only turns gives no statement, and neither does one that only drives
+    along walls.
 
     Args:
         ring: the sensors; other (tx, rx) pairs are ignored.
@@ -186,6 +187,7 @@ def find_robot_echoes(ring: Ring, log: Log) -> RobotEchoes:
     """
     search = _Search.of(ring, log)
     found = _with_companions(ring, list(search.with_poses() if search.has_poses else search.without_poses()))
+    found = [one for one in found if search.is_reciprocal(one, found)]
     direct = {one.tx for one in found if one.tx == one.rx}
     measured = np.unique(log.tx[log.tx == log.rx])
     return RobotEchoes(tuple(found), len(direct) >= max(SETTINGS.floor_sensors, SETTINGS.most * len(measured)))
@@ -246,6 +248,13 @@ class _Search:
         row = np.flatnonzero((path >= 0) & np.isin(log.echo_scan, chosen))
         row = row[np.lexsort((log.range[row], path[row]))]
         return cls(ring, log, has_poses, chosen, measured_paths(ring, log), path, row)
+
+    def is_reciprocal(self, one: RobotEcho, found: list[RobotEcho]) -> bool:
+        """Whether the reverse path has the echo, too, or was hardly measured. True for direct echoes."""
+        reverse = path_rows(self.ring, np.array([one.rx]), np.array([one.tx]))
+        measured = reverse[0] >= 0 and self._measurements[reverse[0]] >= SETTINGS.min_scans
+        expected = [other.range for other in found if (other.rx, other.tx) == (one.tx, one.rx)]
+        return not measured or any(abs(one.range - other) <= _tolerance(one.range) for other in expected)
 
     def with_poses(self) -> Iterator[RobotEcho]:
         """Constant ranges of paths; ``places`` is 0 if they may be of walls."""

@@ -6,16 +6,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.se2 import compose, rotate, tangent_of, unit, wrap_angle
+from jaxsonar.reflectors.settings import SETTINGS
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.sliding_windows import independent_measurements
 from jaxsonar.sensors.ring import Ring
 
-SECTION = 0.1
-"""Measurements of one path within this length of the trajectory count as one, metres."""
-ARM = 0.57
-"""Length of trajectory that corresponds to a rotation, metres per radian: 10 degrees are 0.1 m."""
-MIN_DISTANCE = 0.05
-"""Smallest distance between a sensor and a wall, metres. Guards a division."""
+_SETTINGS = SETTINGS.measurements
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +65,7 @@ class RangeMeasurements:
         across, along = self.half_baseline @ normal, self.half_baseline @ tangent
         distance = np.hypot(ahead, along)
         slope = np.stack([ahead, ahead * beside - along * across], axis=-1)
-        return distance, slope / np.maximum(distance, MIN_DISTANCE)[:, None]
+        return distance, slope / np.maximum(distance, _SETTINGS.min_distance)[:, None]
 
     @classmethod
     def from_log(cls, ring: Ring, log: Log) -> "RangeMeasurements":
@@ -120,8 +116,8 @@ def _sections(pose: Float[np.ndarray, "scans 3"]) -> Int[np.ndarray, " scans"]:
     known = np.all(np.isfinite(pose), axis=1)
     both = (known[1:] & known[:-1])[:, None]
     step = np.where(both, np.diff(pose, axis=0), 0.0)
-    moved = np.hypot(*step[:, :2].T) + ARM * np.abs(wrap_angle(step[:, 2]))
-    return np.append(0, (np.cumsum(moved) / SECTION).astype(np.int64))[: len(pose)]
+    moved = np.hypot(*step[:, :2].T) + _SETTINGS.turn_length * np.abs(wrap_angle(step[:, 2]))
+    return np.append(0, (np.cumsum(moved) / _SETTINGS.section).astype(np.int64))[: len(pose)]
 
 
 def independent_weights(section: Int[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:

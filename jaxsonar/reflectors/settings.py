@@ -22,6 +22,18 @@ class KeptScanSettings:
 
 
 @dataclass(frozen=True)
+class IndependentMeasurementSettings:
+    """Measurements that count as one."""
+
+    section: float = 0.1
+    """Measurements of one path within this length of the trajectory count as one, metres."""
+    turn_length: float = 0.57
+    """Length of trajectory that corresponds to a rotation, metres per radian: 10 degrees are 0.1 m."""
+    min_distance: float = 0.05
+    """Smallest distance between a sensor and a wall, metres. Guards a division."""
+
+
+@dataclass(frozen=True)
 class CenterVotingSettings:
     """Votes of echoes for centers of circles."""
 
@@ -59,6 +71,9 @@ class KindFitSettings:
     """... and there must be ``min_echoes`` as close as this."""
     min_distance: float = 0.03
     """Smallest distance between a sensor and a reflector, metres."""
+    newton_steps: int = 2
+    """Newton steps to the point of reflection of a circle. The error with baselines of 0.2 m and distances of 0.3 m is
+    below 0.1 um."""
     radii: tuple[float, ...] = (0.06, 0.25, 0.8)
     """Radii at which the fit of a circle starts, metres."""
     min_radius: float = 0.01
@@ -175,6 +190,8 @@ class ReflectorSearchSettings:
 
     places: KeptScanSettings = field(default_factory=KeptScanSettings)
     """Scans that are kept."""
+    measurements: IndependentMeasurementSettings = field(default_factory=IndependentMeasurementSettings)
+    """Measurements that count as one."""
     voting: CenterVotingSettings = field(default_factory=CenterVotingSettings)
     """Votes for centers."""
     fit: KindFitSettings = field(default_factory=KindFitSettings)

@@ -15,7 +15,7 @@ from jaxsonar.detection.local_model import Line, LocalModel
 from jaxsonar.evaluation.laser_polygonal_model import PolygonalModel
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import transform_points
-from jaxsonar.mapping.global_map import POINT_KINDS, GlobalMap
+from jaxsonar.mapping.global_map import GlobalMap
 from jaxsonar.reports.plot_style import (
     CROSS_COLOR,
     DIRECT_COLOR,
@@ -32,7 +32,7 @@ from jaxsonar.reports.plot_style import (
     robot_handle,
     wall_handle,
 )
-from jaxsonar.reports.text import plural
+from jaxsonar.reports.text import plural, point_counts
 from jaxsonar.sensors.ring import Ring
 
 MAX_NUMBERED_POSES = 40
@@ -164,15 +164,12 @@ def map_figure(
         room: the true walls, if known.
         reference: endpoints of walls measured by another sensor.
         laser_points: laser measurements.
-        title: title of the figure; by default the numbers of segments, corners and edges.
+        title: title of the figure; by default the numbers of segments and points.
 
     All coordinates are in the world frame, metres.
     """
     if title is None:
-        counts = {kind: world.point_kinds.count(kind) for kind in POINT_KINDS}
-        names = {"undecided": "undecided reflector"}
-        points = [plural(count, names.get(kind, kind)) for kind, count in counts.items() if count]
-        title = ", ".join([plural(len(world), "merged segment"), *points])
+        title = ", ".join([plural(len(world), "merged segment"), *point_counts(world.point_kinds)])
     figure, axes = plan_view(title)
     handles = _draw_map(axes, world)
     if aggregated is not None:

@@ -11,6 +11,12 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
+def point_counts(kinds: tuple[str, ...]) -> list[str]:
+    """How many points of each kind a map has, for example ["1 circle", "2 corners"]; kinds without any are left out."""
+    names = {"undecided": "undecided reflector"}
+    return [plural(kinds.count(kind), names.get(kind, kind)) for kind in sorted(set(kinds))]
+
+
 def fixed(value: float | int | None, digits: int) -> str:
     """A number with a fixed number of decimals; ``NO_VALUE`` for None and NaN."""
     return NO_VALUE if value is None or math.isnan(value) else f"{value:.{digits}f}"

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsonar.estimation.adjustment_state import AdjustmentResult
-from jaxsonar.estimation.landmark_map import POINT_KINDS
+from jaxsonar.estimation.landmark_map import LANDMARK_KINDS
 from jaxsonar.estimation.robust_adjustment import SETTINGS as GNC_SETTINGS
 from jaxsonar.geometry.landmarks import landmark_positions, wall_segments
 from jaxsonar.geometry.se2 import tangent_of, unit, wrap_angle
@@ -21,7 +21,7 @@ def adjusted_map(world: GlobalMap, adjustment: AdjustmentResult, cov: Float[np.n
         adjustment: its result.
         cov: marginal covariance of the parameters of each landmark, metres and radians.
     """
-    world = world.with_kinds(*POINT_KINDS)
+    world = world.with_kinds(*LANDMARK_KINDS)
     wall_count, count = len(world), len(world) + len(world.points)
     first = np.asarray(adjustment.problem.factors.reflection.first)[adjustment.used]
     echoes = np.bincount(first, minlength=count)[:count]
@@ -34,7 +34,7 @@ def adjusted_map(world: GlobalMap, adjustment: AdjustmentResult, cov: Float[np.n
     arm = (tangent_of(theta) * walls.anchor).sum(-1)
     theta_variance = cov[wall, 1, 1]
     rho_variance = cov[wall, 0, 0] + 2 * arm * cov[wall, 0, 1] + arm**2 * theta_variance
-    kinds = {kind: name for name, kind in POINT_KINDS.items()}
+    kinds = {kind: name for name, kind in LANDMARK_KINDS.items()}
     is_kept = np.isin(np.arange(count), kept)
     return replace(
         world.take_walls(is_kept[:wall_count]).take_points(is_kept[wall_count:]),

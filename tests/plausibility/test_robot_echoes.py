@@ -92,6 +92,16 @@ def test_a_body_in_front_of_one_sensor_is_found_on_all_its_paths():
     assert "path" not in str(found.warning())
 
 
+def test_a_cross_echo_without_its_reverse_is_crosstalk():
+    """Sound takes the same way back: a body that one path hears, its reverse path hears, too."""
+    pose = drive([[-1.5, -1.0], [1.4, 0.9], [1.2, -0.8], [-1.3, 0.8], [0.2, -1.0], [0.9, 1.0]])
+    log = simulated(DENSE, rectangle(4.6, 3.4), pose)
+    one_way, _ = with_robot_echoes(log, [(4, 5)], [0.23])
+    assert not find_robot_echoes(DENSE, one_way)
+    both_ways, _ = with_robot_echoes(one_way, [(5, 4)], [0.23])
+    assert find_robot_echoes(DENSE, both_ways).paths == {(4, 5), (5, 4)}
+
+
 def test_the_result_does_not_depend_on_the_world_frame():
     log, _ = with_robot_echoes(SOUND, [(3, 3)], [0.4])
     moved = replace(log, pose=compose(np.array([5.0, -2.0, 2.5]), log.pose))
