@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.hard_cones import simulate
 
 from jaxsonar.detection.extract import local_models
 from jaxsonar.detection.local_model import LocalModel, Point
@@ -24,6 +23,7 @@ from jaxsonar.mapping.wall_endpoints import blocks_gap, detached_points, snap_en
 from jaxsonar.mapping.wall_segments import WallSegments
 from jaxsonar.reports.plot_map import map_figure
 from jaxsonar.simulation.office import load_office
+from jaxsonar.simulation.simulator import simulate
 
 NOWHERE = np.zeros((0, 3))
 PATHS = np.zeros((1, 2), np.int64)
@@ -388,7 +388,8 @@ def test_walls_do_not_extend_across_a_doorway():
     world = assemble_map(gather_evidence(ring, log, list(local_models(ring, log))))
     front = world.segments[np.abs(world.segments[:, :, 1] - 1.2).max(axis=1) < 0.05]
     assert len(front) >= 2
-    inside = (front[..., 0] > -0.35) & (front[..., 0] < 0.45)
+    # Up to 0.1 m beyond its end, the range of an edge differs from that of the wall by less than 6 mm.
+    inside = (front[..., 0] > -0.29) & (front[..., 0] < 0.39)
     assert not inside.any()
     assert not ((front[..., 0].min(axis=1) < -0.4) & (front[..., 0].max(axis=1) > 0.5)).any()
 
