@@ -1,6 +1,7 @@
 """Global maps from logs: local models, evidence, and the assembly of walls and points (paper, section 5)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -28,7 +29,8 @@ from jaxsonar.mapping.settings import SETTINGS
 from jaxsonar.mapping.wall_endpoints import blocks_gap, detached_points, end_walls, snap_endpoints, spurious_walls
 from jaxsonar.mapping.wall_growth import grow_walls
 from jaxsonar.mapping.wall_segments import WallSegments
-from jaxsonar.reflectors.find_reflectors import find_reflectors
+from jaxsonar.reflectors.find_reflectors import Reflector, find_reflectors
+from jaxsonar.reflectors.kind_fit import PLANE
 from jaxsonar.reflectors.range_measurements import RangeMeasurements
 from jaxsonar.scans.scan_log import Log
 from jaxsonar.scans.single_firings import group_firings
@@ -128,8 +130,8 @@ def add_reflectors(
 ) -> GlobalMap:
     """A map with the reflectors that answer from several places and that its walls do not explain.
 
-    They are corners, edges, circles, or of undecided kind. Short walls and points that such a reflector explains better
-    are replaced by it.
+    They are short walls, corners, edges, circles, or of undecided kind. Short walls and points that such a reflector
+    explains better are replaced by it.
 
     Args:
         world: walls, corners, edges and circles.
@@ -141,7 +143,9 @@ def add_reflectors(
     assumed = DEFAULT_SIGMA if sigma is None else sigma
     found = find_reflectors(measurements, np.array(world.segments), np.array(world.points), sigma=assumed)
     world = world.take_walls(~found.replaced_walls).take_points(~found.replaced_points)
-    new = [one for one in found.reflectors if not one.is_wall]
+    missing = [one for one in found.reflectors if not one.is_wall]
+    world = _with_planes(world, [one for one in missing if one.kind == PLANE])
+    new = [one for one in missing if one.kind != PLANE]
     if not new:
         return end_walls(world)
     cov = np.array([one.cov for one in new])
@@ -162,6 +166,30 @@ def add_reflectors(
         point_probabilities=np.concatenate([world.point_probabilities, [one.probability for one in new]])[order],
     )
     return end_walls(world)
+
+
+def _with_planes(world: GlobalMap, planes: Sequence[Reflector]) -> GlobalMap:
+    """The map with further walls."""
+    if not planes:
+        return world
+    line = np.array([one.line for one in planes])
+    side = np.where(line[:, 0] < 0, np.pi, 0.0)
+    sd = np.sqrt(np.diagonal([one.line_cov for one in planes], axis1=-2, axis2=-1))
+    echoes = np.append(world.echoes, [len(one.echoes) for one in planes])
+    order = np.argsort(-echoes, kind="stable")
+    scans = (*world.scans, *(one.scans for one in planes))
+    return replace(
+        world,
+        segments=np.concatenate([world.segments, [one.segment for one in planes]])[order],
+        rho=np.append(world.rho, np.abs(line[:, 0]))[order],
+        theta=np.append(world.theta, wrap_angle(line[:, 1] + side))[order],
+        sigma_rho=np.append(world.sigma_rho, sd[:, 0])[order],
+        sigma_theta=np.append(world.sigma_theta, sd[:, 1])[order],
+        echoes=echoes[order],
+        scans=tuple(scans[k] for k in order),
+        end_kinds=(),
+        end_cov=None,
+    )
 
 
 def assemble_grown_map(

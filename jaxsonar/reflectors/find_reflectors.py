@@ -44,6 +44,10 @@ class Reflector:
     """Numbers of their scans, ascending."""
     segment: Float[np.ndarray, "2 2"]
     """As a plane: its outermost points of reflection, metres."""
+    line: Float[np.ndarray, "2"]
+    """As a plane: (rho, theta) of its line in the world frame, metres and radians."""
+    line_cov: Float[np.ndarray, "2 2"]
+    """Covariance of the line."""
     evidence: float
     """Log-likelihood ratio to clutter, nats."""
     residual: Float[np.ndarray, " inliers"]
@@ -51,7 +55,7 @@ class Reflector:
     is_visible: bool
     """Whether no wall hides it, and enough of the measurements that point at it hear it."""
     is_wall: bool = False
-    """Whether it is a plane, or a wall of the map that may be one."""
+    """Whether a wall of the map describes it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +123,7 @@ def find_reflectors(
         if max(before / sigma, sigma / before) < settings.same_sigma:
             break
     found, replaced = _with_walls(walls, residual, heard, long, found, sigma + settings.model_error / settings.gate)
-    points_found = [one for one in found if not one.is_wall]
+    points_found = [one for one in found if not one.is_wall and one.kind != PLANE]
     position = np.array([one.position for one in points_found]).reshape(-1, 2)
     reach = settings.vertex_distance + np.nan_to_num([one.radius for one in points_found])
     replaced_points = (np.linalg.norm(points[:, None] - position, axis=-1) < reach).any(axis=1)
@@ -299,6 +303,8 @@ def _decided(
     if kind != CIRCLE:
         cov[2], cov[:, 2] = np.nan, np.nan
     ends = fits.plane_extent(measurements.origin[fits.rows])
+    rho, theta = fits.parameters[PLANE, :2]
+    to_world = np.array([[1.0, fits.origin @ tangent_of(theta)], [0.0, 1.0]])
     claimed = fits.rows[fits.inlier[probability > settings.min_claim].any(axis=0)]
     return Reflector(
         kind=kind,
@@ -309,6 +315,8 @@ def _decided(
         echoes=claimed,
         scans=tuple(np.unique(measurements.scan[claimed]).tolist()),
         segment=fits.nearest[PLANE] + ends[:, None] * tangent_of(fits.parameters[PLANE, 1]),
+        line=np.array([rho + fits.origin @ unit(theta), theta]),
+        line_cov=to_world @ fits.cov[PLANE, :2, :2] @ to_world.T,
         evidence=float(evidence[best]),
         residual=fits.residual[best, fits.inlier[best]],
         is_visible=bool(
@@ -327,7 +335,7 @@ def _with_walls(
     found: list[Reflector],
     sigma: float,
 ) -> tuple[list[Reflector], Bool[np.ndarray, " walls"]]:
-    """The reflectors, those marked that short walls of the map describe, and the short walls that others replace.
+    """The reflectors, those marked that walls of the map describe, and the short walls that others replace.
 
     Args:
         walls: both ends, metres.
@@ -346,9 +354,10 @@ def _with_walls(
         share = fits[rows].mean(axis=0).max(initial=0.0)
         on_wall = point_to_segments(one.position[None], walls).min(initial=np.inf) < settings.on_wall
         known = share > settings.replaced_share or (one.kind < 0 and on_wall)
+        known |= one.kind == PLANE and bool(on_wall)
         is_wall = known and one.probability[PLANE] >= settings.min_wall_probability
-        is_wall |= one.kind == PLANE
-        by_other[rows] = not is_wall
-        marked.append(replace(one, is_wall=bool(is_wall)))
+        by_other[rows] = not is_wall and one.kind != PLANE
+        is_doubtful = one.kind == PLANE and one.probability[PLANE] < settings.min_new_wall_probability
+        marked.append(replace(one, is_wall=bool(is_wall), kind=-1 if is_doubtful else one.kind))
     count = np.maximum(fits.sum(axis=0), 1)
     return marked, ~long & ((fits & by_other[:, None]).sum(axis=0) > settings.replaced_share * count)

@@ -172,8 +172,10 @@ class ExplainedEchoSettings:
     reflector is the same, metres."""
     min_wall_probability: float = 0.003
     """A short wall of the map remains if it may be a plane with this probability: most walls of maps are walls."""
+    min_new_wall_probability: float = 0.98
+    """A plane that the map lacks becomes a wall from this probability on, and is undecided below."""
     on_wall: float = 0.03
-    """An undecided reflector that may be a plane belongs to a wall that is this close, metres."""
+    """A plane, or an undecided reflector that may be one, belongs to a wall that is this close, metres."""
     replaced_share: float = 0.5
     """Share of the echoes of a short wall that other reflectors must explain before they replace it."""
     sigma_iterations: int = 3

@@ -6,7 +6,7 @@ import pytest
 from jaxsonar import Ring, Room, simulate
 from jaxsonar.detection.local_model import KIND_NAMES
 from jaxsonar.reflectors.find_reflectors import find_reflectors
-from jaxsonar.reflectors.kind_fit import CIRCLE, EDGE
+from jaxsonar.reflectors.kind_fit import CIRCLE, EDGE, PLANE
 from jaxsonar.reflectors.posed_scans import PosedScans
 from jaxsonar.reflectors.range_measurements import RangeMeasurements
 from jaxsonar.scans.scan_log import Log
@@ -62,6 +62,19 @@ def test_a_short_wall_of_the_map_at_a_column_is_replaced_and_a_true_one_remains(
     wall = found(measured(Room(walls)), walls)
     assert not wall.replaced_walls.any()
     assert all(one.is_wall for one in wall.reflectors)
+
+
+def test_a_wall_that_the_map_lacks_is_a_plane_with_its_line():
+    short = np.array([[[-0.3, 0.8], [0.5, 0.8]]])
+    reflectors = found(measured(Room(np.concatenate([WALLS, short])))).reflectors
+    (one,) = (other for other in reflectors if other.kind == PLANE)
+    assert not one.is_wall
+    assert one.probability[PLANE] > 0.98
+    error = one.line - np.array([0.8, np.pi / 2])
+    assert np.abs(error).max() < 0.01
+    assert error @ np.linalg.solve(one.line_cov, error) < 14.0  # 0.1 % of the errors of two parameters are larger
+    np.testing.assert_allclose(one.segment[:, 1], 0.8, atol=0.01)
+    assert ((one.segment[:, 0] > -0.4) & (one.segment[:, 0] < 0.6)).all()
 
 
 def test_points_of_the_map_on_a_column_are_replaced_and_others_remain():
