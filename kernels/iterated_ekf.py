@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .detection_cones import DEAF, SETTINGS, echo_level, visibility
-from .landmarks import AnyArray, Landmarks, landmark_echo, landmark_in_robot_frame
-from .measurement_model import EDGE, PLANE
+from .landmarks import AnyArray, Landmarks, landmark_echo, landmark_in_robot_frame, reflector_level
+from .measurement_model import PLANE
 from .planar_geometry import dot, normal, tangent
 from .sensor_array import EchoPaths, widen_cones
 
@@ -164,7 +164,7 @@ def expected_ranges(
         margin = EKF_SETTINGS.wall_margin
         beside = (along < landmark.extent[0] - margin) | (along > landmark.extent[1] + margin)
         level = echo_level(echo, eqx.tree_at(lambda p: p.cone, path, cone))
-        level += jnp.where(landmark.kind == EDGE, SETTINGS.edge_level_db, 0)
+        level += reflector_level(landmark.kind, landmark, echo.range)
         heard = (visibility(echo, path) > 0) | (echo.exists & (level > threshold))
         return jnp.where(heard & ((landmark.kind != PLANE) | ~beside), echo.range, jnp.inf)
 
