@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.geometry.segments import crossings, lengths, sample_segments
+from jaxsonar.kernels.detection_cones import SETTINGS as CONES
 from jaxsonar.occupancy.settings import SETTINGS
 
 _WALLS = SETTINGS.reflectors
@@ -118,6 +119,12 @@ class KnownReflectors(NamedTuple):
         radii[: len(self.points)] = self.point_radius
         return radii
 
+    def reflecting_levels(self) -> Float[np.ndarray, " points"]:
+        """Level of each of ``reflecting_points`` relative to a wall, dB: wall ends are faint."""
+        levels, points = np.zeros(len(self.reflecting_points())), len(self.points)
+        levels[points : points + 2 * len(self.walls)] = CONES.edge_level_db
+        return levels
+
     def cells(self, resolution: float) -> Int[np.ndarray, "cells 2"]:
         """Cells (column, row) of the world that the reflectors cover, with their uncertainty, without repetition."""
         length = lengths(self.walls)
@@ -147,44 +154,6 @@ class KnownReflectors(NamedTuple):
             off = np.maximum(np.abs(disc + 0.5 - at) - 0.5, 0)
             found.append(disc[(off**2).sum(axis=1) <= reach**2])
         return np.unique(np.concatenate(found), axis=0)
-
-
-def explained_by_reflectors(
-    known: KnownReflectors,
-    position: Float[np.ndarray, "echoes 2 2"],
-    heading: Float[np.ndarray, "echoes 2"],
-    half_width: Float[np.ndarray, "echoes 2"],
-    distance: Float[np.ndarray, " echoes"],
-) -> Bool[np.ndarray, " echoes"]:
-    """Which echoes have the range of a known wall, wall end, corner, point or circle within both cones.
-
-    Args:
-        known: the map around the echoes.
-        position: of transmitter and receiver of each echo, world frame, metres.
-        heading: of both, radians.
-        half_width: of their cones, radians.
-        distance: half path length, metres.
-    """
-    walls, points, radii = known.walls, known.reflecting_points(), known.reflecting_radii()
-    middle, half = position.mean(axis=1), (position[:, 1] - position[:, 0]) / 2
-    length = lengths(walls)
-    tangent = (walls[:, 1] - walls[:, 0]) / np.maximum(length, 1e-9)[:, None]
-    offset = middle[:, None] - walls[:, 0]
-    height = np.abs(offset[..., 0] * tangent[:, 1] - offset[..., 1] * tangent[:, 0])
-    along = (offset * tangent).sum(-1)
-    expected = np.hypot(height, half @ tangent.T)
-    foot = walls[:, 0] + along[..., None] * tangent
-    on_wall = np.abs(along - length / 2) <= length / 2 + _WALLS.beyond_end
-    to_point = np.linalg.norm(points - position[:, :, None], axis=-1).mean(axis=1) - radii
-    match = np.concatenate([np.where(on_wall, expected, np.inf), to_point], axis=1)
-    match = np.abs(match - distance[:, None]) <= _WALLS.explained
-    target = np.concatenate([foot, np.broadcast_to(points, (len(foot), *points.shape))], axis=1)
-    seen = np.ones(match.shape, bool)
-    for end in (0, 1):
-        ray = target - position[:, None, end]
-        off_axis = np.abs(wrap_angle(np.arctan2(ray[..., 1], ray[..., 0]) - heading[:, end, None]))
-        seen &= off_axis <= half_width[:, end, None] + _WALLS.beyond_cone
-    return np.asarray((match & seen).any(axis=1))
 
 
 def direction_of(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, " walls"]:

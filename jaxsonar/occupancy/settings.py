@@ -35,6 +35,12 @@ class ReflectorSettings:
     footpoint (paper, section 5)."""
     beyond_cone: float = float(np.radians(5.0))
     """A wall is strong enough to be detected this far outside the cone, radians."""
+    explained_outside: float = 0.04
+    """The same outside of the cones, for crosstalk, and for reflections at two walls, metres: half as much, because
+    more reflectors may agree by chance."""
+    hearing_threshold: float = -36.0
+    """Level of the faintest echoes that reflectors outside of the cones explain, dB
+    (``kernels.detection_cones.echo_level``); that of ``localize``."""
     drawn_sd: float = 2.0
     """Walls and points are drawn this many standard deviations wide."""
     max_drawn: float = 0.15
