@@ -43,7 +43,9 @@ class ReceivedEchoes(NamedTuple):
         """Some of the echoes."""
         return ReceivedEchoes(*(column[rows] for column in self))
 
-    def off_axis(self, rows: Int[np.ndarray, " some"], rays: Float[np.ndarray, "some 2 2"]) -> Float[np.ndarray, "some 2"]:
+    def off_axis(
+        self, rows: Int[np.ndarray, " some"], rays: Float[np.ndarray, "some 2 2"]
+    ) -> Float[np.ndarray, "some 2"]:
         """Angles of rays from both sensors of some echoes off their axes, radians."""
         return np.abs(wrap_angle(np.arctan2(rays[..., 1], rays[..., 0]) - self.heading[rows]))
 

@@ -3,9 +3,8 @@
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.geometry.segments import crossings, lengths, sample_segments
 from jaxsonar.kernels.detection_cones import SETTINGS as CONES
 from jaxsonar.occupancy.settings import SETTINGS
@@ -71,12 +70,15 @@ class KnownReflectors(NamedTuple):
     """Largest standard deviation of each point, and of the border of each circle, metres."""
     point_radius: Float[np.ndarray, " points"]
     """Radii of circles, metres; 0 for other points."""
+    circle_cov: Float[np.ndarray, "points 3 3"]
+    """Covariances of the (x, y, radius) of circles, square metres; 0 for other points."""
 
     @classmethod
     def of_walls(cls, walls: Float[np.ndarray, "walls 2 2"]) -> "KnownReflectors":
         """Exact walls without points. Walls without length are left out."""
         walls = walls[lengths(walls) > 0]
-        return cls(walls, np.zeros((len(walls), 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+        nothing = np.zeros(0)
+        return cls(walls, np.zeros((len(walls), 2)), np.zeros((0, 2)), nothing, nothing, circle_cov=np.zeros((0, 3, 3)))
 
     @classmethod
     def of_map(cls, world: ReflectorMap) -> "KnownReflectors":
@@ -91,16 +93,17 @@ class KnownReflectors(NamedTuple):
         sd = np.hypot(middle, lengths(walls) / 2 * sd_theta)
         covariance = np.nan_to_num(world.point_cov)
         point_sd = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0)) if len(covariance) else np.zeros(0)
-        radius_sd = np.sqrt(np.maximum(np.nan_to_num(world.point_circle_cov[:, 2, 2]), 0))
+        circle_cov = np.nan_to_num(world.point_circle_cov)
+        radius_sd = np.sqrt(np.maximum(circle_cov[:, 2, 2], 0))
         point_sd, radius = np.hypot(point_sd, radius_sd), np.nan_to_num(world.point_radius)
-        return cls(walls, np.stack([sd, sd], axis=-1), world.points, point_sd, radius)
+        return cls(walls, np.stack([sd, sd], axis=-1), world.points, point_sd, radius, circle_cov)
 
     def near(self, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]) -> "KnownReflectors":
         """The reflectors that may be in a box, metres."""
         wall = ((self.walls.max(axis=1) >= low) & (self.walls.min(axis=1) <= high)).all(axis=1)
         radius = self.point_radius[:, None]
         point = ((self.points + radius >= low) & (self.points - radius <= high)).all(axis=1)
-        of_points = (column[point] for column in (self.points, self.point_sd, self.point_radius))
+        of_points = (column[point] for column in self[2:])
         return KnownReflectors(self.walls[wall], self.wall_sd[wall], *of_points)
 
     def reflecting_points(self) -> Float[np.ndarray, "points 2"]:

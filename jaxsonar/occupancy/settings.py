@@ -45,6 +45,11 @@ class ReflectorSettings:
     """Walls and points are drawn this many standard deviations wide."""
     max_drawn: float = 0.15
     """... but at most this far to each side, metres."""
+    whole_circle: float = 0.2
+    """Circles up to this radius are drawn completely, larger ones only where readings confirm their border, metres;
+    the legs of a person, poles and most columns are smaller."""
+    border_beside: float = float(np.radians(15.0))
+    """The border of a circle is drawn this far beside a reflection, radians."""
     min_looks: int = 2
     """Readings that must look through a part of a wall, or of its extension, to show that there is none."""
     window: int = 2
