@@ -13,32 +13,40 @@ _WALLS = SETTINGS.reflectors
 
 
 def with_confirmed_borders(known: KnownReflectors, readings: FacingReadings, *, resolution: float) -> KnownReflectors:
-    """The reflectors to draw: large circles become points on those parts of their borders that readings confirm.
+    """The reflectors to draw: large uncertain circles become points where readings confirm their borders.
 
-    A map has large circles that are none, such as a wall of which few echoes were heard. The echoes prove only the part
-    of the border that they came from. Small circles are drawn completely.
+    A map has large circles that are none, such as a wall of which few echoes were heard. Echoes prove only the part of
+    the border that they came from. Small and certain circles are drawn completely, as wide as the side that is known
+    best: radius and distance of the center are correlated.
 
     Args:
         known: the map.
         readings: of all scans.
         resolution: distance of the points, metres.
     """
-    large = known.point_radius > _WALLS.whole_circle
-    points, sd = [known.points[~large]], [known.point_sd[~large]]
-    for row in np.flatnonzero(large):
+    partial = np.zeros(len(known.points), bool)
+    border, border_sd, sd = [np.zeros((0, 2))], [np.zeros(0)], known.point_sd.copy()
+    for row in np.flatnonzero((known.point_radius > 0) & known.circle_cov.any(axis=(1, 2))):
         center, radius = known.points[row], float(known.point_radius[row])
         count = int(np.ceil(2 * np.pi * radius / resolution))
         direction = unit((np.arange(count) + 0.5) * (2 * np.pi / count))
-        shown = _confirmed_sectors(center, radius, readings, count)
         # A point on the border moves with the center and with the radius.
-        jacobian = np.column_stack([direction, np.ones(count)])[shown]
-        variance = np.einsum("ni,ij,nj->n", jacobian, known.circle_cov[row], jacobian)
-        points.append(center + radius * direction[shown])
-        sd.append(np.sqrt(np.maximum(variance, 0)))
-    drawn, drawn_sd = np.concatenate(points), np.concatenate(sd)
-    radius = np.zeros(len(drawn))
-    radius[: (~large).sum()] = known.point_radius[~large]
-    return known._replace(points=drawn, point_sd=drawn_sd, point_radius=radius, circle_cov=np.zeros((len(drawn), 3, 3)))
+        jacobian = np.column_stack([direction, np.ones(count)])
+        across = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", jacobian, known.circle_cov[row], jacobian), 0))
+        partial[row] = radius > _WALLS.whole_circle and across.max() > _WALLS.certain_border
+        if partial[row]:
+            shown = _confirmed_sectors(center, radius, readings, count)
+            border.append(center + radius * direction[shown])
+            border_sd.append(across[shown])
+        else:
+            sd[row] = across.min()
+    border = np.concatenate(border)
+    return known._replace(
+        points=np.concatenate([known.points[~partial], border]),
+        point_sd=np.concatenate([sd[~partial], *border_sd]),
+        point_radius=np.concatenate([known.point_radius[~partial], np.zeros(len(border))]),
+        circle_cov=np.concatenate([known.circle_cov[~partial], np.zeros((len(border), 3, 3))]),
+    )
 
 
 def _confirmed_sectors(

@@ -10,7 +10,7 @@ from jaxsonar.occupancy.wall_profile import FacingReadings
 CENTER, RADIUS = np.array([0.4, -0.2]), 0.6
 
 
-def circle(radius=RADIUS, sd=0.0):
+def circle(radius=RADIUS, sd=0.06):
     """A map of one circle."""
     point = CENTER[None]
     return KnownReflectors(
@@ -61,16 +61,22 @@ def test_readings_that_look_through_or_away_confirm_nothing():
     assert found.min() < 0.3
 
 
-def test_small_circles_are_drawn_completely_and_a_border_is_as_uncertain_as_it_is():
-    small = circle(radius=0.1)
-    for readings in (around(np.zeros(0)), around(np.zeros(5))):
-        drawn = with_confirmed_borders(small, readings, resolution=0.05)
-        np.testing.assert_array_equal(drawn.points, small.points)
-        assert drawn.point_radius.tolist() == [0.1]
+def test_small_and_certain_circles_are_drawn_completely():
+    for known in (circle(radius=0.1), circle(sd=0.01)):
+        for readings in (around(np.zeros(0)), around(np.zeros(5))):
+            drawn = with_confirmed_borders(known, readings, resolution=0.05)
+            np.testing.assert_array_equal(drawn.points, known.points)
+            np.testing.assert_array_equal(drawn.point_radius, known.point_radius)
+
+
+def test_a_border_is_as_uncertain_as_it_is_in_its_direction():
     # Independent errors of position and radius add up in every direction.
-    drawn = with_confirmed_borders(circle(sd=0.01), around(np.linspace(0, 6, 60)), resolution=0.05)
-    np.testing.assert_allclose(drawn.point_sd, 0.01 * np.sqrt(2))
+    drawn = with_confirmed_borders(circle(), around(np.linspace(0, 6, 60)), resolution=0.05)
+    np.testing.assert_allclose(drawn.point_sd, 0.06 * np.sqrt(2))
     # Center and radius that move together leave the near side where it is.
-    known = circle()._replace(circle_cov=np.outer([0.01, 0, -0.01], [0.01, 0, -0.01])[None])
+    together = np.outer([0.1, 0, -0.1], [0.1, 0, -0.1])[None]
+    known = circle()._replace(circle_cov=together)
     drawn = with_confirmed_borders(known, around(np.linspace(-0.1, 0.1, 5)), resolution=0.05)
-    assert drawn.point_sd.max() < 0.002
+    assert drawn.point_sd.max() < 0.02
+    known = circle(radius=0.1)._replace(point_sd=np.full(1, 0.1), circle_cov=together)
+    assert with_confirmed_borders(known, around(np.zeros(0)), resolution=0.05).point_sd[0] < 0.01
