@@ -3,10 +3,13 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsonar import kernels
+from jaxsonar.kernels.sensor_array import EchoPaths
 from jaxsonar.kernels.shape_buckets import bucket_size, next_power_of_two, pad_rows
 from jaxsonar.occupancy.settings import SETTINGS
 from jaxsonar.sensors.ring import Ring
@@ -74,9 +77,25 @@ class ArcTable(NamedTuple):
     weight: Float[np.ndarray, "arcs entries"]
 
 
+def soft_paths(ring: Ring) -> EchoPaths:
+    """The echo paths, each with the arc of a direct path.
+
+    Within two nominal cones, a wall is heard in the narrow range of directions that both cones share. Real beams end
+    gradually: an echo is loud enough if the sum of its two losses is small, for neighbors in almost the same range of
+    directions as for one sensor (``kernels.detection_cones.echo_level``).
+    """
+    paths = ring.echo_paths
+    beam = np.minimum(np.asarray(ring.beam)[ring.paths].min(axis=1), np.pi)
+    start, width = np.asarray(paths.start), np.asarray(paths.width)
+    wide = np.where(width > 0, np.maximum(beam, width), 0).astype(width.dtype)
+    return eqx.tree_at(
+        lambda p: (p.start, p.width), paths, (jnp.asarray(start + (width - wide) / 2), jnp.asarray(wide))
+    )
+
+
 def arc_points(ring: Ring, resolution: float) -> int:
     """Number of points of an arc: at most a cell apart on the longest."""
-    width = float(np.asarray(ring.echo_paths.width).max())
+    width = float(np.asarray(soft_paths(ring).width).max())
     return bucket_size(int(np.ceil(1.25 * ring.max_range * width / resolution)), least=16)
 
 
@@ -99,7 +118,7 @@ def arc_table(
         walls: known walls, which hide the cells behind them.
         resolution: side of a cell, metres.
     """
-    paths, points = ring.echo_paths, arc_points(ring, resolution)
+    paths, points = soft_paths(ring), arc_points(ring, resolution)
     entries = 2 * points
     cell, weight = np.zeros((len(arcs.path), entries), np.int32), np.zeros((len(arcs.path), entries), np.float32)
     origin = np.array([*corner, 0]) * [resolution, resolution, 0.0]

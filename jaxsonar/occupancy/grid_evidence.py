@@ -12,7 +12,8 @@ from jaxsonar.hardware.errors import SonarError
 from jaxsonar.kernels.shape_buckets import pad_rows
 from jaxsonar.occupancy.direct_readings import DirectReadings, TransducerArrays, footprint_cells
 from jaxsonar.occupancy.echo_arcs import EchoArcs, arc_points, walls_near
-from jaxsonar.occupancy.known_reflectors import KnownReflectors, explained_by_reflectors
+from jaxsonar.occupancy.echo_attribution import explained_by_map
+from jaxsonar.occupancy.known_reflectors import KnownReflectors
 from jaxsonar.occupancy.settings import SETTINGS
 from jaxsonar.scans.flat_echoes import FlatEchoes
 from jaxsonar.scans.scan_log import Log
@@ -280,16 +281,11 @@ class GridEvidence:
     def _unexplained(self, arcs: EchoArcs, known: KnownReflectors) -> EchoArcs:
         """The arcs that no known reflector explains."""
         explained = np.zeros(len(arcs.path), bool)
-        ring, reach = self.ring, self.sensors.max_distance + SETTINGS.reflectors.explained
-        heading, half_width = np.asarray(ring.heading), self.sensors.half_width
+        reach = self.sensors.max_distance + SETTINGS.reflectors.explained
         for begin in range(0, len(explained), 1024):
-            here = slice(begin, begin + 1024)
-            pose, ends = arcs.pose[here], ring.paths[arcs.path[here]]
-            near = known.near(pose[:, :2].min(axis=0) - reach, pose[:, :2].max(axis=0) + reach)
-            position = transform_points(pose[:, None], np.asarray(ring.position)[ends])
-            explained[here] = explained_by_reflectors(
-                near, position, heading[ends] + pose[:, None, 2], half_width[ends], arcs.distance[here]
-            )
+            part = EchoArcs(*(column[begin : begin + 1024] for column in arcs))
+            near = known.near(part.pose[:, :2].min(axis=0) - reach, part.pose[:, :2].max(axis=0) + reach)
+            explained[begin : begin + 1024] = explained_by_map(near, self.ring, part)
         return EchoArcs(*(column[~explained] for column in arcs))
 
 

@@ -3,10 +3,10 @@
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from jaxsonar.geometry.se2 import wrap_angle
 from jaxsonar.geometry.segments import crossings, lengths, sample_segments
+from jaxsonar.kernels.detection_cones import SETTINGS as CONES
 from jaxsonar.occupancy.settings import SETTINGS
 
 _WALLS = SETTINGS.reflectors
@@ -70,12 +70,15 @@ class KnownReflectors(NamedTuple):
     """Largest standard deviation of each point, and of the border of each circle, metres."""
     point_radius: Float[np.ndarray, " points"]
     """Radii of circles, metres; 0 for other points."""
+    circle_cov: Float[np.ndarray, "points 3 3"]
+    """Covariances of the (x, y, radius) of circles, square metres; 0 for other points."""
 
     @classmethod
     def of_walls(cls, walls: Float[np.ndarray, "walls 2 2"]) -> "KnownReflectors":
         """Exact walls without points. Walls without length are left out."""
         walls = walls[lengths(walls) > 0]
-        return cls(walls, np.zeros((len(walls), 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+        nothing = np.zeros(0)
+        return cls(walls, np.zeros((len(walls), 2)), np.zeros((0, 2)), nothing, nothing, circle_cov=np.zeros((0, 3, 3)))
 
     @classmethod
     def of_map(cls, world: ReflectorMap) -> "KnownReflectors":
@@ -90,16 +93,17 @@ class KnownReflectors(NamedTuple):
         sd = np.hypot(middle, lengths(walls) / 2 * sd_theta)
         covariance = np.nan_to_num(world.point_cov)
         point_sd = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0)) if len(covariance) else np.zeros(0)
-        radius_sd = np.sqrt(np.maximum(np.nan_to_num(world.point_circle_cov[:, 2, 2]), 0))
+        circle_cov = np.nan_to_num(world.point_circle_cov)
+        radius_sd = np.sqrt(np.maximum(circle_cov[:, 2, 2], 0))
         point_sd, radius = np.hypot(point_sd, radius_sd), np.nan_to_num(world.point_radius)
-        return cls(walls, np.stack([sd, sd], axis=-1), world.points, point_sd, radius)
+        return cls(walls, np.stack([sd, sd], axis=-1), world.points, point_sd, radius, circle_cov)
 
     def near(self, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]) -> "KnownReflectors":
         """The reflectors that may be in a box, metres."""
         wall = ((self.walls.max(axis=1) >= low) & (self.walls.min(axis=1) <= high)).all(axis=1)
         radius = self.point_radius[:, None]
         point = ((self.points + radius >= low) & (self.points - radius <= high)).all(axis=1)
-        of_points = (column[point] for column in (self.points, self.point_sd, self.point_radius))
+        of_points = (column[point] for column in self[2:])
         return KnownReflectors(self.walls[wall], self.wall_sd[wall], *of_points)
 
     def reflecting_points(self) -> Float[np.ndarray, "points 2"]:
@@ -117,6 +121,12 @@ class KnownReflectors(NamedTuple):
         radii = np.zeros(len(self.reflecting_points()))
         radii[: len(self.points)] = self.point_radius
         return radii
+
+    def reflecting_levels(self) -> Float[np.ndarray, " points"]:
+        """Level of each of ``reflecting_points`` relative to a wall, dB: wall ends are faint."""
+        levels, points = np.zeros(len(self.reflecting_points())), len(self.points)
+        levels[points : points + 2 * len(self.walls)] = CONES.edge_level_db
+        return levels
 
     def cells(self, resolution: float) -> Int[np.ndarray, "cells 2"]:
         """Cells (column, row) of the world that the reflectors cover, with their uncertainty, without repetition."""
@@ -147,44 +157,6 @@ class KnownReflectors(NamedTuple):
             off = np.maximum(np.abs(disc + 0.5 - at) - 0.5, 0)
             found.append(disc[(off**2).sum(axis=1) <= reach**2])
         return np.unique(np.concatenate(found), axis=0)
-
-
-def explained_by_reflectors(
-    known: KnownReflectors,
-    position: Float[np.ndarray, "echoes 2 2"],
-    heading: Float[np.ndarray, "echoes 2"],
-    half_width: Float[np.ndarray, "echoes 2"],
-    distance: Float[np.ndarray, " echoes"],
-) -> Bool[np.ndarray, " echoes"]:
-    """Which echoes have the range of a known wall, wall end, corner, point or circle within both cones.
-
-    Args:
-        known: the map around the echoes.
-        position: of transmitter and receiver of each echo, world frame, metres.
-        heading: of both, radians.
-        half_width: of their cones, radians.
-        distance: half path length, metres.
-    """
-    walls, points, radii = known.walls, known.reflecting_points(), known.reflecting_radii()
-    middle, half = position.mean(axis=1), (position[:, 1] - position[:, 0]) / 2
-    length = lengths(walls)
-    tangent = (walls[:, 1] - walls[:, 0]) / np.maximum(length, 1e-9)[:, None]
-    offset = middle[:, None] - walls[:, 0]
-    height = np.abs(offset[..., 0] * tangent[:, 1] - offset[..., 1] * tangent[:, 0])
-    along = (offset * tangent).sum(-1)
-    expected = np.hypot(height, half @ tangent.T)
-    foot = walls[:, 0] + along[..., None] * tangent
-    on_wall = np.abs(along - length / 2) <= length / 2 + _WALLS.beyond_end
-    to_point = np.linalg.norm(points - position[:, :, None], axis=-1).mean(axis=1) - radii
-    match = np.concatenate([np.where(on_wall, expected, np.inf), to_point], axis=1)
-    match = np.abs(match - distance[:, None]) <= _WALLS.explained
-    target = np.concatenate([foot, np.broadcast_to(points, (len(foot), *points.shape))], axis=1)
-    seen = np.ones(match.shape, bool)
-    for end in (0, 1):
-        ray = target - position[:, None, end]
-        off_axis = np.abs(wrap_angle(np.arctan2(ray[..., 1], ray[..., 0]) - heading[:, end, None]))
-        seen &= off_axis <= half_width[:, end, None] + _WALLS.beyond_cone
-    return np.asarray((match & seen).any(axis=1))
 
 
 def direction_of(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, " walls"]:

@@ -9,6 +9,7 @@ from scipy import ndimage
 from jaxsonar import kernels
 from jaxsonar.geometry.segments import lengths
 from jaxsonar.kernels.shape_buckets import bucket_size, next_power_of_two, pad_rows
+from jaxsonar.occupancy.circle_profile import with_confirmed_borders
 from jaxsonar.occupancy.echo_arcs import arc_table
 from jaxsonar.occupancy.grid_evidence import GridEvidence
 from jaxsonar.occupancy.known_reflectors import KnownReflectors, direction_of
@@ -88,7 +89,8 @@ def assemble_grid(
     model: BayesSettings = parameters or getattr(SETTINGS, evidence.method)
     found, viewpoints = _obstacle_evidence(evidence, profile, model)
     robot = (evidence.footprint > 0) | _swept(evidence, readings)
-    walls = area.mask(profile.parts.cells(resolution)) & ~robot
+    drawn = with_confirmed_borders(profile.parts, readings, resolution=resolution)
+    walls = area.mask(drawn.cells(resolution)) & ~robot
     obstacle = (found > model.occupied) & ~robot
     if evidence.method == "counts":
         obstacle &= viewpoints >= SETTINGS.min_viewpoints

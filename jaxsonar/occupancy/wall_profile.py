@@ -226,9 +226,7 @@ def profile_walls(known: KnownReflectors, readings: FacingReadings, *, resolutio
         along = np.where(along < 0, np.maximum(along, limit[0]), np.minimum(along, limit[1]))
         for first, last in along[along[:, 1] - along[:, 0] > 1e-6]:
             extensions.append(walls[wall, 0] + np.array([[first], [last]]) * tangent[wall])
-    found = KnownReflectors(
-        np.array(parts).reshape(-1, 2, 2), np.array(sd).reshape(-1, 2), known.points, known.point_sd, known.point_radius
-    )
+    found = known._replace(walls=np.array(parts).reshape(-1, 2, 2), wall_sd=np.array(sd).reshape(-1, 2))
     return WallProfile(found, np.array(extensions).reshape(-1, 2, 2))
 
 

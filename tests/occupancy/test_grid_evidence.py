@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.firings import explicit, fire_in_turn, repeat_readings
 from support.grid_layers import assert_same_evidence, evidence_of, layers
-from support.hard_cones import simulate
 from support.rooms import loop
 
-from jaxsonar import Log, Ring
+from jaxsonar import Log, Ring, simulate
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.occupancy import grid_evidence
 from jaxsonar.occupancy.direct_readings import certain_angle

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from jaxsonar import GlobalMap
-from jaxsonar.occupancy.known_reflectors import KnownReflectors, explained_by_reflectors
+from jaxsonar.occupancy.echo_attribution import ReceivedEchoes, explained_by_reflectors
+from jaxsonar.occupancy.known_reflectors import KnownReflectors
 
 
 def test_a_circle_of_the_map_is_drawn_as_a_disc_with_its_uncertainty():
@@ -39,5 +40,6 @@ def test_a_circle_of_the_map_is_drawn_as_a_disc_with_its_uncertainty():
     # Its echoes are explained by its border, not by its center.
     sensor = np.array([[[0.0, -0.52], [0.0, -0.52]]] * 2)
     ranges = np.array([1.013 - 0.23, 1.013])
-    explained = explained_by_reflectors(exact, sensor, np.zeros((2, 2)), np.full((2, 2), 0.3), ranges)
+    echoes = ReceivedEchoes(sensor, np.zeros((2, 2)), np.full((2, 2), 0.3), ranges)
+    explained = explained_by_reflectors(exact, echoes)
     assert explained.tolist() == [True, False]

@@ -5,9 +5,8 @@ import ast
 import cv2
 import numpy as np
 import pytest
-from support.hard_cones import simulate
 
-from jaxsonar import Ring
+from jaxsonar import Ring, simulate
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.occupancy.incremental_grid import occupancy
 from jaxsonar.occupancy.nav2_map import grid_image_filename, save_nav2

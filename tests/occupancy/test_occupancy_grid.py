@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import shapely
 from support.grid_layers import assert_same_grid, grid_of_parts
-from support.hard_cones import simulate
 
-from jaxsonar import Log, Ring, random_pose, random_room
+from jaxsonar import Log, Ring, random_pose, random_room, simulate
 from jaxsonar.floor_plans.room import Room
 from jaxsonar.geometry.se2 import rotation
 from jaxsonar.geometry.segments import point_to_segments
@@ -30,9 +29,7 @@ RING = Ring.circular()
 @pytest.fixture(scope="module")
 def heard(office):
     """A log of the office."""
-    simulation = simulate(
-        office.ring, office.room, office.poses, sigma=0.003, seed=1, stamps=office.stamps, beams="hard"
-    )
+    simulation = simulate(office.ring, office.room, office.poses, sigma=0.003, seed=1, stamps=office.stamps)
     return simulation.as_log(office.ring, office.poses)
 
 
@@ -44,7 +41,7 @@ def office_grid(office, heard):
 def listen(ring, walls, poses, *, poles=(), **errors):
     """A simulated log at the given poses."""
     room = Room(np.array(walls).reshape(-1, 2, 2), (), np.array(poles).reshape(-1, 2))
-    return simulate(ring, room, poses, beams="hard", **errors).as_log(ring, poses)
+    return simulate(ring, room, poses, **errors).as_log(ring, poses)
 
 
 def silent(poses, ring=RING):
@@ -140,7 +137,7 @@ def test_the_grid_is_equivariant_under_quarter_turns(office, heard, known):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("errors", [{}, {"clutter": 0.2, "dropout": 0.3}], ids=["clean", "clutter and loss"])
+@pytest.mark.parametrize("errors", [{}, {"clutter": 0.07, "dropout": 0.3}], ids=["clean", "clutter and loss"])
 def test_free_cells_are_truly_free_and_most_cells_near_the_robot_are_known(faw_ring, seed, errors):
     rng = np.random.default_rng(seed)
     room = random_room(rng)
@@ -165,7 +162,8 @@ def test_unknown_walls_become_obstacles(faw_ring, seed):
     rng = np.random.default_rng(seed)
     room = random_room(rng, recess=0.0, box=0.0, segment=0.0, pole=0.0)
     poses = free_trajectory(rng, room, step=0.05)
-    log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed).as_log(faw_ring, poses)
+    # Nothing explains crosstalk here, so that only hard cones give clean obstacles.
+    log = simulate(faw_ring, room, poses, sigma=0.003, seed=seed, beams="hard").as_log(faw_ring, poses)
     grid = occupancy(faw_ring, log)
     image, points = grid.classify(), centers(grid)
     assert truly_free(room, points)[image == FREE].mean() > 0.85
@@ -343,7 +341,7 @@ def test_readings_refute_a_part_of_a_wall_and_echoes_confirm_it():
 def test_edges_near_each_other_may_be_the_ends_of_a_wall_that_no_sensor_faced():
     ends = np.array([[0.0, 1.0], [0.5, 1.0], [3.0, 1.0]])
     points = ends, np.zeros(3), np.zeros(3)
-    known, none = KnownReflectors(np.zeros((0, 2, 2)), np.zeros((0, 2)), *points), np.zeros((0, 2))
+    known, none = KnownReflectors(np.zeros((0, 2, 2)), np.zeros((0, 2)), *points, np.zeros((3, 3, 3))), np.zeros((0, 2))
     found = hidden_walls(known, none, NOTHING, resolution=0.05)
     assert found[..., 0].min() == 0.0
     assert found[..., 0].max() == 0.5  # the third is too far away
