@@ -89,7 +89,8 @@ def test_a_distant_competitor_changes_nothing_and_an_identical_one_shares_the_ec
     error = np.asarray(beside.parameters[1] - EDGE_POINT, float)
     assert error @ np.linalg.solve(np.asarray(beside.covariance[1], float), error) < 16
     twice = wall_and_rows(both, [(PLANE, WALL)])
-    np.testing.assert_allclose(twice.parameters[0], alone.parameters[0], atol=1e-4)
+    sd = np.sqrt(np.diag(alone.covariance[0]))
+    assert (np.abs(twice.parameters[0] - alone.parameters[0]) < 0.5 * sd).all()
     # Two equal reflectors explain half of each echo, and nothing tells whose it is.
     assert (np.diag(twice.covariance[0]) > 1.9 * np.diag(alone.covariance[0])).all()
 
@@ -97,9 +98,9 @@ def test_a_distant_competitor_changes_nothing_and_an_identical_one_shares_the_ec
 def test_covariances_of_ambiguous_echoes_are_larger(rng):
     path, ranges = echoes_of(plane_echo, WALL, rng)
     off = ranges.copy()
-    off[::4] += 3.5 * SIGMA * np.where(np.arange(len(off[::4])) % 2, 1, -1)
+    off[::2] += 3.5 * SIGMA * np.where(np.arange(len(off[::2])) % 2, 1, -1)
     clear, ambiguous = wall_and_rows(scan_of(path, ranges)), wall_and_rows(scan_of(path, off))
-    assert np.linalg.det(ambiguous.covariance[0]) > 1.2 * np.linalg.det(clear.covariance[0])
+    assert np.linalg.det(ambiguous.covariance[0]) > 1.5 * np.linalg.det(clear.covariance[0])
     for fit in (clear, ambiguous):
         assert np.linalg.eigvalsh(np.asarray(fit.covariance[0], np.float64)).min() > 0
 
