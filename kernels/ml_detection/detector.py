@@ -36,6 +36,7 @@ from ..robust_fit import (
 )
 from ..sensor_array import EchoPaths, transform_path
 from .circles import fit_circles, nearest_point
+from .joint_refinement import refine_jointly
 from .likelihood import (
     clutter_log_density,
     hears_outside_cones,
@@ -151,7 +152,7 @@ def detect_in_scan(
     def one_pass(state: tuple[SceneEstimate, Float[Array, "3 k 2"]], _: None):
         scene, parameters = state
         hypotheses = evaluate_hypotheses(scan, parameters, scene, settings)
-        selection = select_reflectors(scan, hypotheses, usable, settings)
+        selection = select_reflectors(scan, hypotheses, usable, scene, settings)
         selected = hypotheses.take(selection.hypothesis)
         scene = update_scene(scan, selected, selection, scene, sigma, settings)
         return (scene, hypotheses.parameters.reshape(parameters.shape)), (selected, selection, scene.sigma)
@@ -160,8 +161,13 @@ def detect_in_scan(
     (scene, _), passes = jax.lax.scan(one_pass, start, None, length=settings.passes)
     selected, selection, final_sigma = jax.tree.map(lambda leaf: leaf[-1], passes)
 
-    # Fit the selected reflectors as circles, and let the four kinds compete.
+    # Refine all of them together: they compete for the echoes.
     clutter = clutter_log_density(scan, scene, settings)
+    exists = selection.evidence > -jnp.inf
+    joint = refine_jointly(scan, selection.kind, selected.parameters, exists, clutter, scene, settings)
+    selected = selected._replace(parameters=jnp.where(exists[:, None], joint.parameters, selected.parameters))
+
+    # Fit the selected reflectors as circles, and let the four kinds compete.
     circles = fit_circles(scan, selected, selection, clutter, scene, settings)
     kind, probability = compare_with_circles(selection, circles.evidence, settings)
 
@@ -171,7 +177,7 @@ def detect_in_scan(
     folded = is_plane & (selected.parameters[:, 0] < 0)
     parameters = jnp.where(is_plane[:, None], line, selected.parameters)
     parameters = jnp.where(is_circle[:, None], jax.vmap(nearest_point)(circles.circle), parameters)
-    covariance = jax.vmap(lambda one: one.covariance)(selected)
+    covariance = joint.covariance
     signs = np.array([[[1.0, -1.0], [-1.0, 1.0]]], np.float32)  # rho changes its sign, theta does not
     covariance = jnp.where(folded[:, None, None], covariance * signs, covariance)
     each_segment = jax.vmap(lambda x, involved: segment_endpoints(x[0], x[1], echo_paths.midpoint, involved))
@@ -292,7 +298,11 @@ def evaluate_hypotheses(
 
 
 def select_reflectors(
-    scan: ScanData, hypotheses: Hypotheses, usable: Bool[Array, " k"], settings: DetectionSettings
+    scan: ScanData,
+    hypotheses: Hypotheses,
+    usable: Bool[Array, " k"],
+    scene: SceneEstimate,
+    settings: DetectionSettings,
 ) -> Selection:
     """Select hypotheses greedily by their evidence, each with the echoes that are left when its turn comes."""
     positive = hypotheses.log_ratio > 0
@@ -314,8 +324,9 @@ def select_reflectors(
     shared = jnp.dot(involved.astype(counted.dtype), counted.T, precision=exact)
     half = 2 * shared >= involved.sum(axis=1, dtype=shared.dtype)[:, None]
     by_kind = jnp.where(half, score, -jnp.inf).reshape(len(best), 3, -1).max(axis=2)
-    handicap = jnp.asarray([settings.plane_handicap, 0, 0], by_kind.dtype)
-    log_odds = settings.tempering * (by_kind - handicap[None])
+    outside = hears_outside_cones(scene)
+    handicap = jnp.where(outside, settings.plane_handicap_outside, settings.plane_handicap).astype(by_kind.dtype)
+    log_odds = settings.tempering * by_kind.at[:, PLANE].add(-handicap)
     log_odds = jnp.where(jnp.isfinite(log_odds).any(axis=1, keepdims=True), log_odds, 0)
     return Selection(
         hypothesis=best,
