@@ -1,5 +1,6 @@
 """Strict settings and shared fixtures: rank and dtype promotion are errors, as are warnings (pyproject)."""
 
+import collections
 import contextlib
 import dataclasses
 import gc
@@ -54,14 +55,49 @@ from jaxsonar.fileio.compilation_cache import use_compilation_cache  # noqa: E40
 use_compilation_cache()  # shared with the commands and between test processes
 
 
+MAX_MEMORY_MAPS = 40_000
+"""Linux allows 65530 per process. A compiled detection has about 1800, and a module of tests adds fewer than 20000."""
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _few_executables():
-    """Drops compiled programs before the process has more memory maps than Linux allows (65530), which ends it."""
+    """Drops compiled programs before the process has more memory maps than Linux allows, which ends it.
+
+    Tracing them again takes seconds each, so the limit is as high as possible.
+    """
     yield
     maps = pathlib.Path("/proc/self/maps")
-    if maps.exists() and len(maps.read_bytes().splitlines()) > 25_000:
+    if maps.exists() and maps.read_bytes().count(b"\n") > MAX_MEMORY_MAPS:
         jax.clear_caches()
         gc.collect()
+
+
+def group_of(nodeid):
+    """The folder of a test. Its tests share programs; those of documentation and demo also share a finished demo."""
+    folder = nodeid.split("::")[0].rsplit("/", 1)[0]
+    return "tests/demo" if folder == "tests/project" else folder
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """With ``--dist loadfile``, one process runs all tests of a folder: each program is traced and compiled once."""
+    if config.getoption("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class FolderScheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            return group_of(nodeid)
+
+    config.option.loadscopereorder = False  # the order is that of the collection
+    return FolderScheduling(config, log)
+
+
+def pytest_collection_modifyitems(config, items):
+    """Processes that share the work begin with the folders of most slow tests, so that they end together."""
+    if hasattr(config, "workerinput"):
+        slow = collections.Counter(group_of(item.nodeid) for item in items if item.get_closest_marker("slow"))
+        items.sort(key=lambda item: (-slow[group_of(item.nodeid)], group_of(item.nodeid)))
 
 
 @pytest.fixture
