@@ -161,8 +161,8 @@ def test_a_kidnapped_robot_starts_a_new_submap():
     heard = simulate(RING, ROOM, poses, sigma=SIGMA, seed=3).as_log(RING, odometry)
     tracker = Tracker(ring=RING, sigma=SIGMA)
     state, steps = tracker.start(), []
-    for scan in heard:
-        state, step = tracker.step(state, scan)
+    for scan, model in zip(heard, local_models(RING, heard), strict=True):
+        state, step = tracker.step(state, scan, model=model)
         steps.append(step)
     assert len(state.graph.submaps) >= 1
     assert len(state.graph.submaps[0].rows) > 8
