@@ -3,6 +3,7 @@
 import collections
 import contextlib
 import dataclasses
+import functools
 import gc
 import inspect
 import pathlib
@@ -29,6 +30,27 @@ def _has_no_shapes(annotation):
     return not is_array and all(map(_has_no_shapes, get_args(annotation)))
 
 
+CHECKED_CALLS = 100
+"""In each test, shapes are checked in the first calls of a function: a check takes longer than a small function."""
+
+_test_count = 0
+
+
+def _checked_first(checked, function):
+    """A function that checks the shapes of its first calls in every test."""
+    test, calls = -1, 0
+
+    @functools.wraps(checked)
+    def call(*arguments, **options):
+        nonlocal test, calls
+        if test != _test_count:
+            test, calls = _test_count, 0
+        calls += 1
+        return (checked if calls <= CHECKED_CALLS else function)(*arguments, **options)
+
+    return call
+
+
 def _jaxtyped_where_needed(target=None, *, typechecker):
     """``jaxtyped``, but without its binding of arguments for functions without shapes in their signature.
 
@@ -40,7 +62,9 @@ def _jaxtyped_where_needed(target=None, *, typechecker):
     is_dataclass = dataclasses.is_dataclass(target) and inspect.isclass(target)
     function = vars(target).get("__init__") if is_dataclass else target
     if not isinstance(function, types.FunctionType) or not all(map(_has_no_shapes, function.__annotations__.values())):
-        return _jaxtyped(target, typechecker=typechecker)  # pyright: ignore
+        checked = _jaxtyped(target, typechecker=typechecker)  # pyright: ignore
+        is_function = isinstance(target, types.FunctionType)
+        return _checked_first(checked, target) if is_function else checked
     checked = typechecker(function)
     if function is target:
         return checked
@@ -53,6 +77,11 @@ jaxtyping.jaxtyped = _jaxtyped_where_needed
 from jaxsonar.fileio.compilation_cache import use_compilation_cache  # noqa: E402  imports from here on are type-checked
 
 use_compilation_cache()  # shared with the commands and between test processes
+
+
+def pytest_runtest_setup():
+    global _test_count
+    _test_count += 1
 
 
 MAX_MEMORY_MAPS = 40_000
