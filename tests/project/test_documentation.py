@@ -4,20 +4,17 @@ A block that is not run has an HTML comment with the reason in the line above it
 that needs a recording has ``<!-- needs: NAME -->``; it is skipped where the recording is absent.
 """
 
-import contextlib
 import json
 import math
 import os
 import re
-import signal
-import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import pytest
+from support.documented_blocks import run_bash, run_python
 from support.recordings import recorded
 
 ROOT = Path(__file__).parents[2]
@@ -69,41 +66,27 @@ def folder(short_demo):
 @pytest.mark.slow
 @pytest.mark.parametrize("block", RUN, ids=lambda block: f"{block.page}:{block.line}")
 def test_a_block_runs_as_printed(block, folder):
-    """In one folder, page by page, in processes of their own."""
+    """In one folder, page by page."""
     if re.search(r"parquet|jaxsonar batch", block.text):
         pytest.importorskip("pyarrow")
     environment = {
         **os.environ,
         "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
         "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])),
-        # Examples in Python share the programs that the commands compile.
+        # Processes share compiled programs with this one.
         "JAX_COMPILATION_CACHE_DIR": getattr(jax.config, "jax_compilation_cache_dir", None) or "",
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
     }
     if block.recording:
         environment[block.recording.upper()] = str(recorded(block.recording))
-    program = {"bash": ["bash", "-euo", "pipefail", "-c"], "python": [sys.executable, "-c"]}[block.language]
-    returncode, output = run_in_group([*program, block.text], folder, environment)
+    if block.language == "python":
+        returncode, output = run_python(block.text, folder)
+    else:
+        returncode, output = run_bash(block.text, folder, environment)
     assert returncode == 0, output[-2000:]
     kind = (block.page, block.language, block.recording)
     if block is next(one for one in RUN if (one.page, one.language, one.recording) == kind):
         CHECKS.get(kind, lambda output, folder: None)(output, folder)
-
-
-def run_in_group(command, folder, environment):
-    """(exit code, output) of a command; what it left running in the background is killed."""
-    with tempfile.TemporaryFile() as output:
-        process = subprocess.Popen(
-            command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
-        )
-        try:
-            returncode = process.wait(900)
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait(60)
-        output.seek(0)
-        return returncode, output.read().decode()
 
 
 def check_first_example(output, folder):
