@@ -105,8 +105,8 @@ def _load_known_map(map_filename: str, messages: InputMessages) -> "GlobalMap":
             raise not_a_map from None
         messages.warn_of_room(room)
         world = map_from_room(room)
-    if not len(world):
-        raise SonarError(f"{shown(map_filename)}: no wall; allowed is a map with walls")
+    if not len(world) + len(world.points):
+        raise SonarError(f"{shown(map_filename)}: neither wall nor point; allowed is a map with walls")
     return world
 
 

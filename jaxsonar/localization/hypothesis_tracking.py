@@ -146,16 +146,21 @@ class HypothesisTracker:
     def chance_nats(self) -> float:
         """Evidence per echo that a scan gains by chance: at poses all over the map, fitted like the hypotheses, nats.
 
-        It depends on the map and on how widely the sensors hear, which no constant covers.
+        It depends on the map and on how widely the sensors hear, which no constant covers. In a bare corridor many of
+        these poses are as good as the true one, so that little speaks for any place.
         """
         low, high = self.known_map.bounds
         drawn = np.random.default_rng(0).uniform([*low, -np.pi], [*high, np.pi], (SETTINGS.chance_poses, 3))
         start, gained = self._at(list(drawn)), []
-        for number in np.unique(np.linspace(0, len(self.rows) - 1, SETTINGS.chance_scans).round().astype(int)):
-            found = self._update_all(start.pose, start.covariance, int(number), UPDATE_SETTINGS.iterations[False])
+        heard = np.flatnonzero(self.echo_counts)
+        if not len(heard):
+            return 0.0
+        chosen = heard[np.unique(np.linspace(0, len(heard) - 1, SETTINGS.chance_scans).round().astype(int))]
+        for number in chosen.tolist():
+            found = self._update_all(start.pose, start.covariance, number, UPDATE_SETTINGS.iterations[False])
             evidence = found.evidence.sum(axis=1) + found.log_odometry
-            gained.append(np.quantile(evidence, SETTINGS.chance_quantile) / max(self.echo_counts[number], 1))
-        return max(float(np.mean(gained)), 0.0)
+            gained.append(np.quantile(evidence, 1 - 1 / SETTINGS.max_hypotheses))
+        return max(float(np.sum(gained) / self.echo_counts[chosen].sum()), 0.0)
 
     @cached_property
     def _moved(self) -> Float[np.ndarray, " steps"]:

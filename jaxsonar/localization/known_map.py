@@ -47,6 +47,8 @@ class KnownMap:
         default = np.eye(2) * SETTINGS.default_map_sd[0] ** 2
         point_covariance = np.where(np.isfinite(world.point_cov), world.point_cov, default)
         point_covariance += np.nan_to_num(world.point_circle_cov[:, 2, 2])[:, None, None] * np.eye(2)
+        if is_floor_plan(world):  # poles and columns are drawn as well as walls
+            point_covariance += np.eye(2) * map_sd[0] ** 2
         landmarks = map_landmarks(world)
         opening = np.zeros((len(landmarks.kind), 2, 2))
         if is_floor_plan(world) or not {"corner", "edge"} & set(world.point_kinds):

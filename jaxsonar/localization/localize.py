@@ -166,7 +166,7 @@ def _check(
     if not len(log):
         raise SonarError("localize: no scan in the log; allowed is a log with one or more")
     if not len(world) + len(world.points):
-        raise SonarError("localize: the map has no wall; allowed is one with walls in reach")
+        raise SonarError("localize: the map has neither wall nor point; allowed is one with walls in reach")
     if start is not None and not (len(start) == 3 and np.isfinite(np.asarray(start, dtype=np.float64)).all()):
         raise SonarError(f"localize: start {tuple(start)}; allowed are x, y (m) and theta (rad)")
 
@@ -207,11 +207,8 @@ def _judge(hypotheses: Sequence[PoseHypothesis], scans: int, *, is_local: bool) 
         )
     alike = [one for one in hypotheses if one.probability > SETTINGS.shown_probability][: SETTINGS.shown_places]
     none = 1 - sum(one.probability for one in hypotheses)
-    if none > 1 - none or not alike:
-        return False, (
-            f"{of}: no place in the map fits: at the best pose {fit}, which is chance with a probability of "
-            f"{_percent(none)}"
-        )
+    if none > 0.5 or not alike:
+        return False, f"{of}: no place in the map fits: at the best pose {fit}; probability of chance {_percent(none)}"
     if len(alike) == 1:
         heading = f"{of}: uncertain, {_percent(none)} for no place of the map"
     else:

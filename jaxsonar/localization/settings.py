@@ -99,9 +99,7 @@ class LocalizationSettings:
     max_tracked: int = 48
     """Number of hypotheses that are tracked together."""
     chance_poses: int = 48
-    """Number of poses all over the map whose evidence is that of chance..."""
-    chance_quantile: float = 23 / 24
-    """... at this quantile of it: what the best of ``max_hypotheses`` wrong poses gains by chance..."""
+    """Number of poses all over the map whose evidence is that of chance: the best of ``max_hypotheses`` of them, ..."""
     chance_scans: int = 8
     """... at this many scans; in the others it is taken in proportion to the number of echoes."""
     none_share: float = 0.05

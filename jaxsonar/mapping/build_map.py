@@ -169,7 +169,7 @@ def add_reflectors(
 
 
 def _with_planes(world: GlobalMap, planes: Sequence[Reflector]) -> GlobalMap:
-    """The map with further walls."""
+    """The map with further walls. Their standard deviations are those of the noise of the ranges."""
     if not planes:
         return world
     line = np.array([one.line for one in planes])

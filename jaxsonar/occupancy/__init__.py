@@ -12,9 +12,8 @@ Design decisions:
 - **Known walls hide, explain and are tested.** Nothing behind a known wall was seen through. An echo that a known wall
   explains marks nothing, because the wall is more precise. Known walls also explain echoes from outside of the cones,
   those of two walls, and crosstalk (``echo_attribution``): drawn within the cones, these would be false obstacles. A
-  part of a wall that later readings look through is not
-  drawn; doors that the robot drove through stay open. Of a large uncertain circle, the part that readings confirm is
-  drawn (``circle_profile``).
+  part of a wall that later readings look through is not drawn; doors that the robot drove through stay open. Of a large
+  uncertain circle, the part that readings confirm is drawn (``circle_profile``).
 - **Walls go on.** Beyond its mapped end, a wall may go on unseen until readings show that it does not, and between two
   edges that are near each other there may be a short wall that no sensor has faced. Cells there are unknown.
 - **One reflector explains an echo.** The echoes that no known reflector explains are shared among the cells of their

@@ -55,7 +55,9 @@ class ReceivedEchoes(NamedTuple):
         off_axis: Float[np.ndarray, "some 2"],
         strength: Float[np.ndarray, " some"] | float,
     ) -> Bool[np.ndarray, " some"]:
-        """Whether some echoes are loud enough (``kernels.detection_cones.echo_level``), also outside of the cones.
+        """Whether some echoes are loud enough, also outside of the cones.
+
+        The level is that of ``kernels.detection_cones.echo_level`` with angles off the axes for chords.
 
         Args:
             rows: the echoes.
@@ -174,8 +176,7 @@ def explained_by_two_walls(
         row, first = np.nonzero(gap <= _WALLS.explained_outside)
         out, leaves = crossing(tx[row], double[row, first], first)
         back, arrives = crossing(out, image[row], np.full(len(row), second))
-        before = height(tx[row], first) * depth[row, first] > 0
         rays = np.stack([out - tx[row], back - rx[row]], axis=1)
         audible = echoes.is_audible(row, echoes.off_axis(row, rays), 0.0)
-        explained[row[leaves & arrives & before & audible]] = True
+        explained[row[leaves & arrives & audible]] = True
     return explained

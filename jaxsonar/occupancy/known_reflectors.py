@@ -123,7 +123,7 @@ class KnownReflectors(NamedTuple):
         return radii
 
     def reflecting_levels(self) -> Float[np.ndarray, " points"]:
-        """Level of each of ``reflecting_points`` relative to a wall, dB: wall ends are faint."""
+        """Level of each of ``reflecting_points`` relative to a wall, dB: wall ends are faint, points may be corners."""
         levels, points = np.zeros(len(self.reflecting_points())), len(self.points)
         levels[points : points + 2 * len(self.walls)] = CONES.edge_level_db
         return levels

@@ -251,10 +251,17 @@ class _Search:
 
     def is_reciprocal(self, one: RobotEcho, found: list[RobotEcho]) -> bool:
         """Whether the reverse path has the echo, too, or was hardly measured. True for direct echoes."""
-        reverse = path_rows(self.ring, np.array([one.rx]), np.array([one.tx]))
-        measured = reverse[0] >= 0 and self._measurements[reverse[0]] >= SETTINGS.min_scans
+        reverse = int(path_rows(self.ring, np.array([one.rx]), np.array([one.tx]))[0])
+        if reverse < 0:
+            return True
+        # Measurements with nearer echoes only tell nothing.
+        rows, scans = self.row[self.path[self.row] == reverse], self.measured[self.chosen, reverse]
+        farthest = np.full(len(self.log), np.inf)
+        heard, last = np.unique(self.log.echo_scan[rows][::-1], return_index=True)
+        farthest[heard] = self.log.range[rows][::-1][last]
+        tells = int((farthest[self.chosen[scans]] > one.range - _tolerance(one.range)).sum())
         expected = [other.range for other in found if (other.rx, other.tx) == (one.tx, one.rx)]
-        return not measured or any(abs(one.range - other) <= _tolerance(one.range) for other in expected)
+        return tells < SETTINGS.min_scans or any(abs(one.range - it) <= _tolerance(one.range) for it in expected)
 
     def with_poses(self) -> Iterator[RobotEcho]:
         """Constant ranges of paths; ``places`` is 0 if they may be of walls."""

@@ -45,9 +45,9 @@ class Reflector:
     segment: Float[np.ndarray, "2 2"]
     """As a plane: its outermost points of reflection, metres."""
     line: Float[np.ndarray, "2"]
-    """As a plane: (rho, theta) of its line in the world frame, metres and radians."""
+    """As a plane: (rho, theta) of its line in the world frame, metres and radians; rho may be negative."""
     line_cov: Float[np.ndarray, "2 2"]
-    """Covariance of the line."""
+    """Covariance of the line from the noise of the ranges."""
     evidence: float
     """Log-likelihood ratio to clutter, nats."""
     residual: Float[np.ndarray, " inliers"]
@@ -127,6 +127,8 @@ def find_reflectors(
     position = np.array([one.position for one in points_found]).reshape(-1, 2)
     reach = settings.vertex_distance + np.nan_to_num([one.radius for one in points_found])
     replaced_points = (np.linalg.norm(points[:, None] - position, axis=-1) < reach).any(axis=1)
+    planes = [one.segment for one in found if not one.is_wall and one.kind == PLANE]
+    replaced_points |= _on_faces(points, np.array(planes).reshape(-1, 2, 2))
     replaced_points[at_walls] = False
     removed = ghosts.copy()
     removed[~ghosts] = replaced
@@ -327,6 +329,27 @@ def _decided(
     )
 
 
+def _continues_a_wall(segment: Float[np.ndarray, "2 2"], walls: Float[np.ndarray, "walls 2 2"]) -> bool:
+    """Whether a segment lies on the line of a wall, beside it or beyond a gap that may be part of it."""
+    settings = SETTINGS.explanation
+    length = np.maximum(lengths(walls), 1e-9)[:, None]
+    tangent = (walls[:, 1] - walls[:, 0]) / length
+    offset = segment - walls[:, :1]
+    along = (offset * tangent[:, None]).sum(-1)
+    across = (offset * perpendicular(tangent)[:, None]).sum(-1)
+    gap = np.maximum(along.min(axis=1) - length[:, 0], -along.max(axis=1))
+    return bool(((np.abs(across) < settings.same_line).all(axis=1) & (gap < settings.bridged_gap)).any())
+
+
+def _on_faces(
+    points: Float[np.ndarray, "points 2"], walls: Float[np.ndarray, "walls 2 2"]
+) -> Bool[np.ndarray, " points"]:
+    """Points on the faces of walls, away from their ends. A corner or an edge cannot be there."""
+    distance = SETTINGS.explanation.vertex_distance
+    from_ends = np.linalg.norm(points[:, None] - walls.reshape(-1, 2), axis=-1).min(axis=1, initial=np.inf)
+    return (point_to_segments(points, walls).min(axis=1, initial=np.inf) < distance) & (from_ends > 2 * distance)
+
+
 def _with_walls(
     walls: Float[np.ndarray, "walls 2 2"],
     residual: Float[np.ndarray, "rows walls"],
@@ -348,16 +371,20 @@ def _with_walls(
     settings = SETTINGS.explanation
     fits = np.abs(residual) < settings.gate * sigma
     fits &= ~fits[:, long].any(axis=1, keepdims=True) & ~long
-    by_other, marked = np.zeros(len(heard), dtype=bool), []
+    by_other, marked, described = np.zeros(len(heard), dtype=bool), [], walls
     for one in found:
         rows = np.searchsorted(heard, one.echoes)
         share = fits[rows].mean(axis=0).max(initial=0.0)
         on_wall = point_to_segments(one.position[None], walls).min(initial=np.inf) < settings.on_wall
         known = share > settings.replaced_share or (one.kind < 0 and on_wall)
-        known |= one.kind == PLANE and bool(on_wall)
+        is_plane = one.kind == PLANE
+        known |= is_plane and _continues_a_wall(one.segment, described)
         is_wall = known and one.probability[PLANE] >= settings.min_wall_probability
-        by_other[rows] = not is_wall and one.kind != PLANE
-        is_doubtful = one.kind == PLANE and one.probability[PLANE] < settings.min_new_wall_probability
+        by_other[rows] = not is_wall and not is_plane
+        is_short = lengths(one.segment[None])[0] < settings.min_new_wall_length
+        is_doubtful = is_plane and (one.probability[PLANE] < settings.min_new_wall_probability or is_short)
+        if is_plane and not is_wall and not is_doubtful:
+            described = np.concatenate([described, one.segment[None]])
         marked.append(replace(one, is_wall=bool(is_wall), kind=-1 if is_doubtful else one.kind))
     count = np.maximum(fits.sum(axis=0), 1)
     return marked, ~long & ((fits & by_other[:, None]).sum(axis=0) > settings.replaced_share * count)

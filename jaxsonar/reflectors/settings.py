@@ -174,8 +174,15 @@ class ExplainedEchoSettings:
     """A short wall of the map remains if it may be a plane with this probability: most walls of maps are walls."""
     min_new_wall_probability: float = 0.98
     """A plane that the map lacks becomes a wall from this probability on, and is undecided below."""
+    min_new_wall_length: float = 0.2
+    """A shorter plane that the map lacks is undecided, metres."""
+    same_line: float = 0.1
+    """A plane both of whose ends are this close to the line of a wall, metres, ..."""
+    bridged_gap: float = 1.5
+    """... and that is not farther from the wall along it, metres, is a part of it: the map knows best what lies
+    between."""
     on_wall: float = 0.03
-    """A plane, or an undecided reflector that may be one, belongs to a wall that is this close, metres."""
+    """An undecided reflector that may be a plane belongs to a wall that is this close, metres."""
     replaced_share: float = 0.5
     """Share of the echoes of a short wall that other reflectors must explain before they replace it."""
     sigma_iterations: int = 3

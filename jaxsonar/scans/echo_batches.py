@@ -19,7 +19,9 @@ class BatchPolicy:
     """Shapes of batches: a compromise between padding and the number of compiled programs. All chosen by timing."""
 
     rows: tuple[int, ...] = (256, 64, 16)
-    """Scans per batch, largest first; a log of one scan has a batch of one row."""
+    """Scans per batch, largest first."""
+    one_row: bool = True
+    """Whether a log of one scan has a batch of one row."""
     min_fill: float = 0.75
     """A batch size is used if at least this fraction of its rows hold scans; otherwise the next smaller size is."""
     large_accumulator: int = 50_000
@@ -46,10 +48,16 @@ class BatchPolicy:
 FAST_SCANS = BatchPolicy()
 """For kernels that take much less than a millisecond per scan and give integer sums, independent of the padding."""
 SLOW_SCANS = BatchPolicy(
-    rows=(32,), block=512, bucket=next_power_of_two, halve_min_columns=False, min_group=0, all_paths=True
+    rows=(32,),
+    one_row=False,
+    block=512,
+    bucket=next_power_of_two,
+    halve_min_columns=False,
+    min_group=0,
+    all_paths=True,
 )
-"""For kernels that take milliseconds per scan and many seconds to compile. The number of columns of a scan depends on
-that scan alone, so that floating-point sums do not depend on the other scans of the batch."""
+"""For kernels that take milliseconds per scan and many seconds to compile, and that skip padding. The number of columns
+of a scan depends on that scan alone, so that floating-point sums do not depend on the other scans of the batch."""
 
 _MAX_REPORTED = 1e6
 """Metres; larger ranges are clipped. Beyond every ring's maximum range, and safe in single precision."""
@@ -132,7 +140,7 @@ def _scans_per_row(ring: Ring, echoes: FlatEchoes) -> Float[np.ndarray, " scans"
 
 def _batch_rows(echoes: FlatEchoes, remaining: int, cells: int, policy: BatchPolicy) -> int:
     """Number of rows of the next batch."""
-    if echoes.scan_count == 1:
+    if echoes.scan_count == 1 and policy.one_row:
         return 1
     # Windows hold hundreds of echoes each.
     large = cells > policy.large_accumulator or echoes.pose is not None

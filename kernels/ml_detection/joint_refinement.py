@@ -2,7 +2,8 @@
 
 ``likelihood.refine`` fits every hypothesis alone, so that an echo of one reflector can attract another one that
 happens to predict a similar range. Here each echo is shared among the reflectors by its responsibilities
-(expectation-maximization), and the covariances contain the uncertainty of this assignment (Louis, 1982).
+(expectation-maximization), and the covariances contain the uncertainty of this assignment (Louis, 1982). Of Louis'
+information matrix, each reflector's own block is used, without the contributions below zero of single echoes.
 """
 
 from typing import NamedTuple
@@ -77,7 +78,8 @@ def refine_jointly(
 
     x, _ = jax.lax.scan(step, start, None, length=settings.joint_steps)
     weight, residual, jacobian = share(x)
-    # Observed information of a mixture: that of the complete data minus that of the missing assignment.
+    # Observed information of a mixture: that of the complete data minus that of the missing assignment, each echo's
+    # at least zero, and without the blocks between reflectors.
     missing = weight * (1 - weight) * (residual / scene.sigma) ** 2
     observed = jnp.maximum(weight - missing, 0)
     return JointFit(x, jax.vmap(regularized_inverse)(information(observed, jacobian)))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.hard_cones import simulate
 
+import jaxsonar
 from jaxsonar import Log, Ring, Room, SonarError
 from jaxsonar.estimation.odometry_noise import OdometryNoise
 from jaxsonar.geometry.se2 import (
@@ -20,7 +21,7 @@ from jaxsonar.geometry.se2 import (
     wrap_angle,
 )
 from jaxsonar.localization.hypothesis_tracking import HypothesisTracker
-from jaxsonar.localization.known_map import KnownMap
+from jaxsonar.localization.known_map import KnownMap, is_floor_plan
 from jaxsonar.localization.localize import Localized, localize
 from jaxsonar.localization.scan_update import update_hypotheses
 from jaxsonar.localization.settings import SETTINGS, UPDATE_SETTINGS
@@ -199,6 +200,66 @@ def test_no_wrong_place_is_certain_if_the_odometry_slips():
     found = localize(ring, map_from_room(room), given)
     apart = np.hypot(*errors_of(found, truth)[:, :2].T)
     assert not found.is_certain or (apart[[0, -1]] < 0.05).all()
+
+
+def plain_room():
+    corners = np.array([[0, 0], [6, 0.3], [6, 4], [0, 4]], float)
+    return Room(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
+
+
+def tracker_of(room, given, poses):
+    return HypothesisTracker(
+        RING, KnownMap.of(map_from_room(room)), given, (), poses, 0.003, OdometryNoise(), SETTINGS.plan_trust
+    )
+
+
+@pytest.mark.parametrize("beams", ["soft", "hard"])
+def test_the_true_place_explains_more_than_chance(beams):
+    """Soft beams receive three times as many echoes, so that no constant per echo serves both."""
+    room, poses = plain_room(), np.array([[1.6, 1.4, 0.3], [1.8, 1.5, 0.4], [2.0, 1.6, 0.5]])
+    given = jaxsonar.simulate(RING, room, poses, sigma=0.003, seed=2, beams=beams).as_log(RING, poses)
+    tracker = tracker_of(room, given, poses)
+    with jax.enable_x64(True):
+        here = tracker._at(list(poses[:1]))
+    found = tracker._update_all(here.pose, here.covariance, 0, UPDATE_SETTINGS.iterations[0])
+    evidence = found.evidence.sum() + found.log_odometry[0]
+    assert 0 < tracker.chance_nats * tracker.echo_counts[0] < 0.7 * evidence
+    # The true place is one of those that are listed, and none of the map is improbable.
+    result = localize(RING, map_from_room(room), given)
+    apart = [np.hypot(*(one.pose - poses[0])[:2]) for one in result.hypotheses if one.probability > 0.05]
+    assert min(apart) < 0.05
+    assert sum(one.probability for one in result.hypotheses) > 0.8
+
+
+def test_silent_scans_do_not_change_what_is_explained_by_chance():
+    room, poses = plain_room(), np.array([[1.6, 1.4, 0.3], [1.8, 1.5, 0.4]])
+    given = simulate(RING, room, poses, sigma=0.003, seed=2).as_log(RING, poses)
+    scans = [given[0], given[1], *(replace(given[0], scan=k, **silence()) for k in range(2, 8))]
+    longer = Log.from_scans(scans)
+    more = poses[0] + np.arange(8)[:, None] * (poses[1] - poses[0])
+    assert tracker_of(room, longer, more).chance_nats == pytest.approx(tracker_of(room, given, poses).chance_nats)
+
+
+def silence():
+    nothing = np.zeros(0)
+    return {
+        "tx": np.zeros(0, int),
+        "rx": np.zeros(0, int),
+        **dict.fromkeys(("range", "amplitude", "t", "age"), nothing),
+    }
+
+
+def test_poles_and_columns_of_a_plan_are_as_uncertain_as_its_walls():
+    room = Room(plain_room().walls, poles=np.array([[2.0, 2.0]]), circles=np.array([[4.0, 2.5, 0.2]]))
+    world = map_from_room(room)
+    assert world.point_kinds == ("edge", "circle")
+    np.testing.assert_array_equal(world.points, [[2.0, 2.0], [4.0, 2.5]])
+    np.testing.assert_array_equal(world.point_radius, [np.nan, 0.2])
+    assert is_floor_plan(world)
+    known = KnownMap.of(world)
+    assert (known.covariance[:, 0, 0] > 0.99 * SETTINGS.plan_sd[0] ** 2).all()
+    low, high = known.bounds
+    np.testing.assert_allclose([low, high], [[0.0, 0.0], [6.0, 4.0]], atol=1e-9)
 
 
 def test_an_update_balances_echoes_and_odometry():

@@ -1,11 +1,16 @@
 """Columns, poles and ends of walls in maps: whole logs, scan by scan, files and figures."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from matplotlib.patches import Circle
 
 from jaxsonar import Mapper, Ring, Room, build_map, simulate
+from jaxsonar.geometry.se2 import compose, wrap_angle
+from jaxsonar.mapping.build_map import add_reflectors
 from jaxsonar.mapping.map_geojson import load_map, load_points, save_map
+from jaxsonar.reflectors.range_measurements import RangeMeasurements
 from jaxsonar.reports.plot_map import map_figure
 
 RING = Ring.circular()
@@ -31,6 +36,30 @@ def test_a_column_and_a_pole_are_in_the_map(world):
     assert circle.point_probabilities[0, 3] > 0.9
     edge = world.with_kinds("edge").points
     assert np.linalg.norm(edge - [-0.9, 0.7], axis=1).min() < 0.01
+
+
+def test_a_wall_that_was_taken_out_is_found_again_and_none_appears_twice():
+    """Far from the origin of the world, where the line's distance depends on its direction."""
+    room = Room(np.array([[[-3.0, -1.2], [3.0, -1.2]], [[-0.5, 0.9], [0.4, 0.9]]]))
+    log = simulate(RING, room, POSES, sigma=0.001, seed=3).as_log(RING, compose(np.array([20.0, -30.0, 2.0]), POSES))
+    whole, measurements = build_map(RING, log), RangeMeasurements.from_log(RING, log)
+    assert len(whole) == 2
+    short = whole.length < 1.2
+    assert short.sum() == 1
+    (old,), again = np.flatnonzero(short), add_reflectors(whole.take_walls(~short), measurements)
+    assert len(again) == 2
+    (new,) = np.flatnonzero(again.length < 1.2)
+    assert again.rho[new] >= 0
+    assert abs(wrap_angle(again.theta[new] - whole.theta[old])) < 4 * np.hypot(
+        again.sigma_theta[new], whole.sigma_theta[old]
+    )
+    assert abs(again.rho[new] - whole.rho[old]) < 4 * np.hypot(again.sigma_rho[new], whole.sigma_rho[old])
+    np.testing.assert_allclose(again.segments[new].mean(axis=0), whole.segments[old].mean(axis=0), atol=0.1)
+    # A fragment that the map has is not described twice.
+    middle, half = whole.segments[old].mean(axis=0), (whole.segments[old, 1] - whole.segments[old, 0]) / 8
+    segments = whole.segments.copy()
+    segments[old] = middle - half, middle + half
+    assert len(add_reflectors(dataclasses.replace(whole, segments=segments), measurements)) == 2
 
 
 def test_the_map_scan_by_scan_is_the_same(world, log):

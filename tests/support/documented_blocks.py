@@ -16,8 +16,10 @@ from string import Template
 
 from support.commands import call
 
-SHELL = re.compile(r"""<<|[|;<>`*?()]|&&|&\s*$|\$\(""", re.MULTILINE)
+SHELL = re.compile(r"[|;<>`*?()]|&&|&\s*$", re.MULTILINE)
 """Syntax that needs a shell, outside of quotes."""
+ONE_SHELL = re.compile(r"<<|&\s*$|^\s*(cd|export|\w+=)|'[^']*\$", re.MULTILINE)
+"""Syntax by which lines depend on each other, or in which ``$`` is none of a variable: one shell for the block."""
 
 
 def run_python(text: str, folder: Path) -> tuple[int, str]:
@@ -31,7 +33,7 @@ def run_python(text: str, folder: Path) -> tuple[int, str]:
 def run_bash(text: str, folder: Path, environment: dict[str, str]) -> tuple[int, str]:
     """Run a block of shell commands in a folder, until one fails. Returns its exit code and the output of all."""
     joined, output = text.replace("\\\n", " "), ""
-    if "<<" in joined or re.search(r"&\s*$", joined, re.MULTILINE):
+    if ONE_SHELL.search(joined):
         return run_in_group(["bash", "-euo", "pipefail", "-c", text], folder, environment)
     for line in filter(None, map(str.strip, joined.splitlines())):
         unquoted = re.sub(r"'[^']*'|\"[^\"]*\"", "", line)
