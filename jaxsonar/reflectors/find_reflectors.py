@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsonar.geometry.robust_statistics import MAD_TO_SIGMA
 from jaxsonar.geometry.se2 import perpendicular, tangent_of, unit
-from jaxsonar.geometry.segments import lengths, point_to_segments
+from jaxsonar.geometry.segments import crossings, lengths, point_to_segments
 from jaxsonar.reflectors.center_votes import center_seeds
 from jaxsonar.reflectors.explained_echoes import (
     explained_by_points,
@@ -382,7 +382,11 @@ def _with_walls(
         is_wall = known and one.probability[PLANE] >= settings.min_wall_probability
         by_other[rows] = not is_wall and not is_plane
         is_short = lengths(one.segment[None])[0] < settings.min_new_wall_length
-        is_doubtful = is_plane and (one.probability[PLANE] < settings.min_new_wall_probability or is_short)
+        way, wall = crossings(one.segment[None], described)
+        crosses = ((way > 0) & (way < 1) & (wall > 0) & (wall < 1)).any()
+        is_doubtful = is_plane and bool(
+            one.probability[PLANE] < settings.min_new_wall_probability or is_short or crosses
+        )
         if is_plane and not is_wall and not is_doubtful:
             described = np.concatenate([described, one.segment[None]])
         marked.append(replace(one, is_wall=bool(is_wall), kind=-1 if is_doubtful else one.kind))

@@ -173,7 +173,8 @@ class ExplainedEchoSettings:
     min_wall_probability: float = 0.003
     """A short wall of the map remains if it may be a plane with this probability: most walls of maps are walls."""
     min_new_wall_probability: float = 0.98
-    """A plane that the map lacks becomes a wall from this probability on, and is undecided below."""
+    """A plane that the map lacks becomes a wall from this probability on, and is undecided below, or if it crosses a
+    wall."""
     min_new_wall_length: float = 0.2
     """A shorter plane that the map lacks is undecided, metres."""
     same_line: float = 0.1
