@@ -106,7 +106,7 @@ def _load_known_map(map_filename: str, messages: InputMessages) -> "GlobalMap":
         messages.warn_of_room(room)
         world = map_from_room(room)
     if not len(world) + len(world.points):
-        raise SonarError(f"{shown(map_filename)}: neither wall nor point; allowed is a map with walls")
+        raise SonarError(f"{shown(map_filename)}: no wall and no point; allowed is a map with walls")
     return world
 
 

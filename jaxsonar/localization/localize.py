@@ -166,7 +166,7 @@ def _check(
     if not len(log):
         raise SonarError("localize: no scan in the log; allowed is a log with one or more")
     if not len(world) + len(world.points):
-        raise SonarError("localize: the map has neither wall nor point; allowed is one with walls in reach")
+        raise SonarError("localize: the map has no wall and no point; allowed is one with walls in reach")
     if start is not None and not (len(start) == 3 and np.isfinite(np.asarray(start, dtype=np.float64)).all()):
         raise SonarError(f"localize: start {tuple(start)}; allowed are x, y (m) and theta (rad)")
 
