@@ -5,7 +5,7 @@ scan, a ring with narrow cones hardly determines the curvature by the ranges. Th
 heard tells more. Where neither decides, the reflector remains undecided.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -136,18 +136,22 @@ def _fit_circle(
         gradient = weighted @ echoes.residual - prior_information[2] * (at.shape - mean)
         return _covariance(weighted @ echoes.jacobian.T + prior_information), gradient
 
-    def step(at: TangentCircle, sigma: Float[Array, ""]):
-        covariance, gradient = normal_equations(at, linearize(at, sigma), sigma)
+    def step(state: tuple[TangentCircle, Any], sigma: Float[Array, ""]):
+        at, _ = state
+        echoes = linearize(at, sigma)
+        covariance, gradient = normal_equations(at, echoes, sigma)
         largest = jnp.asarray([settings.max_refinement, settings.max_refinement, settings.max_shape_step])
         rho, theta, shape = jnp.clip(covariance @ gradient, -largest, largest)
         shape = jnp.clip(at.shape + shape, *settings.circle_bounds)
-        return at._replace(rho=at.rho + rho, theta=at.theta + theta, shape=shape), None
+        return (at._replace(rho=at.rho + rho, theta=at.theta + theta, shape=shape), (at, echoes, covariance)), None
 
-    # The first steps also reach echoes that the plane or the point did not explain.
+    # The first steps also reach echoes that the plane or the point did not explain. The last linearization is at the
+    # result; in the loop, it is compiled once.
     scales = settings.circle_initial_scale * 0.5 ** jnp.arange(settings.circle_steps, dtype=start.rho.dtype)
-    fitted, _ = jax.lax.scan(step, start, jnp.maximum(scales, scene.sigma))
-    echoes = linearize(fitted, scene.sigma)
-    covariance, _ = normal_equations(fitted, echoes, scene.sigma)
+    noise = jnp.append(jnp.maximum(scales, scene.sigma), scene.sigma)
+    nothing = jnp.zeros_like(scan.ranges)
+    unused = start, _LinearizedEchoes(jnp.stack([nothing] * 3), nothing, nothing), prior_information
+    (_, (fitted, echoes, covariance)), _ = jax.lax.scan(step, (start, unused), noise)
     circle, jacobian = fitted.as_circle()
     return CircleFit(
         circle=circle,

@@ -6,7 +6,7 @@ happens to predict a similar range. Here each echo is shared among the reflector
 information matrix, each reflector's own block is used, without the contributions below zero of single echoes.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -70,14 +70,17 @@ def refine_jointly(
     def information(weight: Float[Array, "reflectors echoes"], jacobian: Float[Array, "reflectors 2 echoes"]):
         return jnp.einsum("ke,kie,kje->kij", weight / scene.sigma**2, jacobian, jacobian)
 
-    def step(x: Float[Array, "reflectors 2"], _: None):
-        weight, residual, jacobian = share(x)
+    def step(state: tuple[Float[Array, "reflectors 2"], Any], _: None):
+        x, _ = state
+        shared = weight, residual, jacobian = share(x)
         gradient = jnp.einsum("ke,kie->ki", weight * residual / scene.sigma**2, jacobian)
         change = jnp.einsum("kij,kj->ki", jax.vmap(regularized_inverse)(information(weight, jacobian)), gradient)
-        return x + jnp.clip(change, -settings.max_refinement, settings.max_refinement), None
+        return (x + jnp.clip(change, -settings.max_refinement, settings.max_refinement), (x, *shared)), None
 
-    x, _ = jax.lax.scan(step, start, None, length=settings.joint_steps)
-    weight, residual, jacobian = share(x)
+    # The last shares are those at the result; in the loop, they are compiled once.
+    nothing = jnp.zeros((len(start), len(scan.ranges)), start.dtype)
+    unused = start, nothing, nothing, jnp.stack([nothing] * 2, axis=1)
+    (_, (x, weight, residual, jacobian)), _ = jax.lax.scan(step, (start, unused), None, length=settings.joint_steps + 1)
     # Observed information of a mixture: that of the complete data minus that of the missing assignment, each echo's
     # at least zero, and without the blocks between reflectors.
     missing = weight * (1 - weight) * (residual / scene.sigma) ** 2
