@@ -27,7 +27,7 @@ from jaxsonar.evaluation.map_accuracy import evaluate
 from jaxsonar.evaluation.settings import SETTINGS as EVALUATION
 from jaxsonar.fileio.atomic_files import atomic_write, make_folder
 from jaxsonar.floor_plans.room_geojson import save_room
-from jaxsonar.mapping.build_map import assemble_map
+from jaxsonar.mapping.build_map import add_reflectors, assemble_map
 from jaxsonar.mapping.map_evidence import gather_evidence
 from jaxsonar.mapping.map_geojson import save_map
 from jaxsonar.occupancy.incremental_grid import occupancy
@@ -79,7 +79,7 @@ def run_demo(
     on_step("the map of the office")
     evidence = gather_evidence(ring, log, models)
     paper_evidence = gather_evidence(ring, log, paper_models)
-    world = assemble_map(evidence)
+    world = add_reflectors(assemble_map(evidence), evidence.scans.measurements())
     heard = wall_reflection_points(ring, office.room, office.poses, simulation)
     grids = {
         "map and echoes": occupancy(ring, log, walls=KnownReflectors.of_map(world)),
