@@ -164,7 +164,7 @@ def expected_ranges(
         margin = EKF_SETTINGS.wall_margin
         beside = (along < landmark.extent[0] - margin) | (along > landmark.extent[1] + margin)
         level = echo_level(echo, eqx.tree_at(lambda p: p.cone, path, cone))
-        level += reflector_level(landmark.kind, landmark, echo.range)
+        level += reflector_level(jnp.asarray(landmark.kind), landmark, echo.range)
         heard = (visibility(echo, path) > 0) | (echo.exists & (level > threshold))
         return jnp.where(heard & ((landmark.kind != PLANE) | ~beside), echo.range, jnp.inf)
 
