@@ -41,23 +41,24 @@ class KnownMap:
                 it is one, else those of the map.
         """
         world = world.with_kinds(*LANDMARK_KINDS)
+        is_plan = is_floor_plan(world)
         if map_sd is None:
-            map_sd = SETTINGS.plan_sd if is_floor_plan(world) else SETTINGS.min_map_sd
+            map_sd = SETTINGS.plan_sd if is_plan else SETTINGS.min_map_sd
         wall_covariance = _wall_covariances(world, map_sd)
         default = np.eye(2) * SETTINGS.default_map_sd[0] ** 2
         point_covariance = np.where(np.isfinite(world.point_cov), world.point_cov, default)
         point_covariance += np.nan_to_num(world.point_circle_cov[:, 2, 2])[:, None, None] * np.eye(2)
-        if is_floor_plan(world):  # poles and columns are drawn as well as walls
+        if is_plan:  # poles and columns are drawn as well as walls
             point_covariance += np.eye(2) * map_sd[0] ** 2
         landmarks = map_landmarks(world)
         opening = np.zeros((len(landmarks.kind), 2, 2))
-        if is_floor_plan(world) or not {"corner", "edge"} & set(world.point_kinds):
+        if is_plan or not {"corner", "edge"} & set(world.point_kinds):
             corners, corner_covariance, directions = _wall_corners(world, wall_covariance)
             point_covariance = np.concatenate([point_covariance, corner_covariance])
             kind = np.full(len(corners), kernels.CORNER)
             landmarks = concatenate_landmarks([landmarks, landmarks_from_points(kind, corners)])
             opening = np.concatenate([opening, directions])
-        if is_floor_plan(world):
+        if is_plan:
             ends = _free_ends(world)
             landmarks = concatenate_landmarks(
                 [landmarks, landmarks_from_points(np.full(len(ends), kernels.EDGE), ends)]

@@ -39,6 +39,10 @@ class EchoArcs(NamedTuple):
         """All arcs of several collections."""
         return cls(*(np.concatenate(columns) for columns in zip(cls.empty(), *parts, strict=True)))
 
+    def take(self, rows: Int[np.ndarray, " some"] | Bool[np.ndarray, " arcs"] | slice) -> "EchoArcs":
+        """Some of the arcs (numbers, mask or slice)."""
+        return EchoArcs(*(column[rows] for column in self))
+
     def thinned(self, limit: int) -> "EchoArcs":
         """One arc for all echoes of a path from about the same place, in the same direction and of the same range.
 

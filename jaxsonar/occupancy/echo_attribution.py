@@ -88,7 +88,7 @@ def explained_by_map(known: KnownReflectors, ring: Ring, arcs: EchoArcs) -> Bool
     for other in () if together is None else together[arcs.path].T:
         rows = np.flatnonzero(~explained & (other >= 0))
         ends = np.stack([other[rows], sensors[rows, 1]], axis=-1)
-        echoes = ReceivedEchoes.of(ring, EchoArcs(*(column[rows] for column in arcs)), ends)
+        echoes = ReceivedEchoes.of(ring, arcs.take(rows), ends)
         explained[rows] = explained_by_reflectors(known, echoes, own=False)
         left = np.flatnonzero(~explained[rows])
         explained[rows[left]] = explained_by_two_walls(known.walls, echoes.take(left))

@@ -283,10 +283,10 @@ class GridEvidence:
         explained = np.zeros(len(arcs.path), bool)
         reach = self.sensors.max_distance + SETTINGS.reflectors.explained
         for begin in range(0, len(explained), 1024):
-            part = EchoArcs(*(column[begin : begin + 1024] for column in arcs))
+            part = arcs.take(slice(begin, begin + 1024))
             near = known.near(part.pose[:, :2].min(axis=0) - reach, part.pose[:, :2].max(axis=0) + reach)
             explained[begin : begin + 1024] = explained_by_map(near, self.ring, part)
-        return EchoArcs(*(column[~explained] for column in arcs))
+        return arcs.take(~explained)
 
 
 def _cone_squares(

@@ -254,12 +254,9 @@ class _Search:
         reverse = int(path_rows(self.ring, np.array([one.rx]), np.array([one.tx]))[0])
         if reverse < 0:
             return True
-        # Measurements with nearer echoes only tell nothing.
-        rows, scans = self.row[self.path[self.row] == reverse], self.measured[self.chosen, reverse]
-        farthest = np.full(len(self.log), np.inf)
-        heard, last = np.unique(self.log.echo_scan[rows][::-1], return_index=True)
-        farthest[heard] = self.log.range[rows][::-1][last]
-        tells = int((farthest[self.chosen[scans]] > one.range - _tolerance(one.range)).sum())
+        scan = self.chosen[self.measured[self.chosen, reverse]]
+        farthest = self._farthest_echoes(scan, self.row[self.path[self.row] == reverse])
+        tells = int((farthest > one.range - _tolerance(one.range)).sum())
         expected = [other.range for other in found if (other.rx, other.tx) == (one.tx, one.rx)]
         return tells < SETTINGS.min_scans or any(abs(one.range - it) <= _tolerance(one.range) for it in expected)
 
@@ -317,6 +314,22 @@ class _Search:
         pair = self.ring.paths[one.path : one.path + 1]
         return float(self.ring.corrected(np.array([one.echo.range]), *pair.T)[0])
 
+    def _farthest_echoes(
+        self, scan: Int[np.ndarray, " measurements"], rows: Int[np.ndarray, " echoes"]
+    ) -> Float[np.ndarray, " measurements"]:
+        """Range of the last echo of each measurement of a path, metres; infinite for silence.
+
+        A measurement whose last echo is nearer than a constant range tells nothing about it.
+
+        Args:
+            scan: rows of the scans that measured the path, ascending.
+            rows: rows of the log of the path's echoes, by range.
+        """
+        farthest = np.full(len(scan), np.inf)
+        heard, last = np.unique(self.log.echo_scan[rows][::-1], return_index=True)
+        farthest[np.searchsorted(scan, heard)] = self.log.range[rows][::-1][last]
+        return farthest
+
     def windows(self) -> Iterator[_Window]:
         """Constant ranges of all paths."""
         if len(self.chosen) < SETTINGS.min_scans:
@@ -354,9 +367,7 @@ class _Search:
         """
         log, (center, sigma, half_width) = self.log, found
         scan = self.chosen[self.measured[self.chosen, path]]
-        at, has_echo, farthest = log.pose[scan].copy(), np.zeros(len(scan), bool), np.full(len(scan), np.inf)
-        heard, last = np.unique(log.echo_scan[rows][::-1], return_index=True)
-        farthest[np.searchsorted(scan, heard)] = log.range[rows][::-1][last]
+        at, has_echo, farthest = log.pose[scan].copy(), np.zeros(len(scan), bool), self._farthest_echoes(scan, rows)
         place = np.searchsorted(scan, log.echo_scan[inside])
         at[place], has_echo[place] = pose[inside], True
         tells = has_echo | (farthest > center)

@@ -305,8 +305,8 @@ def _decided(
     if kind != CIRCLE:
         cov[2], cov[:, 2] = np.nan, np.nan
     ends = fits.plane_extent(measurements.origin[fits.rows])
-    rho, theta = fits.parameters[PLANE, :2]
-    to_world = np.array([[1.0, fits.origin @ tangent_of(theta)], [0.0, 1.0]])
+    plane_rho, plane_theta = fits.parameters[PLANE, :2]
+    to_world = np.array([[1.0, fits.origin @ tangent_of(plane_theta)], [0.0, 1.0]])
     claimed = fits.rows[fits.inlier[probability > settings.min_claim].any(axis=0)]
     return Reflector(
         kind=kind,
@@ -316,8 +316,8 @@ def _decided(
         probability=probability,
         echoes=claimed,
         scans=tuple(np.unique(measurements.scan[claimed]).tolist()),
-        segment=fits.nearest[PLANE] + ends[:, None] * tangent_of(fits.parameters[PLANE, 1]),
-        line=np.array([rho + fits.origin @ unit(theta), theta]),
+        segment=fits.nearest[PLANE] + ends[:, None] * tangent_of(plane_theta),
+        line=np.array([plane_rho + fits.origin @ unit(plane_theta), plane_theta]),
         line_cov=to_world @ fits.cov[PLANE, :2, :2] @ to_world.T,
         evidence=float(evidence[best]),
         residual=fits.residual[best, fits.inlier[best]],
@@ -346,8 +346,9 @@ def _on_faces(
 ) -> Bool[np.ndarray, " points"]:
     """Points on the faces of walls, away from their ends. A corner or an edge cannot be there."""
     distance = SETTINGS.explanation.vertex_distance
-    from_ends = np.linalg.norm(points[:, None] - walls.reshape(-1, 2), axis=-1).min(axis=1, initial=np.inf)
-    return (point_to_segments(points, walls).min(axis=1, initial=np.inf) < distance) & (from_ends > 2 * distance)
+    on_face = point_to_segments(points, walls).min(axis=1, initial=np.inf) < distance
+    on_face[near_points(points, walls.reshape(-1, 2), 2 * distance)] = False
+    return on_face
 
 
 def _with_walls(
